@@ -1,4 +1,4 @@
-"""The angle between vectors, right to rounding also where they are nearly parallel."""
+"""The angle between vectors, accurate to rounding even if they are nearly parallel."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

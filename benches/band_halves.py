@@ -1,11 +1,11 @@
-"""Coverage of a band when a population of virtual patients is split into halves again and again.
+"""Coverage of a band over many random splits of virtual patients into halves.
 
     python benches/band_halves.py FOLDER [--model M+S] [--splits 2000] [--seed 1]
 
 FOLDER holds the predictions of `cmfsim benchmark FOLDER --band MODEL` for all parts. Each split
 calibrates on a random half and counts, in the other one, the patients whose true skin lies within
-the band at all vertices of a region. A single split shows little: of 66 patients, a band that holds
-90 % covers between 82 and 97 %. The model must not have learned from any patient.
+the band at all vertices of a region. A single split is not enough: of 66 patients, a band for 90 %
+covers between 82 and 97 %. The model must not have learned from any patient.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Time and memory of `cmfsim build` on a clinical CT's size, stage by stage: building.py [CASE].
+"""Time and memory of `cmfsim build` for the size of a clinical CT, by stage: building.py [CASE].
 
 Without a case, the phantom's CT is resampled to 512 × 512 × 200 voxels of 0.45 × 0.45 × 1 mm with
 noise of 25 HU. Prints a table in Markdown.

@@ -1,11 +1,11 @@
 """Solves random plans with sliding contact on heads: contact_plans.py CASE [CASE …] --plans 200.
 
 Each plan moves one or more segments of the case by up to 10 mm along each axis and up to 8° about
-any axis; plans whose bones would pass through each other are drawn again. The table tells how many
+any axis; plans whose bones would pass through each other are drawn again. The table lists how many
 plans converge and in how many Newton steps. With --nearby N, the first N plans of each model are
-also solved with 0.01 mm more motion, and once more from the solution of the plan before: how far
-that moves the skin at most, and for how many plans by more than it should. Exit code 1 if a plan
-does not converge.
+also solved with 0.01 mm more motion, and once more starting from the solution of the previous plan.
+The table has the largest resulting change of the skin, and the number of plans for which it is
+larger than allowed. Exit code 1 if a plan does not converge.
 """
 
 import argparse

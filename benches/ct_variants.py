@@ -1,4 +1,4 @@
-"""A CT made harder: what other scanners, patients and exports do to an image."""
+"""Variants of a CT: effects of other scanners, patients and exports on an image."""
 
 import numpy as np
 from scipy import ndimage

@@ -1,14 +1,14 @@
-"""What an element and its kinematics cost and buy: error on the outer surface against run time.
+"""Cost and error of elements and kinematics: error on the outer surface against run time.
 
     python benches/elements.py [--level 2] [--layers 3] [--json FILE]
         [--markdown docs/benchmarks.md]
 
-A shell of soft tissue (12 mm over a bone of 40 mm) is held over one half of the bone and joined to
-a segment over the other, which advances by 5 mm and turns by 8°, and is solved with every element
-and kinematics. The reference is hyperelastic on quadratic tets of half the edge length. Error: how
-far the nodes on the outer surface are from where the reference puts them; it has every node of the
-coarse mesh. Time: processor seconds of set-up and solve, the best of three, over those of linear
-tets in linear kinematics.
+A shell of soft tissue (12 mm over a bone of 40 mm) is fixed over one half of the bone and joined to
+a segment over the other half, which advances by 5 mm and rotates by 8°. It is solved with every
+element and kinematics. The reference is hyperelastic on quadratic tets of half the edge length. The
+error is the distance of the nodes on the outer surface from the reference, which has every node of
+the coarse mesh. The time is the processor seconds of set-up and solve, the best of three, relative
+to linear tets in linear kinematics.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""Plans found again from their faces: face_planning.py FOLDER [--plans N] [--truth PATIENT …].
+"""Recovers plans from their faces: face_planning.py FOLDER [--plans N] [--truth PATIENT …].
 
-The embedded head with Le Fort I, sagittal split and genioplasty, written into FOLDER. Random plans
-of two segments (maxilla, body of the mandible) and of three (with the chin), ±5 mm and ±5° of each
-number, are searched for from points of the face that the plan operator gives them: 120 points
-without noise; 30 points with 0.2 mm of noise along each axis. With noise, the covariance of each
-search states which directions of its numbers the face determines: those whose deviation is at most
-0.25 (mm or degrees), for which two deviations are 0.5.
+The case is the embedded head with Le Fort I, sagittal split and genioplasty, written into FOLDER.
+Random plans of two segments (maxilla, body of the mandible) and of three (with the chin), ±5 mm and
+±5° of each number, are searched for from points of the face that the plan operator gives them: 120
+points without noise; 30 points with 0.2 mm of noise along each axis. With noise, the covariance of
+each search states which directions of its numbers the face determines: those whose deviation is at
+most 0.25 (mm or degrees), for which two deviations are 0.5.
 
 With --truth, folders of virtual patients (`cmfsim virtual-patients`): the plan that was operated,
 searched for from the face of the other equations, with an operator about no movement at all.

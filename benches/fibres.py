@@ -1,8 +1,8 @@
 """Angle between box directions and true fibres on the phantom's muscles: fibres.py [SPACING].
 
 Prints a Markdown table: over points drawn uniformly in the volume of each muscle of the left side,
-the median and the 95th percentile of the angle, for boxes as the shape needs and for the one box of
-Kim et al. (2010). Sheets are those that `MuscleFibres.is_sheet` flags.
+the median and the 95th percentile of the angle, for as many boxes as the shape needs and for the
+single box of Kim et al. (2010). Sheets are those that `MuscleFibres.is_sheet` flags.
 """
 
 import sys

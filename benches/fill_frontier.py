@@ -1,9 +1,9 @@
-"""Puts what `cmfsim bench frontier` measured into the documentation.
+"""Inserts the results of `cmfsim bench frontier` into the documentation.
 
     python benches/fill_frontier.py FOLDER NAME
 
-`docs/frontier.md` has two marks around the tables of each NAME (head, ct_phantom); the picture
-stands beside the others.
+`docs/frontier.md` has two marks around the tables of each NAME (head, ct_phantom); the picture is
+saved next to the others.
 """
 
 import argparse

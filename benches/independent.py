@@ -1,6 +1,6 @@
-"""Stiffness and forces of every element by scikit-fem and numpy: nothing of cmfsim's numbers.
+"""Stiffness and forces of every element by scikit-fem and numpy, independent of cmfsim.
 
-Of cmfsim come the mesh and the numbering of its mid-edge nodes alone.
+Only the mesh and the numbering of its mid-edge nodes come from cmfsim.
 """
 
 from __future__ import annotations

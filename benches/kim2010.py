@@ -1,8 +1,8 @@
 """The study of Kim et al. (2010) on virtual patients: kim2010.py FOLDER [--markdown PAGE].
 
-FOLDER gets the virtual patients P1 to P4 (`cmfsim virtual-patients FOLDER`; those that are there
-are kept) and their study (`cmfsim study FOLDER`). The landmarks of P1 are then placed again three
-times, as in the paper's section 3.3. With a page, tables and figures of docs are written as well.
+FOLDER gets the virtual patients P1 to P4 (`cmfsim virtual-patients FOLDER`; existing ones are kept)
+and their study (`cmfsim study FOLDER`). The landmarks of P1 are then placed again three times, as
+in the paper's section 3.3. With a page, the tables and figures of the docs are written as well.
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""How far landmarks that are found automatically lie from those that a person placed.
+"""Distances of automatically found landmarks from those that a person placed.
 
 Real heads (the folder named by CMFSIM_DATA, else ../shared/data; skipped where absent), each with
 the synthetic head as the only template and with the other real head as a further one; variants of
-the CT that leave something out or show it worse; and synthetic heads, whose landmarks are known.
+the CT that are cropped or degraded; and synthetic heads, whose landmarks are known.
 
     python benches/landmark_accuracy.py --markdown docs/landmarks.md
 """

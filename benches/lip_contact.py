@@ -2,7 +2,7 @@
 
 FOLDER holds virtual patients as `cmfsim virtual-patients` writes them. Each is predicted by every
 model twice, with `contact = false` and `contact = true` in [lips] of its case file, and compared
-with its face after the operation. A version without [lips] is run without contact alone.
+with its face after the operation. A version without [lips] is run only without contact.
 """
 
 import argparse

@@ -1,8 +1,9 @@
-"""How near a template's muscles come to those of other phantom people: morphing.py [PEOPLE].
+"""Distance of a template's muscles from those of other phantom people: morphing.py [PEOPLE].
 
-Prints a Markdown table, a line per person (`HeadParameters.random`, seeds from 1): distance of the
-muscles' vertices from the true surfaces before and after the morph by the skull landmarks, mm, the
-mean over all muscles and that of the worst, and the median leave-one-out distance of the landmarks.
+Prints a Markdown table with one line per person (`HeadParameters.random`, seeds from 1): distance
+of the muscles' vertices from the true surfaces before and after the morph by the skull landmarks,
+mm, the mean over all muscles and that of the worst, and the median leave-one-out distance of the
+landmarks.
 """
 
 import sys

@@ -1,7 +1,7 @@
 """Builds a case several times and compares the files byte by byte: repeat_builds.py CASE --runs 20.
 
-Every other run has one thread in place of all: neither a race nor the number of threads may change
-a result. Of build.json, the run times are left out. Exit code 1 if a file differs.
+Every other run uses one thread instead of all: neither a race nor the number of threads may change
+a result. The run times in build.json are ignored. Exit code 1 if a file differs.
 """
 
 import argparse

@@ -1,9 +1,9 @@
-"""Errors of muscle fractions against samples and run time; losses on bad surfaces.
+"""Errors of muscle fractions against samples and run time; errors on defective surfaces.
 
     python benches/sampling_error.py --out folder
 
-writes sampling_error.png, sampling_error.csv and inside_tests.csv. Three ways are compared on tets
-cut by a finely triangulated plane, where the fraction is known exactly: `equivalent_material`;
+writes sampling_error.png, sampling_error.csv and inside_tests.csv. Three methods are compared on
+tets cut by a finely triangulated plane, where the fraction is known exactly: `equivalent_material`;
 random points with one winding number each; random points with the paper's test (closest normal
 against closest-distance vector, Kim et al. 2010, section 2.3).
 """

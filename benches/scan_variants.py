@@ -1,9 +1,9 @@
-"""What metal, other scanners, crops and things on the face cost a segmentation, in mm.
+"""Errors of segmentation caused by metal, other scanners, crops and objects on the face, in mm.
 
-Each variant is made of a CT whose segmentation is known; skin and bone of both are compared in the
-face, either way (what is too much, and what is missing), away from where the variant is cut off.
-A variant whose surfaces are beyond the tolerances must be reported by a finding or refused by a
-named error; otherwise its verdict is "silent".
+Each variant is made from a CT whose segmentation is known. Skin and bone of both are compared in
+the face, in both directions (excess and missing parts), away from where the variant is cut off. A
+variant whose surfaces are beyond the tolerances must be reported by a finding or refused by a
+specific error; otherwise its verdict is "silent".
 
     python benches/scan_variants.py --before COMMIT --markdown docs/real_scans.md
 

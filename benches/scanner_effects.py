@@ -1,4 +1,4 @@
-"""What X-rays, detectors and reconstruction do to the image of a head, put into a clean CT.
+"""Effects of X-rays, detectors and reconstruction on the image of a head, added to a clean CT.
 
 Metal: line integrals through the slice at three energies, the detector's counts with scatter and
 Poisson noise, and filtered back projection of the difference that the metal makes. Beam hardening

@@ -4,7 +4,7 @@
 
 solves each case with each method and writes a table with the condition number, the residual, the
 error against a closed form or an independent solution, and a verdict. The exit status is 1 if any
-verdict is not the wanted one. The cases stand in `benches/extreme/`, a module per subject. Needs
+verdict is not the expected one. The cases are in `benches/extreme/`, one module per subject. Needs
 scipy and scikit-fem beside numpy and cmfsim.
 """
 

@@ -2,10 +2,10 @@
 
     python benches/voxel_entry.py FOLDER [--voxel 5] [--part test]
 
-An entry that shares neither mesh, elements, assembly nor solver with cmfsim: trilinear hexahedra on
-a grid, one isotropic tissue, bone that moves its nodes (as Mollemans et al. 2007 compare finite
-elements with mass tensors). Of cmfsim it takes the bones as they are cut and the plan. The
-predictions are put into FOLDER/predictions/scikit-fem.
+This entry shares neither mesh, elements, assembly nor solver with cmfsim: trilinear hexahedra on a
+grid, one isotropic tissue, bone that moves its nodes (as Mollemans et al. 2007 compare finite
+elements with mass tensors). From cmfsim it takes only the cut bones and the plan. The predictions
+are put into FOLDER/predictions/scikit-fem.
 """
 
 import argparse

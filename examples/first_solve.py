@@ -1,7 +1,7 @@
 """A first solve: a block of soft tissue between two bones, joined to one and sliding on the other.
 
-The upper bone moves 2 mm forwards and turns by 5°; the lower one, with a flat contact surface,
-stays. Run it with `python examples/first_solve.py`.
+The upper bone moves 2 mm forwards and rotates by 5°; the lower one, with a flat contact surface,
+does not move. Run it with `python examples/first_solve.py`.
 """
 
 import itertools

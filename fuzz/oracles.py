@@ -1,7 +1,7 @@
-"""What a file means by its format's own rules, read slowly and strictly, one value at a time.
+"""Strict, slow readers that follow the rules of each format, one value at a time.
 
-These readers share nothing with the package. Where a reader of the package accepts a file that one
-of these refuses, or gives other vertices or triangles, it changed the geometry in silence.
+These readers share nothing with the package. If a reader of the package accepts a file that one of
+these refuses, or returns other vertices or triangles, it silently changed the geometry.
 """
 
 import base64

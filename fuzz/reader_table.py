@@ -1,4 +1,4 @@
-"""The readers that are fuzzed: small valid files of each format, how they are read, what must hold.
+"""The readers that are fuzzed: small valid files of each format, how they are read, what to check.
 
 A new reader is one entry of `READERS`.
 """

@@ -1,8 +1,8 @@
 """Feeds damaged files to every reader: python fuzz/readers.py --mutants 10000 --seed 0.
 
-Each mutant of a small valid file must be read as the format's rules say, or be refused by a named
-error, within ten seconds. Readers run in a process of their own, so that a crash is counted and the
-rest goes on. Exit code 1 if anything is wrong; the files at fault are kept.
+Each mutant of a small valid file must be read according to the rules of its format, or be refused
+with a specific error, within ten seconds. Readers run in a separate process, so that a crash is
+counted and the run continues. Exit code 1 if anything is wrong; the files that fail are kept.
 """
 
 import argparse

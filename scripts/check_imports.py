@@ -1,7 +1,7 @@
 """Checks who may import whom: check_imports.py [FOLDER of the project].
 
-A case walks downhill through the files, and each outside library stays behind one of them. The
-tables below are the rules; a new file gets a line here, with the least that it needs.
+Imports run in one direction, and each outside library is used in one place. The tables below are
+the rules; a new file gets a line here that allows the least it needs.
 """
 
 import ast

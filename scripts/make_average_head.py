@@ -1,4 +1,4 @@
-"""Makes the head that proposed landmarks are compared with, average_head.npz of the package.
+"""Makes the head with which proposed landmarks are compared, average_head.npz of the package.
 
 Run it after a change of the shapes in cmfsim.phantom: python scripts/make_average_head.py
 """

@@ -1,7 +1,7 @@
 """Writes the built-in template from the phantom head: make_default_template.py [FILE].
 
-Run it after a change of the phantom's muscles, skull or landmarks; a test says when. It takes about
-a minute and needs the extra `imaging`.
+Run it after a change of the phantom's muscles, skull or landmarks; a test detects this. It takes
+about a minute and needs the extra `imaging`.
 """
 
 import sys

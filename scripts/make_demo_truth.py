@@ -1,13 +1,12 @@
 """Writes the face after the demo's operation, in silico: make_demo_truth.py [FILE].
 
-The head and the plan are those of the virtual patient P1, with landmarks where they are. Run it
-after a change of the phantom, of P1 or of the truth's physics. It takes some minutes and needs the
-extras `study`, `imaging` and `mesh`. In FILE:
+The head and the plan are those of the virtual patient P1, with exact landmarks. Run it after a
+change of the phantom, of P1 or of the truth's physics. It takes some minutes and needs the extras
+`study`, `imaging` and `mesh`. In FILE:
 
-vertices     (v, 3) float32, mm, LPS: the skin of the face
-triangles    (t, 3) uint32 (uint16 where that suffices)
-landmark_names, landmarks   (k,) text and (k, 3) float32, mm: on that skin, exact
-parameters   JSON text: the head, the plan, how the face was computed and how well it settled
+vertices (v, 3) float32, mm, LPS: the skin of the face triangles (t, 3) uint32 (uint16 where that
+suffices) landmark_names, landmarks (k,) text and (k, 3) float32, mm: on that skin, exact parameters
+JSON text: the head, the plan, how the face was computed and how well it converged
 """
 
 import json

@@ -1,6 +1,6 @@
 """Makes the pictures of the README from a demo: cmfsim demo, then make_figures.py cmfsim-demo.
 
-Pictures of the demo's report, made smaller so that the repository stays light.
+The pictures are those of the demo's report, made smaller so that the repository stays light.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/landmarks.md: where the 32 sites of the skull and 14 of the skin lie.
+"""Makes the pictures of docs/landmarks.md: the 32 sites of the skull and 14 of the skin.
 
 python scripts/make_landmark_figure.py
 

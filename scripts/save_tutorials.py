@@ -1,6 +1,6 @@
 """Runs the tutorials and saves them with their outputs: save_tutorials.py [NAME ...].
 
-Pictures are made smaller, and nothing of the machine is kept: neither times of execution nor paths.
+Pictures are made smaller, and machine-specific data (execution times and paths) are removed.
 `tests/python/project/test_tutorials.py` runs the tutorials again and compares what they print.
 """
 

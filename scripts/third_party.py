@@ -1,10 +1,10 @@
-"""The licences of everything that others wrote: checked, and of the wheel's parts written down.
+"""Checks all third-party licences, and writes those of the wheel's parts.
 
 `python scripts/third_party.py` writes THIRD-PARTY-NOTICES.md, which every wheel holds: each crate
-that is compiled into it on any platform, METIS, and their licence texts. `--check` fails where
-that file is out of date, where any crate or Python package that the project names has a licence
-that is not on the list here, or where a file of METIS under the LGPL would be compiled. Both ask
-`cargo metadata` and read nothing but the local sources of the crates.
+that is compiled into it on any platform, METIS, and their licence texts. `--check` fails where that
+file is out of date, where any crate or Python package that the project names has a licence that is
+not on the list here, or where a file of METIS under the LGPL would be compiled. Both use `cargo
+metadata` and read only the local sources of the crates.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""A wheel as a user gets it: installed into a new environment, where it runs the demo.
+"""Tests a wheel as a user would: installs it into a new environment and runs the demo there.
 
 `python scripts/try_wheel.py dist` takes the one wheel of a folder. It fails where the wheel lacks
 its licence files, cannot be installed, is not what the new environment imports, or where the demo

@@ -1,10 +1,10 @@
 """Sliding contact: stiff and extreme scenes against the moved surface itself and 32 digits.
 
-The displacements are compared with those that the same walls and normals leave a body in
-equilibrium with: u = u_p + Z y, N u_p = N (c − x) + g, Z spanning the null space of the normals N,
-and Zᵀ f(u) = 0 refined with 32 digits. Nothing of cmfsim is in it but the normals at the end, and
-these are held against the facets of the wall; where it bends, also the points that nodes rest on,
-for nodes feel facets as curved and edges as round.
+The displacements are compared with those of a body in equilibrium under the same walls and normals:
+u = u_p + Z y, N u_p = N (c − x) + g, Z spanning the null space of the normals N, and Zᵀ f(u) = 0
+refined with 32 digits. Only the final normals come from cmfsim, and these are compared with the
+facets of the wall. Where the wall bends, the contact points also come from cmfsim, because its
+facets are curved and its edges rounded.
 """
 
 from __future__ import annotations

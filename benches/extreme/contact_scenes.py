@@ -1,4 +1,4 @@
-"""Bodies on walls: flat, creased, bumpy, closed round the body, or all that holds it."""
+"""Bodies on walls: flat, creased, bumpy, closed round the body, or the only constraint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""True distances to a triangle surface, by every triangle in turn: no tree, no code of cmfsim."""
+"""True distances to a triangle surface by testing every triangle: no tree, no code of cmfsim."""
 
 from __future__ import annotations
 

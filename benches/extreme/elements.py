@@ -2,7 +2,7 @@
 
 The error is from the displacements that an independent stiffness of the same element gives
 (`independent.py`), factored by scipy. The deflection is that of the tip over scikit-fem's quadratic
-tets on a mesh twice as fine: what the element makes of the tissue, not the solver of the element.
+tets on a mesh twice as fine: it measures the element, not the solver.
 """
 
 from __future__ import annotations

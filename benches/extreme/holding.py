@@ -1,4 +1,4 @@
-"""Linear cases about what holds a body: smallest meshes, islands, hinges, arches."""
+"""Linear cases on the constraints of a body: smallest meshes, islands, hinges, arches."""
 
 from __future__ import annotations
 

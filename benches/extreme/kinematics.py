@@ -1,7 +1,7 @@
-"""Large deformation: closed forms, and forces that scikit-fem finds in balance.
+"""Large deformation: closed forms, and balance of forces computed by scikit-fem.
 
-Where there is no closed form the error is the step that Newton's method would still take from the
-forces of `independent.py`, with the tangent of cmfsim: rest means that it is nothing.
+Without a closed form, the error is the step that Newton's method would still take from the forces
+of `independent.py`, with the tangent of cmfsim; at equilibrium this step is zero.
 """
 
 from __future__ import annotations

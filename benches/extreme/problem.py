@@ -1,4 +1,4 @@
-"""What one linear case is made of, and the meshes that the suite squashes and joins."""
+"""The parts of one linear case, and the meshes that the suite deforms and joins."""
 
 from __future__ import annotations
 

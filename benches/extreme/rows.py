@@ -1,4 +1,4 @@
-"""What a case of the suite asks and what a method made of it, and what every suite allows."""
+"""A case of the suite, the result of a method, and the tolerances of every suite."""
 
 from __future__ import annotations
 

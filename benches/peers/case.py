@@ -1,6 +1,6 @@
-"""What the runner and every adapter share: the case, the stage clock and the result.
+"""Shared by the runner and every adapter: the case, the stage clock and the result.
 
-Needs numpy alone, so it loads in every interpreter a peer may bring.
+It needs only numpy, so that it can be loaded in the interpreter of every peer.
 """
 
 from __future__ import annotations

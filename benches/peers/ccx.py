@@ -2,8 +2,8 @@
 
 Parsing, assembly, factor and output happen inside one process, so they count together as "solve",
 and there is no next plan with the factor kept. The `.frd` keeps 6 significant digits: a difference
-of some 1e-6 of the largest displacement is rounding of the output, not of the solver. ccx cuts
-input fields silently after 20 characters, so numbers are written with 12 digits, which always fit.
+of some 1e-6 of the largest displacement is rounding of the output, not of the solver. ccx silently
+truncates input fields after 20 characters, so numbers are written with 12 digits, which always fit.
 """
 
 from __future__ import annotations

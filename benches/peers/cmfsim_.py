@@ -1,4 +1,4 @@
-"""cmfsim itself, by the public API alone."""
+"""cmfsim itself, through its public API only."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@
         --threads 2 --repeat 3 --out results.json --markdown table.md
 
 Every measurement is a fresh process pinned to `--threads` cores. Repeats are interleaved (A B C A B
-C), so that a disturbance of the machine meets all peers alike. The README beside this file says how
-the peers are installed and what the columns mean.
+C), so that a disturbance of the machine affects all peers alike. The README next to this file
+explains how to install the peers and what the columns mean.
 """
 
 from __future__ import annotations

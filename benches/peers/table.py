@@ -102,7 +102,7 @@ def markdown(study: dict) -> str:
     ]
     others = [run["other_cores"] for _, run in runs if run.get("other_cores") is not None]
     if others:
-        text[0] += f" Other processes kept {median(others):.2f} cores busy"
+        text[0] += f" Other processes used {median(others):.2f} cores"
         text[0] += f" (median of the runs; {max(others):.2f} at most)."
         if median(others) > IDLE:
             text += ["", "The machine was not idle: wall times are disturbed, CPU times less so."]

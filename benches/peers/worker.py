@@ -1,7 +1,7 @@
-"""Runs one peer on one case in this process; `run.py` starts it afresh for every measurement.
+"""Runs one peer on one case in this process; `run.py` starts a new one for every measurement.
 
 Stages: "set-up", "assembly", "factor", "solve" make the total (case in memory to displacements in
-memory); "import", "compile" and "next plan" are kept apart.
+memory); "import", "compile" and "next plan" are reported separately.
 """
 
 from __future__ import annotations

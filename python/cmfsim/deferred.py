@@ -1,4 +1,4 @@
-"""Names that a package loads when they are first asked for: a scene pays for what it has."""
+"""Names that a package loads on first use, so that a scene loads only what it needs."""
 
 import re
 from collections.abc import Callable

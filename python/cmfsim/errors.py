@@ -1,7 +1,7 @@
 """The exception family, how Python code of the package raises it, and missing optional packages.
 
-The classes are defined by the extension, so that an error means the same wherever it is found.
-Where the input is at fault the error is a `ValueError` too.
+The classes are defined by the extension, so that an error is the same class wherever it is
+detected. If the input is at fault, the error is also a `ValueError`.
 """
 
 from importlib import import_module
@@ -47,11 +47,11 @@ __all__ = [
 
 
 class BoundaryInputError(BoundaryError, ValueError):
-    """A motion, plan or boundary that cannot be meant."""
+    """An invalid motion, plan or boundary."""
 
 
 class CaseInputError(CaseError, ValueError):
-    """A scene or case, in memory or on disk, that cannot be meant."""
+    """An invalid scene or case, in memory or on disk."""
 
 
 class UnpairedError(CaseInputError):
@@ -59,11 +59,11 @@ class UnpairedError(CaseInputError):
 
 
 class CalibrationError(CaseInputError):
-    """A calibration that does not fit the prediction, or that is too small for what is asked."""
+    """A calibration that does not match the prediction, or that is too small for the request."""
 
 
 class MaterialInputError(MaterialError, ValueError):
-    """Options of a tissue that cannot be meant."""
+    """Invalid options of a tissue."""
 
 
 class MeshInputError(MeshError, ValueError):
@@ -71,7 +71,7 @@ class MeshInputError(MeshError, ValueError):
 
 
 class LandmarkInputError(LandmarkError, ValueError):
-    """Landmarks, in memory or on disk, that cannot be meant."""
+    """Invalid landmarks, in memory or on disk."""
 
 
 class ImageInputError(ImageError, ValueError):
@@ -79,7 +79,7 @@ class ImageInputError(ImageError, ValueError):
 
 
 class RegistrationInputError(RegistrationError, ValueError):
-    """Points, surfaces or volumes that cannot be brought together as they are."""
+    """Points, surfaces or volumes that cannot be registered."""
 
 
 def error_text(error: BaseException) -> str:
@@ -97,16 +97,16 @@ _IMPORTING = RLock()
 def third_party(
     module: str, purpose: str, extra: str, error: type[CmfsimError] = CaseInputError
 ) -> Any:
-    """A module of an optional dependency; where it is missing, the pip line that installs it.
+    """A module of an optional dependency; an error names the pip line for a missing one.
 
     Parameters
     ----------
     module : str
         As `import` takes it: "scipy.ndimage".
     purpose : str
-        What needs it, as the beginning of a sentence: "bones are cut".
+        Its use, as the beginning of a sentence: "bones are cut".
     extra : str
-        The extra of cmfsim that brings it.
+        The extra of cmfsim that installs it.
     error : type of CmfsimError
         What to raise.
 

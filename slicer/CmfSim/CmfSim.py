@@ -30,7 +30,7 @@ INTERVAL = 300
 
 
 class CmfSim(ScriptedLoadableModule):
-    """The module as Slicer lists it."""
+    """The module in Slicer's list."""
 
     def __init__(self, parent):
         super().__init__(parent)
@@ -53,7 +53,7 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
     """Choosers, a table of segments, a button, a bar."""
 
     def setup(self):
-        """Builds the panel; nothing is installed and nothing is imported of cmfsim here."""
+        """Builds the panel; cmfsim is neither installed nor imported here."""
         super().setup()
         self.logic = CmfSimLogic()
         self.run = None
@@ -92,7 +92,10 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
         form = self._section("Head before the operation")
         model, points = ["vtkMRMLModelNode"], ["vtkMRMLMarkupsFiducialNode"]
         self.volume = self._chooser(
-            form, "CT volume:", ["vtkMRMLScalarVolumeNode"], "In HU; or leave it and choose a skin"
+            form,
+            "CT volume:",
+            ["vtkMRMLScalarVolumeNode"],
+            "In HU; leave empty to use a skin model",
         )
         self.skin = self._chooser(form, "Skin model:", model, "Where no CT is chosen")
         self.skull = self._chooser(form, "Skull landmarks:", points, "Needed for muscles and cuts")
@@ -151,7 +154,7 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
             yield name.currentText.strip(), model.currentNode(), transform.currentNode()
 
     def onButton(self):
-        """Starts a prediction, or stops the one that runs."""
+        """Starts a prediction, or stops the running one."""
         if self.run is not None:
             self.run.stop()
             return
@@ -175,7 +178,7 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
         self.timer.start()
 
     def onTimer(self):
-        """Shows how far the prediction is, and its face when it is done."""
+        """Shows the progress of the prediction, and its face at the end."""
         for line in self.run.poll():
             self.status.text = line.text
             if line.share is not None:
@@ -200,7 +203,7 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
 
 
 class CmfSimLogic(ScriptedLoadableModuleLogic):
-    """What needs Slicer: saving nodes, matrices of transforms, showing the face."""
+    """The parts that need Slicer: saving nodes, matrices of transforms, showing the face."""
 
     def __init__(self):
         super().__init__()
@@ -229,7 +232,7 @@ class CmfSimLogic(ScriptedLoadableModuleLogic):
         return found
 
     def choice(self, volume, skin, rows, marks, settings):
-        """What was chosen, with every node saved into a new folder."""
+        """The choice, with every node saved into a new folder."""
         self.folder = Path(tempfile.mkdtemp(prefix="CmfSim-", dir=slicer.app.temporaryPath))
         edge, model = settings
         made = Choice(edge_length=edge, model=model)
@@ -252,7 +255,7 @@ class CmfSimLogic(ScriptedLoadableModuleLogic):
         return path
 
     def _matrix(self, transform):
-        """What a transform does on its own: the rest of the head lies under its parent, too."""
+        """The effect of a transform alone: the rest of the head is under its parent, too."""
         if transform is None:
             return None
         matrix = vtk.vtkMatrix4x4()
@@ -276,7 +279,7 @@ class CmfSimTest(ScriptedLoadableModuleTest):
     """Run by Slicer: Reload and Test, or --testing."""
 
     def runTest(self):
-        """The panel and a choice that is not complete; the rest is tested without Slicer."""
+        """The panel with an incomplete choice; the rest is tested without Slicer."""
         self.setUp()
         self.test_a_choice_without_a_head_is_refused()
 

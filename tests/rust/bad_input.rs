@@ -702,7 +702,7 @@ fn numerical_failures_are_told_from_mistakes() {
             Solver,
             name,
             "3 iterations",
-            "mm was asked for"
+            "mm was requested"
         );
     }
     let options = StaticOptions { memory_limit: Some(1000), ..with_method(Method::Cholesky) };

@@ -178,11 +178,11 @@ impl Boundary {
         for (pair, TouchingPair { nodes, against }) in pairs.iter().enumerate() {
             let fail = |problem: String| Err(MtmError::TouchingPair { pair, problem });
             if nodes.is_empty() {
-                return fail("has no nodes: give it some or leave it out".into());
+                return fail("has no nodes: add some or remove it".into());
             }
             match against {
                 Against::Tissue(triangles) if triangles.is_empty() => {
-                    return fail("has no triangles: give it some or leave it out".into());
+                    return fail("has no triangles: add some or remove it".into());
                 }
                 Against::Bone { segment: Some(name), .. }
                     if !self.segments.iter().any(|s| s.name == *name) =>
@@ -253,9 +253,7 @@ impl Boundary {
                 return fail("is named twice".into());
             }
             if segment.joined.is_empty() && segment.sliding.is_empty() {
-                return fail(
-                    "has neither joined nor sliding nodes: give it some or leave it out".into(),
-                );
+                return fail("has neither joined nor sliding nodes: add some or remove it".into());
             }
             if !segment.sliding.is_empty() && segment.contact.is_none() {
                 return fail(format!(
@@ -474,7 +472,7 @@ pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a M
             Some((_, motion)) => Ok(motion),
             None => Err(fail(
                 segment,
-                "it is missing; a plan names every segment (the identity matrix: it stays)".into(),
+                "it is missing; a plan names every segment (identity matrix: no motion)".into(),
             )),
         })
         .collect()

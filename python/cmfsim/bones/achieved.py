@@ -107,7 +107,7 @@ class AchievedMotion(Frozen):
 
     @property
     def plan(self) -> Floats | MovedSurface:
-        """What a plan takes: the matrix, or the moved surface where it is not rigid."""
+        """The motion as a plan takes it: the matrix, or the moved surface if it is not rigid."""
         return self.matrix if self.is_rigid or self.moved is None else self.moved
 
     def as_dict(self) -> dict[str, Any]:
@@ -172,7 +172,7 @@ class AchievedPlan(Frozen):
         }
 
     def text(self) -> str:
-        """Translation and turn of each segment, as Table 2 of Kim et al. (2010) has them."""
+        """Translation and rotation of each segment, in the form of Table 2 of Kim et al. (2010)."""
         lines = [["segment", "left", "back", "up", "turn", "about axis", "rms", "kept"]]
         for name, found in self.motions.items():
             shift, axis = found.motion.translation, found.motion.axis
@@ -209,7 +209,8 @@ def measure_motion(
     centre : (3,) float64, mm, optional
         About which the turn is written. Default: the middle of the vertices before.
     tolerance : float, mm
-        The motion counts as rigid if the best rigid one reproduces every vertex to this.
+        The motion counts as rigid if the best rigid motion reproduces every vertex to this
+        tolerance.
 
     Returns
     -------
@@ -316,7 +317,7 @@ def achieved_plan(
     Parameters
     ----------
     segments : mapping of str to SurfaceData or BoneSegment
-        Cut as the surgeon cut them, where they were before the operation.
+        Cut as the surgeon cut them, in their positions before the operation.
     postoperative : SurfaceData, or mapping of str to SurfaceData
         The whole bone after the operation, or a surface for each segment. One with the triangles of
         its segment gives the motion by vertices; otherwise the segment is registered to it.
@@ -327,7 +328,7 @@ def achieved_plan(
         A segment that was not operated on, such as the cranium. Its residual motion corrects the
         alignment, and is thus subtracted from every other motion.
     centres : mapping of str to (3,) float64, mm, optional
-        About which turns are written. Default: the middle of each segment's vertices.
+        Centres of the rotations. Default: the middle of each segment's vertices.
     options : MatchOptions, optional
     beside : sequence of SurfaceData
         Further segments before the operation, whose motion is not needed. A cut face towards one
@@ -349,9 +350,9 @@ def achieved_plan(
     Notes
     -----
     Trimmed iterative closest points (Besl & McKay 1992; Chetverikov et al. 2002) start from the
-    segment's place before the operation and from 6 mm to each side, and continue from the best;
-    a robust fit to tangent planes follows, in which the size may change. A change of size is about
-    the segment's centre, and is not part of its motion.
+    segment's position before the operation and from 6 mm to each side, and continue from the best.
+    A robust fit to tangent planes follows, in which the size may change. A change of size is about
+    the segment's centre and is not part of its motion.
 
     Examples
     --------
@@ -457,8 +458,8 @@ def _targets(
     missing = [name for name in parts if name not in postoperative]
     if missing:
         raise RegistrationInputError(
-            f"there is no post-operative surface of {', '.join(missing)}: give one for each of "
-            f"{', '.join(parts)}, or one surface of the whole bone"
+            f"these segments have no post-operative surface: {', '.join(missing)}; give one for "
+            f"each of {', '.join(parts)}, or one surface of the whole bone"
         )
     for name in parts:
         check_instance(f"post-operative surface of {name!r}", postoperative[name], SurfaceData)

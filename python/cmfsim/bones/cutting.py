@@ -32,7 +32,7 @@ SURFACES_AT_ONCE = 2
 
 @dataclass(frozen=True)
 class CutOptions:
-    """How bones are cut.
+    """Options of cutting bones.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ def cut_bones(
     bones : mapping of str to ImageData
         Levels (positive inside) on one grid: "cranium" and "mandible" for the standard procedures.
     procedures : sequence of Procedure, or mapping of procedure name to options
-        Standard ones are made from top to bottom, then the others in their order.
+        Standard procedures are applied from top to bottom, then the others in their order.
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks, LPS; needed where procedures are given by name.
     options : CutOptions, optional
@@ -117,7 +117,7 @@ def cut_bones(
     -----
     The level of a piece is the minimum of the bone's level and the planes' signed distances, and
     that of the rest the minimum of the bone's level and their negative: no voxel is lost or counted
-    twice, and the cut lies on the plane to a fraction of a voxel.
+    twice, and the cut is on the plane to a fraction of a voxel.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def cut_bones(
             np.array_equal(getattr(level, n), getattr(first, n)) for n in ("spacing", "origin")
         )
         if not same:
-            raise CaseInputError(f"bone {name!r} lies on another grid than {next(iter(bones))!r}")
+            raise CaseInputError(f"bone {name!r} is not on the same grid as {next(iter(bones))!r}")
     placed = _placed(procedures, landmarks or {})
     findings = [f for p in placed for f in p.findings]
     pieces: dict[str, Levels] = {name: level.single for name, level in bones.items()}
@@ -166,7 +166,7 @@ def cut_bones(
 def segments_from_surfaces(
     levels: Mapping[str, ImageData], surfaces: Mapping[str, SurfaceData]
 ) -> tuple[BoneSegment, ...]:
-    """Bone segments from surfaces that are given: nothing is cut.
+    """Bone segments from given surfaces; nothing is cut.
 
     Parameters
     ----------
@@ -274,7 +274,9 @@ def _names_of_cut(procedure: Procedure, cut: Cut, pieces: Iterable[str]) -> tupl
         )
     rest_name = cut.rest or source
     if cut.segment in pieces or (rest_name != source and rest_name in pieces):
-        raise CaseInputError(f"{procedure.kind} makes {cut.segment!r}, which exists already")
+        raise CaseInputError(
+            f"{procedure.kind} makes {cut.segment!r}, but a segment of this name already exists"
+        )
     return source, rest_name
 
 

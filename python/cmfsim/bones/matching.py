@@ -33,7 +33,7 @@ MOST_STEPS = 300
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """How a bone segment is registered to the post-operative bone.
+    """Options of the registration of a bone segment to the post-operative bone.
 
     Attributes
     ----------
@@ -44,11 +44,12 @@ class MatchOptions:
         The search also starts this far to each side along each axis, for segments that moved far
         enough to be matched to neighbouring bone; 0: only from the place before the operation.
     max_angle : float, degrees
-        Between normals of partners: prevents matches of the inner side of a bone to its outer side.
+        Largest angle between normals of partners: prevents matching the inner to the outer side of
+        a bone.
     max_rms : float, mm
-        Of the partners at the end; a worse fit is an error.
+        RMS distance of the partners at the end; a worse fit is an error.
     least_share : float
-        Of the vertices that must have a partner at the end.
+        Share of the vertices that must have a partner at the end.
 
     Raises
     ------
@@ -114,10 +115,10 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
     if fit.rms > options.max_rms or share < options.least_share:
         raise RegistrationError(
             f"segment {name!r} does not fit the post-operative bone: {fit.rms:.2f} mm rms over "
-            f"{share:.0%} of its vertices, with the size that fits best (allowed "
-            f"{options.max_rms:g} mm, at least {options.least_share:.0%}); check that the scans "
-            "are aligned, that the segment is cut as it was in the operation, and that the scan "
-            "shows the whole bone; a larger trim ignores plates and new bone"
+            f"{share:.0%} of its vertices, at the best size (allowed {options.max_rms:g} mm, at "
+            f"least {options.least_share:.0%}); check that the scans are aligned, that the "
+            "segment is cut as it was in the operation, and that the scan shows the whole bone; "
+            "a larger trim ignores plates and new bone"
         )
     _LOG.info("segment %s: %.3f mm rms, %.0f %% kept", name, fit.rms, 100 * share)
     return fit
@@ -148,7 +149,7 @@ def _sized_start(
 
 
 def _shifts(options: MatchOptions) -> list[Floats]:
-    """Where a search starts: at the segment's place, and to each side of it."""
+    """Starting positions of a search: at the segment's position, and to each side of it."""
     shifts = [np.zeros(3)]
     if options.reach > 0.0:
         shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]

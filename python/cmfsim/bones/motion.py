@@ -115,8 +115,8 @@ def sound_motion(motion: MovedSurface) -> MovedSurface:
         keep[thin_triangles(vertices, triangles)[0]] = False
     if not keep.any():
         raise BoundaryInputError(
-            "no triangle of the moved surface has an area both before and after: give the bone "
-            "before, and the same bone after, in the same unit"
+            "no triangle of the moved surface has an area both before and after: give the same "
+            "bone before and after, in the same unit"
         )
     return _part(motion, triangles[keep])
 

@@ -74,7 +74,7 @@ def part_segment(
     if not parted:
         raise CaseInputError(
             f"none of the {len(pieces)} moved pieces lies in bone {segment.name!r}: give the "
-            "surface of this bone before and after, in the frame and unit of the case"
+            "surfaces of this bone before and after, both in the frame and unit of the case"
         )
     with ThreadPoolExecutor(SURFACES_AT_ONCE) as pool:
         made = pool.map(lambda name: surface_of_level(name, parted[name]), parted)

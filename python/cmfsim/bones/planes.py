@@ -117,7 +117,7 @@ class Procedure:
     options : mapping of str to float
         The distances (mm) and angles (degrees) that placed the planes, defaults included.
     findings : tuple of Finding
-        What to check in its placement.
+        Points to check in its placement.
     """
 
     kind: str
@@ -146,7 +146,7 @@ def free_cut(
     planes : tuple of CuttingPlane
         Normals point into the piece.
     rest : str, optional
-        What the bone is called afterwards; its own name by default.
+        Name of the remaining bone; by default its own name.
 
     Returns
     -------

@@ -54,8 +54,8 @@ def check_segments(segments: Sequence[BoneSegment], given: Collection[str] = ())
         key = _key(segment)
         if key in known:
             raise CaseError(
-                f"segments {known[key]!r} and {segment.name!r} have the same surface, vertex for "
-                "vertex: one of them would move with the other's tissue; if the case names one "
+                f"segments {known[key]!r} and {segment.name!r} have the same surface, vertex by "
+                "vertex, so that one would move with the other's tissue; if the case names one "
                 "file for two bones, correct it; otherwise report this as a bug in cmfsim"
             )
         known[key] = segment.name
@@ -81,7 +81,7 @@ def _check_lies_on_level(segment: BoneSegment, *, is_given: bool) -> None:
     why = "its surface was exchanged or damaged in processing: report this as a bug in cmfsim"
     least = LEAST_GIVEN_SHARE if is_given else LEAST_SHARE
     if is_given:
-        why = "check that each bone is given its own surface"
+        why = "check that the case names a different surface for each bone"
     if share < least:
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         first, past = block_of(inside)

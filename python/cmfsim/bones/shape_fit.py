@@ -213,8 +213,8 @@ def fit_shape(
         if not LEAST_SIZE < pose.scale < MOST_SIZE:
             raise RegistrationInputError(
                 f"the bone after the operation is {pose.scale:.3g} times as large as the segment "
-                f"(allowed {LEAST_SIZE:g} to {MOST_SIZE:g}): check the units of both, and whether "
-                "they are the same bone"
+                f"(allowed {LEAST_SIZE:g} to {MOST_SIZE:g}): check the units of both files, and "
+                "that they show the same bone"
             )
         if float(np.linalg.norm(step)) <= REST:
             break

@@ -62,7 +62,7 @@ RELIEFS = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
 
 @dataclass(frozen=True)
 class SheetOptions:
-    """How a contact sheet is made.
+    """Options of a contact sheet.
 
     Attributes
     ----------

@@ -90,7 +90,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
         except SystemExit as error:
             print(said.getvalue(), end="", file=sys.stderr)
             if error.code == BAD_INPUT:
-                lines = said.getvalue().strip().splitlines() or ["bad words"]
+                lines = said.getvalue().strip().splitlines() or ["invalid arguments"]
                 _print_json("UsageError", lines[-1], BAD_INPUT)
             raise
     if options.command is None:
@@ -115,7 +115,7 @@ def _run(options: argparse.Namespace) -> int:
     except (CmfsimError, OSError, MemoryError) as error:
         return _ended(options, error, FAILED)
     except KeyboardInterrupt:
-        text = "stopped; existing files are as they were"
+        text = "stopped; existing files are unchanged"
         print(f"cmfsim: {text}", file=sys.stderr)
         if getattr(options, "json", False):
             _print_json("KeyboardInterrupt", text, FAILED)

@@ -1,4 +1,4 @@
-"""The options by which commands are asked for a band."""
+"""The command-line options for a band."""
 
 import argparse
 from pathlib import Path
@@ -15,20 +15,23 @@ def add_band_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--band",
         action="store_true",
-        help="state how far to trust the face: a band in report, files and on the terminal",
+        help="add an uncertainty band of the face to the report, the files and the terminal output",
     )
     command.add_argument(
         "--calibration",
         metavar="FILE",
         type=Path,
-        help="calibration of the band, from cases whose outcome is known; without one it is "
-        "uncalibrated, and named so",
+        help="calibration of the band, from cases whose outcome is known; without one, the band "
+        "is marked as uncalibrated",
     )
     command.add_argument(
-        "--coverage", metavar="SHARE", type=float, help="of the band (default 0.9, 90 %%)"
+        "--coverage",
+        metavar="SHARE",
+        type=float,
+        help="coverage of the band (default 0.9, that is 90 %%)",
     )
     command.add_argument(
-        "--group", metavar="NAME", help="use the calibration cases of this group alone"
+        "--group", metavar="NAME", help="use only the calibration cases of this group"
     )
 
 

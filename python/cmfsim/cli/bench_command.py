@@ -108,7 +108,7 @@ def _text(found: Frontier) -> str:
     failed = sum(bool(row.failure) for row in found.rows)
     if failed:
         lines.append(
-            f"  {failed} of {len(found.rows)} choices were refused or failed: see the page"
+            f"  {failed} of {len(found.rows)} choices were refused or failed: see frontier.md"
         )
     lines.append(f"  base {base_verdict(base)}")
     return "\n".join(lines)

@@ -108,8 +108,8 @@ def _warn_of_other_state(case: Case, path: Path) -> None:
     made_for = MADE_FOR.search(path.read_text(encoding="utf-8"))
     if made_for is not None and made_for[1] != plan_key(case):
         _log.warning(
-            "%s: was made for another case, or for other images, landmarks or cuts of this one: "
-            "check the motions below, or make the planning page again",
+            "%s: this plan was made for another case, or for other images, landmarks or cuts of "
+            "this case: check the motions below, or create the planning page again",
             path,
         )
 

@@ -1,4 +1,4 @@
-"""What is no error of any model, as the terminal states it."""
+"""Terminal text on errors that do not come from any model."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,7 +15,7 @@ def not_operated_line(found: Mapping[str, Any] | None) -> str:
         "not_operated" of `metrics.json`.
     """
     if found is None:
-        return "where nothing was operated on: not known, the scans do not both show it"
+        return "where nothing was operated on: unknown, because not both scans show these regions"
     whole = found["regions"]["whole"]
     return (
         f"where nothing was operated on: {whole['mean_mm']:.2f} mm on average, "

@@ -88,7 +88,7 @@ def _write(folder: Path, head: ProposedHead) -> tuple[list[str], tuple[Finding, 
                 "landmarks-no-picture",
                 f"the picture was not drawn: {error}",
                 where=str(folder / PICTURE),
-                why="the landmarks should be looked at before they are used",
+                why="the landmarks should be checked before they are used",
                 fix="open the files in 3D Slicer together with the head",
             )
         )
@@ -135,7 +135,7 @@ def _print(report: Mapping[str, Any], found: ProposedLandmarks) -> None:
         values = np.array(list(apart.values()))
         if len(values):
             print(
-                f"{kind}: {values.mean():.1f} mm on average from those that the case gives, "
+                f"{kind}: {values.mean():.1f} mm on average from the landmarks of the case, "
                 f"{values.max():.1f} mm at most ({max(apart, key=lambda name: apart[name])})"
             )
     for name in report["files"]:

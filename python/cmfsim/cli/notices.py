@@ -27,7 +27,7 @@ class FindingsError(Exception):
 
 
 class Notices:
-    """The findings of a command, each once.
+    """The findings of a command, without duplicates.
 
     Warnings and errors are printed on standard error as they come, grouped by kind, and again by
     `summarise`; notes are counted there. Use `add` as `on_findings` of the stages.
@@ -56,7 +56,7 @@ class Notices:
         Parameters
         ----------
         where : str
-            Where all findings stand in full, for the last line.
+            The file that lists all findings in full, for the last line.
         """
         groups = [group for group in grouped(self._found) if group.severity != "note"]
         if not groups and (self._quiet or not self._found):

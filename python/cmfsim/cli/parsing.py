@@ -41,7 +41,8 @@ def make_parser() -> argparse.ArgumentParser:
     """The parser of every command; `options.run` is the function that does it."""
     parser = argparse.ArgumentParser(
         prog="cmfsim",
-        description="Soft tissue after cranio-maxillofacial surgery, by the mass-tensor model.",
+        description="Predict soft tissue after cranio-maxillofacial surgery with the "
+        "mass-tensor model.",
         epilog="Exit codes: 0 done, 1 failed, 2 bad input. For research, not a medical device.",
     )
     parser.add_argument("--version", action="version", version=f"cmfsim {__version__}")
@@ -51,7 +52,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--json", action="store_true", help="print the result, or the error, as a JSON object"
     )
     common.add_argument(
-        "-q", "--quiet", action="store_true", help="print no progress, only warnings and errors"
+        "-q", "--quiet", action="store_true", help="print only warnings and errors, no progress"
     )
     _add_case_commands(commands, common)
     _add_scene_commands(commands, common)
@@ -63,7 +64,9 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     named = argparse.ArgumentParser(add_help=False, parents=[common])
-    named.add_argument("case", metavar="CASE", type=Path, help="case.toml, or its folder")
+    named.add_argument(
+        "case", metavar="CASE", type=Path, help="case.toml, or the folder that contains it"
+    )
 
     _add_demo(commands, common)
     _add_init(commands, common)
@@ -147,7 +150,7 @@ def _add_view(commands: Any, common: argparse.ArgumentParser) -> None:
         help="which of several predictions (default: the last of H, M, H+S, M+S)",
     )
     view.add_argument(
-        "--screenshot", metavar="PNG", type=Path, help="write a picture, open no window"
+        "--screenshot", metavar="PNG", type=Path, help="write a picture instead of opening a window"
     )
     view.set_defaults(run=view_command.view)
 
@@ -158,7 +161,10 @@ def _add_phantom(commands: Any, common: argparse.ArgumentParser) -> None:
     )
     phantom.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
     phantom.add_argument(
-        "--person", metavar="N", type=int, help="number of the person; each N is a different one"
+        "--person",
+        metavar="N",
+        type=int,
+        help="number of the person; each N gives a different head",
     )
     phantom.add_argument(
         "--spacing", metavar="MM", type=float, default=1.0, help="CT voxel size (default 1)"
@@ -191,7 +197,7 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     study.set_defaults(run=study_commands.study)
 
     report = commands.add_parser(
-        "report", parents=[common], help="regenerate the report of a folder of results"
+        "report", parents=[common], help="regenerate the report of a results folder"
     )
     report.add_argument("folder", metavar="FOLDER", type=Path, help="folder written by predict")
     report.set_defaults(run=study_commands.report)
@@ -199,7 +205,7 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
 
 def _add_predict(commands: Any, changed: argparse.ArgumentParser) -> None:
     predict = commands.add_parser(
-        "predict", parents=[changed], help="predict the face after the operation"
+        "predict", parents=[changed], help="predict the post-operative face"
     )
     predict.add_argument(
         "--model",
@@ -219,7 +225,7 @@ def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
     plan = commands.add_parser(
         "plan",
         parents=[changed],
-        help="write a page on which you move bones and see the face follow",
+        help="write a page on which you move the bones and the face follows",
         epilog="The page is a single file that needs neither a server nor a network.",
     )
     plan.add_argument("--model", choices=MODELS, default="M+S", help="model (default M+S)")
@@ -228,14 +234,14 @@ def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
         metavar="N",
         type=int,
         default=plan_command.TRIALS,
-        help=f"exact solutions that measure the page's error (default {plan_command.TRIALS})",
+        help=f"exact solutions for measuring the error of the page (default {plan_command.TRIALS})",
     )
     plan.add_argument(
         "--corrections",
         metavar="N",
         type=int,
         default=CORRECTIONS,
-        help="exact solutions that correct the face for other plans than the case's, if tissue "
+        help="exact solutions for correcting the face at plans other than the case's, if tissue "
         f"slides; 0 for none (default {CORRECTIONS})",
     )
     plan.add_argument(
@@ -262,14 +268,16 @@ def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
 
 def _add_evaluate(commands: Any, changed: argparse.ArgumentParser) -> None:
     evaluate = commands.add_parser(
-        "evaluate", parents=[changed], help="predict the face, and compare it with the real one"
+        "evaluate",
+        parents=[changed],
+        help="predict the face, and compare it with the post-operative face",
     )
     evaluate.add_argument("--model", **MODEL_CHOICES, help="as in predict (default all)")
     evaluate.add_argument(
         "--fit-thickness",
         action="store_true",
         help="fit one change of thickness (swelling, weight) where nothing was operated on, and "
-        "state the errors with it as well",
+        "also report the errors with this change",
     )
     _add_output_options(evaluate)
     evaluate.set_defaults(run=study_commands.evaluate)
@@ -341,7 +349,7 @@ def _add_landmarks(commands: Any, named: argparse.ArgumentParser) -> None:
     landmarks = commands.add_parser(
         "landmarks",
         parents=[named],
-        help="find the landmarks of skull and skin, and draw them for confirmation",
+        help="find the landmarks of skull and skin, and draw them for checking",
     )
     landmarks.add_argument(
         "-o", "--output", metavar="OUT", type=Path, help="output folder (default: that of the case)"
@@ -391,7 +399,11 @@ def _add_template_import(actions: Any, common: argparse.ArgumentParser) -> None:
     imports.add_argument("atlas", choices=["bodyparts3d"], help="which atlas")
     imports.add_argument("folder", metavar="FOLDER", type=Path, help="folder of the atlas files")
     imports.add_argument(
-        "--landmarks", metavar="FILE", type=Path, required=True, help="on its bones (.mrk.json)"
+        "--landmarks",
+        metavar="FILE",
+        type=Path,
+        required=True,
+        help="skull landmarks on the bones of the atlas (.mrk.json)",
     )
     imports.add_argument(
         "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz file"
@@ -404,13 +416,15 @@ def _add_template_import(actions: Any, common: argparse.ArgumentParser) -> None:
 
 def _add_template_morph(actions: Any, named: argparse.ArgumentParser) -> None:
     morph = actions.add_parser(
-        "morph", parents=[named], help="map the muscles of a template to a patient by landmarks"
+        "morph",
+        parents=[named],
+        help="transfer the muscles of a template to a patient by landmarks",
     )
     morph.add_argument(
         "landmarks",
         metavar="LANDMARKS",
         type=Path,
-        help="landmarks of the patient, .mrk.json or .fcsv",
+        help="skull landmarks of the patient, .mrk.json or .fcsv",
     )
     morph.add_argument(
         "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz file"
@@ -442,8 +456,8 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     frontier = actions.add_parser(
         "frontier",
         parents=[common],
-        help="measure the cost and the accuracy of each choice in a prediction",
-        epilog="Finished runs are kept in the folder: an interrupted sweep is resumed.",
+        help="measure the run time and the accuracy of each setting of a prediction",
+        epilog="Finished runs are kept in the output folder, so an interrupted sweep is resumed.",
     )
     frontier.add_argument(
         "case", metavar="CASE", type=Path, nargs="?", help="case.toml (default: a synthetic head)"
@@ -457,15 +471,27 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         help=f"output folder (default {bench_command.FRONTIER_FOLDER})",
     )
     frontier.add_argument(
-        "--edge-length", metavar="H", type=float, help="of the base run, mm (default: the case's)"
+        "--edge-length",
+        metavar="H",
+        type=float,
+        help="edge length of the base run, mm (default: that of the case)",
     )
     frontier.add_argument("--model", choices=MODELS, help="model of the base run (default M+S)")
     frontier.add_argument(
-        "--edges", metavar="H", type=float, nargs="+", default=EDGES, help="edges of the grid, mm"
+        "--edges",
+        metavar="H",
+        type=float,
+        nargs="+",
+        default=EDGES,
+        help="edge lengths of the grid, mm",
     )
     for name, known in (("elements", ELEMENTS), ("kinematics", KINEMATICS)):
         frontier.add_argument(
-            f"--{name}", choices=known, nargs="+", default=known, help="of the grid (default all)"
+            f"--{name}",
+            choices=known,
+            nargs="+",
+            default=known,
+            help=f"{name} of the grid (default all)",
         )
     frontier.add_argument(
         "--factors",
@@ -473,10 +499,13 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         nargs="*",
         default=list(FACTORS),
         metavar="FACTOR",
-        help=f"choices to vary one at a time, none if empty (default {' '.join(FACTORS)})",
+        help=f"settings to vary one at a time, none if empty (default {' '.join(FACTORS)})",
     )
     frontier.add_argument(
-        "--reference-edge", metavar="H", type=float, help="mm (default: the smallest of the sweep)"
+        "--reference-edge",
+        metavar="H",
+        type=float,
+        help="edge length of the reference, mm (default: the smallest of the sweep)",
     )
     frontier.add_argument(
         "--reference-kinematics",
@@ -487,9 +516,15 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     frontier.add_argument(
         "--repeats", metavar="N", type=int, default=3, help="timing rounds (default 3)"
     )
-    frontier.add_argument("--threads", metavar="N", type=int, help="(default: all cores)")
     frontier.add_argument(
-        "--time-limit", metavar="S", type=float, default=600.0, help="per job (default 600 s)"
+        "--threads", metavar="N", type=int, help="number of threads (default: all cores)"
+    )
+    frontier.add_argument(
+        "--time-limit",
+        metavar="S",
+        type=float,
+        default=600.0,
+        help="time limit per job, s (default 600)",
     )
     frontier.add_argument("--fresh", action="store_true", help="repeat finished runs")
     frontier.set_defaults(run=bench_command.frontier)

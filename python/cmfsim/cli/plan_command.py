@@ -134,7 +134,7 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
         errors = expected_error(planning, trials=options.trials, progress=progress.stage)
         found = None
         if targets is not None:
-            progress.stage("searching the plan of the face")
+            progress.stage("searching for the plan of the desired face")
             found = plan_for_face(planning, targets(planning), _search(options, planning))
         progress.stage("making the page")
         wished = {} if found is None else {TOWARDS: found.plan}
@@ -150,7 +150,7 @@ def _serve(options: argparse.Namespace, made: _Made, case_file: str) -> None:
         if options.json:
             print(json.dumps({"url": url}), flush=True)
         else:
-            print(f"page   {url}\nOn this machine alone; Ctrl-C ends it.", flush=True)
+            print(f"page   {url}\nOnly this machine can open it; stop with Ctrl-C.", flush=True)
         if not options.no_open and has_screen() and sys.stdout.isatty():
             webbrowser.open(url)
 
@@ -162,7 +162,7 @@ def _serve(options: argparse.Namespace, made: _Made, case_file: str) -> None:
 def _error_text(errors: ExpectedError) -> str:
     """The error of the page as measured by exact solutions, in one line."""
     if not errors.slides:
-        return "none: no tissue slides, and the page is exact for every plan"
+        return "none: no tissue slides, so the page is exact for every plan"
     solved = [trial for trial in errors.trials if not trial.failed]
     failed = len(errors.trials) - len(solved)
     if not solved:
@@ -181,7 +181,7 @@ def _correction_text(correction: PlanCorrection) -> str:
     usual = float(np.percentile(correction.left_out, USUAL))
     return (
         f"corrected by {len(correction.plans)} other plans: {before:.2f} mm at most before, "
-        f"{after:.2f} mm where each was left out (nine of ten: {usual:.2f} mm)"
+        f"{after:.2f} mm when each is predicted from the others (nine of ten: {usual:.2f} mm)"
     )
 
 
@@ -227,11 +227,11 @@ def _towards_text(found: FacePlan, path: Path) -> str:
     """The plan that was found, its error, and what the desired face leaves undetermined."""
     lines = [f"wish   {name}: {motion.text}" for name, motion in found.motions.items()]
     rms = [float(np.sqrt((row**2).mean())) for row in found.exact_residuals]
-    lines.append(f"       solved exactly, it is off by {TARGET_STD * max(rms):.2f} mm RMS")
+    lines.append(f"       the exact solution is off by {TARGET_STD * max(rms):.2f} mm RMS")
     if found.at_bounds:
         lines.append(f"       at its bound: {', '.join(found.at_bounds)}")
     if found.undetermined:
-        lines.append(f"       the wish leaves open: {', '.join(found.undetermined)}")
+        lines.append(f"       the desired face does not determine: {', '.join(found.undetermined)}")
     if not found.converged:
-        lines.append("       the search did not converge: take it as a first guess")
+        lines.append("       the search did not converge: use the result only as a first guess")
     return "\n".join(escaped(line) for line in [*lines, f"       saved as {path}"])

@@ -22,7 +22,7 @@ def _add_virtual_patients(commands: Any, common: argparse.ArgumentParser) -> Non
     virtual = commands.add_parser(
         "virtual-patients",
         parents=[common],
-        help="write virtual patients with the face after their operation (in silico)",
+        help="write virtual patients with their post-operative faces (in silico)",
         epilog="Existing patients with the same settings are kept.",
     )
     virtual.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
@@ -37,14 +37,14 @@ def _add_virtual_patients(commands: Any, common: argparse.ArgumentParser) -> Non
         "--count",
         metavar="N",
         type=int,
-        help="instead of named ones, N patients drawn at random: shape, tissue, operation, plan",
+        help="draw N patients at random (shape, tissue, operation, plan) instead of --patients",
     )
     virtual.add_argument(
         "--workers",
         metavar="N",
         type=int,
         default=1,
-        help="drawn patients made at a time, a process each (default 1)",
+        help="number of drawn patients made at a time, one process each (default 1)",
     )
     virtual.add_argument("--seed", metavar="N", type=int, default=0, help="random seed (default 0)")
     virtual.add_argument(
@@ -67,12 +67,13 @@ def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
     benchmark = commands.add_parser(
         "benchmark",
         parents=[common],
-        help="score predictions of a population of virtual patients, by method and region",
-        epilog="A method enters with predictions/METHOD/PATIENT.npz (docs/benchmark.md). Results "
-        "are in FOLDER/benchmark, the same bytes each time but for the run times.",
+        help="score predictions for a population of virtual patients, by method and region",
+        epilog="To enter a method, add predictions/METHOD/PATIENT.npz (docs/benchmark.md). "
+        "Results are written to FOLDER/benchmark; except for the run times, they have "
+        "the same bytes each time.",
     )
     benchmark.add_argument(
-        "folder", metavar="FOLDER", type=Path, help="written by virtual-patients --count"
+        "folder", metavar="FOLDER", type=Path, help="folder written by virtual-patients --count"
     )
     benchmark.add_argument(
         "--entries",
@@ -80,8 +81,8 @@ def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
         nargs="*",
         choices=(*ENTRIES, *ON_REQUEST),
         default=list(ENTRIES),
-        help=f"entries of this package to predict first, none if empty (default "
-        f"{' '.join(ENTRIES)}; {' '.join(ON_REQUEST)} takes longer)",
+        help=f"entries of this package to run first, none if empty (default {' '.join(ENTRIES)}; "
+        f"{' '.join(ON_REQUEST)} takes longer)",
     )
     benchmark.add_argument(
         "--band",
@@ -89,15 +90,15 @@ def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=MODELS,
         default=[],
-        help="models whose band of 90 %% is calibrated on the part calibration, and tested on the "
-        "patients that are scored",
+        help="models whose band of 90 %% is calibrated on the part calibration and tested on "
+        "the scored patients",
     )
     benchmark.add_argument(
         "--band-parts",
         metavar="PART",
         nargs="*",
         choices=PARTS,
-        help="parts that bands are calibrated on (default calibration, where it is not scored)",
+        help="parts on which bands are calibrated (default calibration, unless it is scored)",
     )
     benchmark.add_argument(
         "--part", choices=PARTS, default=TEST, help="patients to score (default test)"
@@ -107,7 +108,7 @@ def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
         metavar="N",
         type=int,
         default=1,
-        help="patients predicted at a time, a process each (default 1)",
+        help="number of patients predicted at a time, one process each (default 1)",
     )
     benchmark.add_argument(
         "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"

@@ -58,7 +58,7 @@ def _check_output(output: Path, scene: Path) -> None:
     """Detects invalid options and outputs before the scene is solved."""
     if output.suffix not in result_suffixes():
         known = ", ".join(result_suffixes())
-        raise CaseInputError(f"{output.name}: results end in {known}, not {output.suffix!r}")
+        raise CaseInputError(f"{output.name}: a result file ends in {known}, not {output.suffix!r}")
     if not output.parent.is_dir():
         raise FileNotFoundError(f"{output.parent}: no such folder")
     if output.is_dir():

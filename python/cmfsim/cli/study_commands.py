@@ -150,7 +150,7 @@ def evaluate(options: argparse.Namespace) -> int:
         print(achieved_text(achieved))
     print(_plan_text(found.predictions[0].summary))
     print(not_operated_line(values["not_operated"]))
-    print(f"{escaped(case.name)}: distance from the face after the operation, mm")
+    print(f"{escaped(case.name)}: distance from the post-operative face, mm")
     print("  model        mean     SD   95 %    max   < 2 mm")
     for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
         figures = entry["regions"]["whole"]
@@ -202,7 +202,10 @@ def sensitivity(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(values, allow_nan=False))
         return DONE
-    print(f"{escaped(case.name)}, model {options.model}: mean distances from the case's own, mm")
+    print(
+        f"{escaped(case.name)}, model {options.model}: mean distances from the positions under "
+        "the case's own landmarks, mm"
+    )
     print("  trial  landmarks  muscles  masseter    skin  skin 95 %")
     for number, trial in enumerate(found.trials):
         masseter = [d for name, d in trial.muscle_deviation.items() if "masseter" in name]
@@ -341,14 +344,15 @@ def _print_failed(failed: Mapping[str, str]) -> None:
 
 def achieved_text(achieved: Mapping[str, Any]) -> str:
     """The motion of each segment in the operation, as in Table 2 of Kim et al. (2010)."""
-    lines = ["achieved plan: motion of each segment's middle, mm (L, P, S), and turn about it"]
+    lines = ["achieved plan: motion of each segment's middle, mm (L, P, S), and rotation about it"]
     for name, found in achieved["segments"].items():
         shift = " ".join(f"{c:+6.2f}" for c in found["translation_mm"])
         axis = ", ".join(f"{c:+.2f}" for c in found["axis"])
         how = (
-            f"vertex by vertex, rigid to {found['rms_mm']:.2f} mm rms"
+            f"vertex by vertex, {found['rms_mm']:.2f} mm rms from a rigid motion"
             if found["method"] == "vertices"
-            else f"laid on the bone to {found['rms_mm']:.2f} mm rms ({found['share']:.0%} of it)"
+            else f"registered to the bone within {found['rms_mm']:.2f} mm rms "
+            f"({found['share']:.0%} of it)"
         )
         lines.append(
             f"  {escaped(name):<14} {shift}  {found['angle_degrees']:5.2f}° about ({axis}), {how}"

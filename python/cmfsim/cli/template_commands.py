@@ -136,7 +136,7 @@ def show(options: argparse.Namespace) -> int:
 
 
 def _beside(output: Path, report: dict[str, Any]) -> dict[str, Any] | None:
-    """The report where it has a place: beside a folder's files, not in an archive."""
+    """The report, if it has a place: next to the files of a folder, not in an archive."""
     return None if output.suffix == ".npz" else report
 
 
@@ -146,7 +146,7 @@ def _chosen(template: MuscleTemplate, names: Sequence[str]) -> Musculature:
     bare = {name.removesuffix("_L").removesuffix("_R") for name in known}
     for name in names:
         if name not in known | bare:
-            raise CaseInputError(f"no muscle {name!r}; there are: {', '.join(sorted(bare))}")
+            raise CaseInputError(f"no muscle {name!r}; muscles are: {', '.join(sorted(bare))}")
     return Musculature(
         tuple(
             muscle
@@ -159,12 +159,12 @@ def _chosen(template: MuscleTemplate, names: Sequence[str]) -> Musculature:
 def _print_landmarks(muscles: MorphedMusculature) -> None:
     """How well the landmarks agree: the worst ones, by the distance the others would put them."""
     residual = max(muscles.residuals.values())
-    print(f"{len(muscles.landmarks)} landmarks, met to {residual:.2g} mm")
+    print(f"{len(muscles.landmarks)} landmarks, matched to {residual:.2g} mm")
     left_out = muscles.leave_one_out
     if left_out is None:
         return
     median = float(np.median(left_out.distances))
-    print(f"left out one by one, the others put them {median:.1f} mm off (median); worst:")
+    print(f"predicted from the others, each is off by {median:.1f} mm off (median); worst:")
     for line in left_out.table().splitlines()[: 1 + WORST_SHOWN]:
         print(f"  {escaped(line)}")
 

@@ -1,4 +1,4 @@
-"""What the command line prints for a person: errors, log lines, the stage of the work."""
+"""Output of the command line for people: errors, log lines, the stage of the work."""
 
 import logging
 import os

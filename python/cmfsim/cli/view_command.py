@@ -66,7 +66,7 @@ def parts_of(path: Path, model: str | None = None) -> list[ViewPart]:
     }
     if path.suffix.lower() not in readers:
         known = ", ".join(readers)
-        raise CaseInputError(f"{path.name}: folders and files ending in {known} can be shown")
+        raise CaseInputError(f"{path.name}: view displays folders, and files ending in {known}")
     return readers[path.suffix.lower()](path)
 
 
@@ -75,7 +75,7 @@ def _of_folder(folder: Path, model: str | None) -> list[ViewPart]:
     with contextlib.suppress(FileNotFoundError):
         found = {entry["model"]: place for place, entry in predictions_of(folder).items()}
         if model is not None and model not in found:
-            raise CaseInputError(f"{folder}: holds models {', '.join(found)}, not {model}")
+            raise CaseInputError(f"{folder}: contains the models {', '.join(found)}, not {model}")
         # The case's own prediction before those in folders by model.
         own = next((name for name, place in found.items() if place == folder), None)
         return _of_prediction(found[model or own or [*found][-1]])
@@ -84,7 +84,8 @@ def _of_folder(folder: Path, model: str | None) -> list[ViewPart]:
     if (folder / "case.toml").exists():
         return parts_of(folder / "case.toml", model)
     raise CaseInputError(
-        f"{folder}: holds no prediction.json, build.json or case.toml: nothing of cmfsim to show"
+        f"{folder}: contains no prediction.json, build.json or case.toml, so there is nothing to "
+        "display"
     )
 
 

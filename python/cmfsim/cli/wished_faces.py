@@ -35,7 +35,7 @@ def read_targets(path: Path) -> Callable[[PlanningModel], list[Target]]:
         return lambda _: [SurfaceTarget(wished, std=TARGET_STD)]
     if ending not in LANDMARKS:
         known = ", ".join((*SURFACES, ".mrk.json", ".fcsv"))
-        raise CaseInputError(f"{path.name}: a wished face ends in {known}")
+        raise CaseInputError(f"{path.name}: a file with a desired face ends in {known}")
     goals = {label_key(name): place for name, place in read_landmarks(path).items()}
 
     def targets(planning: PlanningModel) -> list[Target]:
@@ -43,7 +43,7 @@ def read_targets(path: Path) -> Callable[[PlanningModel], list[Target]]:
         both = [name for name in own if label_key(name) in goals]
         if not both:
             raise LandmarkInputError(
-                f"{path.name}: has no landmark of the case's skin, which are: "
+                f"{path.name}: has none of the case's skin landmarks, which are: "
                 f"{', '.join(own) or 'none'}"
             )
         places = np.array([own[name] for name in both])

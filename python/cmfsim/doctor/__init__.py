@@ -1,4 +1,4 @@
-"""What will go wrong with a case, said before any work is done: each with why and how to fix it.
+"""Problems of a case, reported before any work is done, each with its reason and its fix.
 
 `diagnose` reads the files of a case and looks; it changes and writes nothing. `evidence` is what
 was read, `placement` asks whether it lies where it should, `surfaces` whether it is sound,
@@ -40,15 +40,15 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Examination:
-    """What is known of a case before any work.
+    """The findings on a case before any work, and its plan in words.
 
     Attributes
     ----------
     findings : tuple of Finding
         Errors first, then warnings and notes.
     plan : mapping of str to ClinicalMotion
-        How each segment moves that the plan names, as far as it can be read. Empty for a plan that
-        is read off the bones after the operation, and where the files do not lie in one frame.
+        Motion of each segment in the plan, as far as it can be read. Empty for a plan that is
+        measured on the post-operative bones, and if the files are not in one frame.
     """
 
     findings: tuple[Finding, ...]
@@ -56,14 +56,14 @@ class Examination:
 
 
 def diagnose(case: CaseOrPath, models: Sequence[str] | None = None) -> tuple[Finding, ...]:
-    """What a person should know before a case is built: errors first, then warnings and notes.
+    """The findings on a case before it is built: errors first, then warnings and notes.
 
     Parameters
     ----------
     case : Case, or path of its file or folder
     models : sequence of str, optional
-        The models that are asked for, of "H", "M", "H+S" and "M+S": muscles are checked only if
-        one of them has muscles. Default: all that the case can be solved with.
+        The requested models, of "H", "M", "H+S" and "M+S": muscles are checked only if one of them
+        has muscles. Default: all models with which the case can be solved.
 
     Returns
     -------
@@ -72,8 +72,8 @@ def diagnose(case: CaseOrPath, models: Sequence[str] | None = None) -> tuple[Fin
 
     Notes
     -----
-    A fault that makes others is said alone: where a surface is in metres, nothing is said about its
-    landmarks.
+    A fault that causes others is reported alone: if a surface is in metres,
+    its landmarks are not reported.
 
     Examples
     --------
@@ -85,7 +85,7 @@ def diagnose(case: CaseOrPath, models: Sequence[str] | None = None) -> tuple[Fin
 
 
 def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examination:
-    """What `diagnose` finds, with the plan in a surgeon's words.
+    """The findings of `diagnose`, with the plan in clinical terms.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def check_after(evidence: Evidence) -> Iterator[Finding]:
             f"{len(far)} of {len(away)} landmarks lie more than {LANDMARK_WARNING:g} mm from the "
             f"skin after the operation, {away.max():.1f} mm at most: {', '.join(far[:4])}{more}",
             where=where,
-            why="these landmarks decide which points are compared: errors of the landmarks would "
-            "count as errors of the prediction",
-            fix="place them on the skin after the operation, not on the one before",
+            why="these landmarks decide which points are compared, so their errors would count "
+            "as errors of the prediction",
+            fix="place them on the post-operative skin, not on the pre-operative one",
         )

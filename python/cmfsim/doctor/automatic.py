@@ -1,4 +1,4 @@
-"""That landmarks will be found when the case is built, and what cannot be checked before."""
+"""The note that landmarks will be found during the build, and what cannot be checked before."""
 
 from collections.abc import Iterator
 
@@ -20,11 +20,11 @@ def check_automatic(evidence: Evidence) -> Iterator[Finding]:
     ]
     yield Finding.note(
         "landmarks-automatic",
-        "no landmarks are given: they are found when the case is built; not checked here: "
+        "the case names no landmarks, so the build will find them; the doctor does not check "
         + ", ".join(left),
         where=case.where("landmarks"),
-        why="what is placed from landmarks can be checked only once they are known; the build "
-        "stops if they are insufficient",
-        fix='run "cmfsim landmarks case.toml" to see them with their expected errors, and name its '
-        "files under [landmarks]: the doctor then checks all of it",
+        why="items placed from landmarks can be checked only when the landmarks are known; the "
+        "build stops if they are insufficient",
+        fix='run "cmfsim landmarks case.toml" to see them with their expected errors, and '
+        "name its files under [landmarks]; the doctor then checks everything",
     )

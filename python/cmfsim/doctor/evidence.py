@@ -209,7 +209,7 @@ def gather(case: Case) -> Evidence:
                 "tissue-preset",
                 f"preset is {case.tissue.preset!r}",
                 where=case.where("tissue.preset"),
-                why="no tissue can be built from it",
+                why="no tissue can be built from this preset",
                 fix=f"use one of: {', '.join(PRESETS)}",
             )
         )

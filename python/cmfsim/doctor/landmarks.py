@@ -66,9 +66,9 @@ LANDMARK_CODES = frozenset(
 )
 PLACED_FROM = {
     "skull": "cuts, muscles and the region are placed from it",
-    "skin": "the prediction is measured and the face divided by it",
+    "skin": "distances and the regions of the face depend on it",
 }
-AGAIN = "look at it in 3D Slicer, and place it again or correct its label"
+AGAIN = "check it in 3D Slicer, and place it again or correct its label"
 
 
 def nearest_of_surfaces(surfaces: Sequence[Surface]) -> Nearest:
@@ -205,10 +205,10 @@ def _off_surface(
             severity="error" if median > ANOTHER else "warning",
             code="landmarks-off",
             what=f"{int(far.sum())} of {n} landmarks of the {key} lie more than {FAR:g} mm from "
-            f"the {surface}, half of them by more than {median:.1f} mm",
+            f"the {surface}, and half of them by more than {median:.1f} mm",
             where=where,
-            why="so many cannot be placement errors: they belong to another patient, scan or "
-            f"frame, or the {surface} is not this patient's",
+            why="errors of placement do not explain so many: the landmarks belong to another "
+            f"patient, scan or frame, or the {surface} is not this patient's",
             fix="check that both files come from the same patient and the same scan",
         )
     for (name, point), offset, distance in zip(landmarks.items(), offsets, found, strict=True):
@@ -234,10 +234,10 @@ def _swapped(landmarks: Mapping[str, Floats], pair: tuple[str, str], where: str)
     apart = float(np.linalg.norm(landmarks[one] - landmarks[other]))
     return Finding.error(
         "landmarks-swapped",
-        f"{one} at {place_text(landmarks[one])} and {other} at {place_text(landmarks[other])} seem "
-        f"to be swapped: exchanged, they fit all the others ({apart:.0f} mm apart)",
+        f"{one} at {place_text(landmarks[one])} and {other} at {place_text(landmarks[other])} "
+        f"seem to be swapped: when exchanged, they fit all the others ({apart:.0f} mm apart)",
         where=where,
-        why="each pulls the muscles and cuts near it to the wrong place",
+        why="each pulls nearby muscles and cuts to the wrong place",
         fix="swap the two labels, or place both again",
     )
 
@@ -265,7 +265,7 @@ def _asymmetric(
         told.add(base)
         named |= {name} if base == name else {f"{base}_L", f"{base}_R"}
         what = (
-            f"{name} lies {0.5 * distance:.1f} mm off the midline that the other landmarks make"
+            f"{name} lies {0.5 * distance:.1f} mm off the midline of the other landmarks"
             if base == name
             else f"{base}_L and {base}_R deviate from mirror symmetry by {distance:.1f} mm, "
             "judged by the other landmarks"
@@ -274,9 +274,9 @@ def _asymmetric(
             "landmark-asymmetric",
             what,
             where=where,
-            why=f"{PLACED_FROM[key]}; overall asymmetry is allowed for, so one of them is "
+            why=f"{PLACED_FROM[key]}; overall asymmetry is taken into account, so one of them is "
             "misplaced or the bone is deformed there",
-            fix="look at both sides in 3D Slicer; place it again, or keep it if the bone is "
+            fix="check both sides in 3D Slicer; place it again, or keep it if the bone is "
             "asymmetric there",
         )
 

@@ -26,7 +26,7 @@ def check_lips(evidence: Evidence) -> Iterator[Finding]:
             "lips-method",
             f"contact of the lips is not solved by method = {case.solver.method!r}",
             where=case.where("solver.method"),
-            why="the solver would refuse the case",
+            why="the solver would end with an error",
             fix=f"write one of {', '.join(METHODS)}, or contact = false in [lips]",
         )
     if case.node_kinds.get("sliding") is False:
@@ -56,7 +56,8 @@ def check_lips(evidence: Evidence) -> Iterator[Finding]:
         "lips-landmarks-few",
         f"the skin landmarks {', '.join(missing)} are missing",
         where=case.where("landmarks.skin"),
-        why="the line between the lips and the corners of the mouth are then read off the skin "
-        "alone, unchecked; if the skin shows neither gap nor crease, the lips are not separated",
+        why="the line between the lips and the corners of the mouth are then found on the skin "
+        "alone and cannot be checked; if the skin shows neither gap nor crease, the lips "
+        "are not separated",
         fix="place them",
     )

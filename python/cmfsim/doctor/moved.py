@@ -50,8 +50,8 @@ FEW = 0.05
 MIRRORED = 0.1
 # What is left where vertices cannot be followed.
 BY_SHAPE = (
-    "or give the bone after as it was segmented or remeshed on its own: with other triangles it is "
-    "registered by its shape (it then moves rigidly, and a change of size is reported with its "
+    "or give the post-operative bone with its own triangles, as segmented or remeshed: it is "
+    "then registered by its shape (it moves rigidly, and a change of size is reported with its "
     "interval)"
 )
 # Vertices that a fit is made of.
@@ -69,7 +69,7 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
                 "moved-not-paired",
                 str(moved),
                 where=where,
-                why=f"it is unknown where each vertex of {name} went",
+                why=f"the motion of each vertex of {name} is unknown",
                 fix="export the bone before, and the same mesh after the motion",
             )
             continue
@@ -91,8 +91,8 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             "moved-all",
             f"every bone moves: {', '.join(least)}, by {min(least.values()):.1f} mm at least",
             where=case.where("plan"),
-            why="jaw surgery does not move the skull above the jaws; if the scans are in different "
-            "frames, the whole face is moved by the difference",
+            why="jaw surgery does not move the skull above the jaws; if the scans are in "
+            "different frames, the whole face would move by the difference",
             fix="register the post-operative scan to the pre-operative one on the skull "
             "(register_volumes, icp)",
         )
@@ -102,12 +102,13 @@ def _remeshed(name: str, where: str, before: SurfaceData, after: SurfaceData) ->
     """A bone whose vertices cannot be followed: the build finds its motion by its shape."""
     return Finding.note(
         "moved-remeshed",
-        f"{name} has {len(after.triangles)} triangles after and {len(before.triangles)} before, or "
-        "numbers them differently: its rigid motion is found by its shape",
+        f"{name} has {len(after.triangles)} triangles after and {len(before.triangles)} before, "
+        "or numbers them differently, so its rigid motion is found by its shape",
         where=where,
-        why="vertices cannot be followed; a bone that was cut into pieces moves as its largest",
-        fix="nothing to do if it is one piece, segmented or remeshed twice; for several pieces, "
-        "name each of them",
+        why="vertices cannot be followed; a bone that was cut into pieces gets the motion of "
+        "its largest piece",
+        fix="nothing to do if the bone is one piece that was segmented or remeshed twice; "
+        "otherwise name each piece",
     )
 
 
@@ -120,9 +121,10 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
     if _is_mirrored(here, there):
         yield Finding.error(
             "moved-mirrored",
-            f"{name} is mirrored after against before",
+            f"{name} is mirrored after the operation relative to before",
             where=where,
-            why="no bone motion does that: one file has left and right, or an axis, swapped",
+            why="no motion mirrors a bone: in one of the files, left and right or another axis "
+            "are swapped",
             fix="export both in one frame (LPS or RAS)",
         )
         return
@@ -130,8 +132,8 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
     if along < ALONG:
         yield Finding.error(
             "moved-scrambled",
-            f"the edges of {name} point in other directions after (cosine {along:.2f} on average, "
-            "not 1)",
+            f"the edges of {name} have other directions after the operation (cosine {along:.2f} "
+            "on average, not 1)",
             where=where,
             why="both files have the same number of vertices, but in a different order",
             fix=f"export the moved mesh without remeshing or sorting its vertices; {BY_SHAPE}",
@@ -150,14 +152,17 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
         ),
         None,
     )
-    what = f"{name} is {scale:.3g} times as large after as before (median of its edges)"
+    what = (
+        f"{name} is {scale:.3g} times as large after the operation as before (median of its edges)"
+    )
     if unit is not None or scale < LEAST_SCALE:
         between = f": that is {unit[0]} read as {unit[1]}" if unit is not None else ""
         return Finding.error(
             "moved-scaled",
             f"{what}{between}",
             where=where,
-            why="bone does not grow during an operation: the files are in two units, or scaled",
+            why="bone does not grow during an operation: the files have different units, or one "
+            "was scaled",
             fix="export both in the unit that the case states",
         )
     return Finding.warning(
@@ -213,7 +218,7 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
             "moved-still",
             f"{name} moves by {moved[worst]:.2g} mm at most",
             where=where,
-            why="the plan moves nothing there",
+            why="the plan does not move this segment",
             fix="check that the file is the bone after the operation; otherwise remove it",
         )
         return
@@ -225,7 +230,7 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
             what=f"{name} moves by up to {moved[worst]:.1f} mm, at {place_text(here[worst])}",
             where=where,
             why=f"ordinary surgery moves bone by at most {FAR:g} mm; tissue would tear",
-            fix="one file is in LPS, the other in RAS: export both in one frame"
+            fix="one file is in LPS and the other in RAS: export both in one frame"
             if turned
             else "register the post-operative scan to the pre-operative one on the skull, and "
             "check that both files number their vertices in the same order",

@@ -22,7 +22,7 @@ MUSCLE_KEYS = ("muscles.young_along", "muscles.young_across", "muscles.poisson")
 
 
 def check_muscles(evidence: Evidence) -> Iterator[Finding]:
-    """Findings about the template of a case, and its landmarks beside the patient's."""
+    """Findings about the template of a case, and its landmarks compared with the patient's."""
     given = evidence.case.muscles
     if given is None:
         return
@@ -45,10 +45,10 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
     if not evidence.skull_landmarks:
         yield Finding.error(
             "muscles-without-landmarks",
-            "muscles are asked for, and no skull landmarks could be read",
+            "the case has [muscles], but no skull landmarks could be read",
             where=where,
-            why="the template is fitted to the patient by them",
-            fix="add [landmarks] skull, or leave out [muscles]",
+            why="skull landmarks fit the template to the patient",
+            fix="add [landmarks] skull, or remove [muscles]",
         )
         return
     try:
@@ -93,7 +93,7 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
             str(error),
             where=case.where("tissue"),
             why="the fat of [tissue] lies between the muscles",
-            fix="use a young (MPa) that is plausible for fat, or leave out [tissue]",
+            fix="set young (MPa) to a value that is plausible for fat, or remove [tissue]",
         )
         return
     yield from moduli_findings(moduli, given.preset, case.where(place))

@@ -19,8 +19,8 @@ from cmfsim.values.finding import Finding
 
 __all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
 
-# Depth by which a moved bone may pass the skin at rest before it is said, mm: skin goes with the
-# bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
+# Depth by which a moved bone may pass the undeformed skin before it is reported, mm: skin goes with
+# the bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
 THROUGH_SKIN = 2.0
 # How far outside a bone its neighbourhood is asked for tissue, mm.
 BESIDE_BONE = 0.5
@@ -36,9 +36,9 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
         if cut.bone is not None and cut.bone not in available:
             yield Finding.error(
                 "cut-unknown-bone",
-                f"the cut is through bone {cut.bone!r}",
+                f"the cut is meant for bone {cut.bone!r}",
                 where=where,
-                why="there is no such bone or segment at this point of the list",
+                why="no such bone or segment exists at this point of the list",
                 fix=f"use one of: {', '.join(sorted(available))}",
             )
         available |= set(cut.segments)
@@ -50,8 +50,8 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
                 f"the plan moves {name!r}",
                 where=case.where(f"plan.{name}"),
                 why="no bone and no osteotomy of the case has this name",
-                fix=f"use one of: {', '.join(sorted(available))}, or add the osteotomy that makes "
-                "it",
+                fix=f"use one of: {', '.join(sorted(available))}, or add the osteotomy that "
+                "creates it",
             )
 
 
@@ -78,7 +78,7 @@ def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iter
             str(error),
             where=where,
             why="the cut cannot be placed",
-            fix="correct the option, or leave it out",
+            fix="correct the option, or remove it",
         )
 
 
@@ -168,7 +168,7 @@ def check_plan(
 
 
 def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Finding]:
-    """Numbers without a frame beside surfaces that are not in LPS, which would be assumed."""
+    """Findings on numbers without a frame, read as LPS, if the surfaces are not in LPS."""
     case, read = evidence.case, evidence.transforms.get(name)
     stated = case.plan[name].frame is not None
     if read is not None:
@@ -180,10 +180,10 @@ def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Find
         return
     yield Finding.warning(
         "plan-frame",
-        f"the motion of {name} states no frame and is taken as LPS; the surfaces are in {frame}",
+        f"the motion of {name} has no frame and is read as LPS, but the surfaces are in {frame}",
         where=case.where(f"plan.{name}"),
-        why="in the other frame forwards is backwards, and left is right",
-        fix=f'write frame = "LPS" or frame = "{frame}" beside the numbers of the motion',
+        why="the other frame reverses forwards and backwards, left and right",
+        fix=f'write frame = "LPS" or frame = "{frame}" next to the numbers of the motion',
     )
 
 
@@ -228,12 +228,12 @@ def _check_through_skin(
         f"{place_text(moved[through[worst]])}",
         where=evidence.case.where(f"plan.{name}"),
         why="the tissue over it would be crushed or inverted",
-        fix="check the plan; solve a genuinely large advancement in steps",
+        fix="check the plan; if the advancement is really that large, solve it in steps",
     )
 
 
 def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Finding]:
-    """A moving bone with no soft tissue beside it, in the region that is meshed."""
+    """Findings on a moving bone without adjacent soft tissue in the meshed region."""
     skin = evidence.skin
     if skin is None:
         return

@@ -114,7 +114,7 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
     if low <= numbers <= high:
         yield Finding.error(
             "surface-units",
-            f"the skin is {numbers:.4g} long in the file's own numbers: these look like mm, and "
+            f"the skin is {numbers:.4g} long in the numbers of the file: they look like mm but "
             f"are read as {stated} ({extent:.4g} mm)",
             where=evidence.skin.where,
             why="every length of the case is mm; a head is 110 to 420 mm long",
@@ -161,7 +161,7 @@ def _check_bone_sizes(evidence: Evidence) -> Iterator[Finding]:
             "surface-units",
             f"bone {name} is {extent:.4g} mm long, the skin {skin:.4g} mm",
             where=body.where,
-            why="all surfaces of a case must have the same units and lie in one frame",
+            why="all surfaces of a case must have the same units and the same frame",
             fix="export it in the units of the skin",
         )
 
@@ -198,14 +198,14 @@ def _check_landmark_fit(
         return
     where = evidence.case.where(f"landmarks.{key}")
     surface = "bones" if key == "skull" else "skin"
-    what = f"half of the landmarks lie more than {median:.0f} mm from the {surface}"
+    what = f"half of the landmarks are more than {median:.0f} mm from the {surface}"
     why = "cuts, muscles and the region are placed from landmarks"
     tries = {
-        "frame": (HALF_TURN, "turned from RAS to LPS"),
-        "m": (np.full(3, 1000.0), "taken as metres"),
-        "cm": (np.full(3, 10.0), "taken as cm"),
-        "um": (np.full(3, 0.001), "taken as µm"),
-        "inch": (np.full(3, 25.4), "taken as inches"),
+        "frame": (HALF_TURN, "converted from RAS to LPS"),
+        "m": (np.full(3, 1000.0), "read as metres"),
+        "cm": (np.full(3, 10.0), "read as cm"),
+        "um": (np.full(3, 0.001), "read as µm"),
+        "inch": (np.full(3, 25.4), "read as inches"),
     }
     for name, (factors, done) in tries.items():
         fitted = float(np.median(_nearest(bodies, points * factors)))
@@ -216,9 +216,8 @@ def _check_landmark_fit(
                 f"{what}; {done}, {fitted:.1f} mm",
                 where=where,
                 why=why,
-                fix="correct coordinateSystem in the file (LPS or RAS), or frame under [surfaces] "
-                "if "
-                "the surfaces are the ones that are turned"
+                fix="correct coordinateSystem in the file (LPS or RAS), or frame under "
+                "[surfaces] if it is the surfaces that have the wrong frame"
                 if is_frame
                 else "correct coordinateUnits in the file, or save it again in mm",
             )
@@ -228,7 +227,7 @@ def _check_landmark_fit(
         what,
         where=where,
         why=why,
-        fix="check that landmarks and surfaces belong to one patient and one frame",
+        fix="check that landmarks and surfaces are from one patient and in one frame",
     )
 
 
@@ -258,14 +257,14 @@ def _check_within_image(
     yield Finding(
         severity="error" if is_frame or wrong.mean() > ELSEWHERE_SHARE else "warning",
         code="landmark-frame" if is_frame else "landmark-outside-image",
-        what=f"{len(names)} of {len(landmarks)} landmarks lie beyond the image"
-        + (f", turned from RAS to LPS {int(turned.sum())}" if is_frame else "")
+        what=f"{len(names)} of {len(landmarks)} landmarks lie outside the image"
+        + (f", converted from RAS to LPS {int(turned.sum())}" if is_frame else "")
         + f": {', '.join(names[:4])}{more}",
         where=evidence.case.where(f"landmarks.{key}"),
         why="cuts, muscles and the region are placed from landmarks",
         fix="correct coordinateSystem in the file (LPS or RAS)"
         if is_frame
-        else "check that landmarks and image belong to one patient, and that the scan is whole",
+        else "check that landmarks and image are from one patient, and that the scan is complete",
     )
 
 
@@ -324,7 +323,7 @@ def _check_directions(
     elif signs[0] < 0:
         yield Finding.error(
             "left-right-swapped",
-            f"of {len(pairs)} pairs of landmarks the left ones lie on the right (R) side",
+            f"of {len(pairs)} pairs of landmarks, the left ones are on the right (R) side",
             where=where,
             why="either the labels are swapped or the data are mirrored; a plan would move the "
             "wrong side",
@@ -335,19 +334,19 @@ def _check_directions(
         what = "the face looks backwards" if signs[1] < 0 else "the head is upside down"
         yield Finding.error(
             "frame-turned",
-            f"by its landmarks, {what}",
+            f"according to its landmarks, {what}",
             where=where,
             why=why,
-            fix="check the axes of the program that made the files: LPS is left, posterior, "
+            fix="check the axes of the program that wrote the files: LPS is left, posterior, "
             "superior",
         )
     elif any(v is not None and s == 0 for v, s in zip((left, back, up), signs, strict=True)):
         yield Finding.warning(
             "frame-tilted",
-            "by its landmarks, the head is turned by more than 60° from the axes",
+            "according to its landmarks, the head is rotated by more than 60° from the axes",
             where=where,
             why="default planes are placed along the axes",
-            fix="turn the data upright, or give posterior_plane and the planes of cuts",
+            fix="rotate the data upright, or give posterior_plane and the planes of the cuts",
         )
 
 
@@ -416,8 +415,8 @@ def _check_bone_directions(evidence: Evidence) -> Iterator[Finding]:
             f"the mandible lies {direction} the middle of the cranium",
             where=mandible.where,
             why="in LPS the face looks along −P and the crown along +S",
-            fix='write frame = "RAS" under [surfaces] if the files are in RAS; else check their '
-            "axes",
+            fix='write frame = "RAS" under [surfaces] if the files are in RAS; otherwise '
+            "check their axes",
         )
 
 
@@ -441,9 +440,9 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
         yield Finding.error(
             "surface-frame" if is_frame else "bone-elsewhere",
             f"{share:.0%} of bone {name} lies outside the skin"
-            + (f", turned from RAS to LPS {turned:.0%}" if is_frame else ""),
+            + (f", converted from RAS to LPS {turned:.0%}" if is_frame else ""),
             where=body.where,
-            why="skin and bones of a case lie in one frame",
+            why="skin and bones of a case must be in one frame",
             fix="export skin and bones in the same frame",
         )
         return
@@ -455,7 +454,7 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
         f"bone {name} protrudes from the skin by {depth[worst]:.1f} mm at "
         f"{place_text(points[worst])}, with {share:.1%} of its points",
         where=body.where,
-        why="there is no tissue over it, so the skin there is bone",
+        why="no tissue covers it, so the skin there is bone",
         fix="correct the surface there; build cuts the bone off at the skin",
     )
 
@@ -482,7 +481,7 @@ def _check_bone_overlap(evidence: Evidence) -> Iterator[Finding]:
                     f"{share:.0%} of bone {name} lies within bone {other_name}",
                     where=body.where,
                     why="the case contains the same bone twice; if one copy moves and the other "
-                    "stays, both hold the tissue",
-                    fix=f"cut {name} out of {other_name}, or drop the file and cut by "
-                    "[[osteotomies]]",
+                    "stays, tissue is attached to both",
+                    fix=f"cut {name} out of {other_name}, or remove the file and define the cut "
+                    "in [[osteotomies]]",
                 )

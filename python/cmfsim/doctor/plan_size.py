@@ -12,7 +12,7 @@ from cmfsim.values.motion import decompose_motion
 
 __all__ = ["FAR", "TOO_FAR", "SizedMotion", "check_motion_size", "check_tiny", "check_turn"]
 
-# Motions of bone above which a plan is unusual, and above which it cannot be meant; mm and degrees.
+# Motions of bone above which a plan is unusual, and above which it is implausible; mm and degrees.
 # The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
 FAR, TOO_FAR = 20.0, 60.0
 TURNED, TOO_TURNED = 20.0, 60.0
@@ -68,7 +68,8 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
         remedy = "check translation (mm), sign and frame (LPS: forwards is −P)"
         if about_origin:
             remedy = (
-                "give the centre of the turn: without it, it is about the origin of the coordinates"
+                "give the centre of the rotation: without one, the segment rotates about the "
+                "origin of the coordinates"
             )
         elif not motion.typed:
             remedy = "check the unit (mm), frame (LPS or RAS) and direction of the transform"
@@ -97,8 +98,8 @@ def check_turn(name: str, where: str, angle: float) -> Iterator[Finding]:
             code="plan-turned",
             what=f"{name} turns by {angle:.1f}°",
             where=where,
-            why=f"bone turns by {TURNED:g}° at most in ordinary surgery; linear strain invents "
-            "volume",
+            why=f"ordinary surgery rotates bone by at most {TURNED:g}°; linear strain creates "
+            "spurious volume",
             fix="check angle (degrees, not radians) and axis",
         )
 
@@ -110,9 +111,10 @@ def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Find
             "plan-tiny",
             f"{name} moves by {far:.2g} mm at most",
             where=where,
-            why="this is too small to be seen: the prediction equals the face before the operation",
+            why="this is too small to be visible: the prediction equals the face before the "
+            "operation",
             fix=f"check the unit: translations and matrices are in mm ({far:.2g} m would be "
-            f"{1000.0 * far:.2g} mm); if the segment stays, leave it out of the plan",
+            f"{1000.0 * far:.2g} mm); if the segment does not move, remove it from the plan",
         )
     least, most = TINY_TURN
     if least <= angle < most:
@@ -120,8 +122,8 @@ def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Find
             "plan-tiny-angle",
             f"{name} turns by {angle:.2g}°",
             where=where,
-            why=f"no operation is planned that precisely; {angle:.2g} radians would be "
+            why=f"operations are not planned that precisely; {angle:.2g} radians would be "
             f"{math.degrees(angle):.1f}°",
-            fix="check the unit: angles are in degrees; nothing to do if the turn is meant, or was "
-            "measured",
+            fix="check the unit: angles are in degrees; nothing to do if the rotation is "
+            "intended, or was measured",
         )

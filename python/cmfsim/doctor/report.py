@@ -9,7 +9,7 @@ __all__ = ["findings_text"]
 
 # ANSI colours of the severities: red, yellow, blue.
 COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}
-# Columns that a terminal is taken to have, unless it says.
+# Columns of a terminal, unless it reports its width.
 WIDTH = 100
 
 

@@ -36,13 +36,13 @@ def check_image(evidence: Evidence) -> Iterator[Finding]:
             "ct-spacing-coarse",
             f"voxels are {size} mm",
             where=evidence.case.where("image.file"),
-            why=f"beyond {COARSE_SPACING:g} mm thin bone, lids and lips are lost between voxels",
-            fix="use the thin series of the scan (1 mm or below) where there is one",
+            why=f"above {COARSE_SPACING:g} mm, thin bone, lids and lips are lost between voxels",
+            fix="use the thin series of the scan (1 mm or below) if there is one",
         )
 
 
 def check_surfaces(evidence: Evidence) -> Iterator[Finding]:
-    """Findings about each surface by itself."""
+    """Findings about each surface separately."""
     bodies = [evidence.skin] if evidence.skin else []
     for body in [*bodies, *evidence.bones.values()]:
         yield from _check_body(body)
@@ -73,8 +73,8 @@ def _check_borders(body: Body) -> Iterator[Finding]:
         f"{place_text(longest.centre)}",
         where=body.where,
         why="only a closed surface has an inside and an outside: gaps are capped"
-        + (", and a cap this wide invents part of the head" if wide else ""),
-        fix="look at the caps after build; if they are wrong, close the surface yourself",
+        + (", and the shape of a cap this wide is invented" if wide else ""),
+        fix="check the caps after build; if they are wrong, close the surface yourself",
     )
 
 
@@ -86,8 +86,8 @@ def _check_orientation(body: Body) -> Iterator[Finding]:
             f"{report.inconsistent} edges have triangles that face opposite ways"
             + ("" if report.orientable else "; a part has only one side (Möbius)"),
             where=body.where,
-            why="inside and outside change from place to place; the smaller part is flipped",
-            fix="recompute normals in the program that made it",
+            why="inside and outside differ from place to place; the smaller part is flipped",
+            fix="recompute normals in the program that wrote it",
         )
     elif report.volume < 0.0:
         yield Finding.warning(
@@ -95,7 +95,7 @@ def _check_orientation(body: Body) -> Iterator[Finding]:
             f"normals point inwards (volume {report.volume:.0f} mm³)",
             where=body.where,
             why="inside and outside are swapped; build flips it",
-            fix="flip normals in the program that made it",
+            fix="flip normals in the program that wrote it",
         )
 
 
@@ -154,7 +154,7 @@ def _check_pieces(body: Body) -> Iterator[Finding]:
         f"{solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
         where=body.where,
         why="debris becomes islands of bone or skin; pieces below 1 % of the largest are dropped",
-        fix="delete what does not belong, or give each bone a file of its own",
+        fix="delete the pieces that do not belong to it, or put each bone into a separate file",
     )
 
 
@@ -165,7 +165,7 @@ def _check_triangles(body: Body) -> Iterator[Finding]:
             "surface-degenerate",
             f"{len(report.degenerate)} triangles without area and {len(report.duplicate)} repeated",
             where=body.where,
-            why="they have no normal, or count their volume twice; they are dropped",
+            why="they have no normal, or their volume counts twice; they are removed",
             fix="nothing to do",
         )
     share = len(report.slivers) / max(report.n_triangles, 1)
@@ -177,7 +177,7 @@ def _check_triangles(body: Body) -> Iterator[Finding]:
             "hundred times longer than high",
             where=body.where,
             why="their normals are unreliable, which disturbs contact",
-            fix="remesh it if sliding on it matters" if share <= SLIVER_SHARE else "remesh it",
+            fix="remesh it if tissue slides on it" if share <= SLIVER_SHARE else "remesh it",
         )
 
 

@@ -42,7 +42,7 @@ Choice: TypeAlias = ArrayLike | str | None
 
 @dataclass(frozen=True, eq=False)
 class SkinComparison:
-    """How far a predicted skin lies from the post-operative one.
+    """Distances of a predicted skin from the post-operative one.
 
     Attributes
     ----------
@@ -58,17 +58,17 @@ class SkinComparison:
     statistics : DistanceStatistics
         From the prediction to the post-operative skin.
     back_signed : (b,) float64, mm
-        The other way: distance of post-operative vertices from their partners on the prediction,
-        with the same sign: negative where the prediction lies behind.
+        The other direction: distance of post-operative vertices from their partners on the
+        prediction, with the same sign: negative where the prediction lies behind.
     back_vertices : (b,) uint32
         Those vertices.
     backward : DistanceStatistics or None
         Of `back_signed`; None if no post-operative vertex faces the evaluated part.
     symmetric : DistanceStatistics or None
-        Of both directions, each with half the weight.
+        Of both directions with equal weight.
     regions : mapping of str to DistanceStatistics
         From the prediction to the post-operative skin, by region; regions without an evaluated
-        vertex are left out.
+        vertex are omitted.
     region_vertices : mapping of str to (r,) uint32
         The evaluated vertices in each.
     share : float
@@ -76,9 +76,10 @@ class SkinComparison:
     n_masked : int
         Vertices of the prediction outside the mask.
     n_border, n_far : int
-        Left out: partner on the border of the post-operative skin; further away than the limit.
+        Excluded vertices: with a partner on the border of the post-operative skin; with a partner
+        beyond the limit.
     back_border, back_far : int
-        The same for the way back.
+        The same in the other direction.
     findings : tuple of Finding
     """
 
@@ -123,12 +124,12 @@ class SkinComparison:
 
     @property
     def p90(self) -> float:
-        """|Distance| that nine tenths of the vertices do not pass, mm."""
+        """90th percentile of |distance|, mm."""
         return self.statistics.p90
 
     @property
     def p95(self) -> float:
-        """The same for 95 %, mm."""
+        """95th percentile of |distance|, mm."""
         return self.statistics.p95
 
     @property
@@ -212,25 +213,25 @@ def compare_skins(
     Parameters
     ----------
     simulated, postoperative : SurfaceData or Surface
-        Skins in one frame with outward normals; they may be open, at the neck for one.
+        Skins in one frame with outward normals; they may be open, for example at the neck.
     landmarks : (landmarks, landmarks), optional
         Of the simulated and of the post-operative skin: mappings of name to place, matched by name
         (`match_landmarks`), or (n, 3) arrays in one order, mm.
     method : str, optional
         "landmarks": a thin-plate spline through the landmarks carries the simulated skin near the
         post-operative one, and the point closest to the carried vertex is its partner (Kim et al.
-        2010, section 3.2). "closest": the point closest to the vertex itself. Default: the first
-        where there are landmarks.
+        2010, section 3.2). "closest": the point closest to the vertex itself. Default: the first if
+        there are landmarks.
     mask : (n,) bool, (k,) indices or "face", optional
         The vertices of the simulated skin to evaluate, such as those that the simulation could
         move; "face" takes the face by its landmarks. Default: all.
     regions : mapping of str to (n,) bool or (k,) indices, optional
-        Parts to be told apart. Default: `skin_regions` where the landmarks have their names.
+        Regions to report separately. Default: `skin_regions` if the landmarks have the usual names.
     exclude_borders : bool
-        Whether to leave out vertices whose partner lies on the border of the other skin: there it
-        ends, and the distance says where the scan was cut.
+        Whether to exclude vertices whose partner lies on the border of the other skin, where the
+        distance depends on where the scan was cut.
     max_distance : float, mm, optional
-        Leaves out, and counts, what is further apart. Default: nothing.
+        Vertices further apart are excluded and counted. Default: no limit.
 
     Returns
     -------
@@ -328,9 +329,9 @@ def _warps(landmarks: tuple[Landmarks, Landmarks] | None) -> _Warps:
 def _check_matched(matches: Matches, n_chosen: int) -> None:
     if not len(matches.vertices):
         raise RegistrationInputError(
-            f"none of {n_chosen} vertices has a partner: {matches.n_border} are matched "
-            f"to the border of the post-operative skin and {matches.n_far} are further away than "
-            "the limit; do both lie in one frame, and does the mask lie on the scanned face?"
+            f"none of {n_chosen} vertices has a partner: {matches.n_border} are matched to the "
+            f"border of the post-operative skin and {matches.n_far} are further away than the "
+            "limit; check that both are in one frame, and that the mask is on the scanned face"
         )
 
 
@@ -383,7 +384,7 @@ def _paired(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats, tuple[F
     if len(first) != len(second):
         raise LandmarkInputError(
             f"there are {len(first)} landmarks of one skin and {len(second)} of the other: both "
-            "need the same number, in the same order"
+            "must have the same number, in the same order"
         )
     return first, second, ()
 
@@ -422,7 +423,7 @@ def _as_choice(name: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
         chosen = np.zeros(count, dtype=bool)
         chosen[as_indices(name, value, count)] = True
     if not chosen.any():
-        raise CaseInputError(f"{name} holds no vertex")
+        raise CaseInputError(f"{name} contains no vertex")
     return chosen
 
 
@@ -466,9 +467,9 @@ def _findings(
             Finding.note(
                 "many-border-matches",
                 f"{matches.n_border} of {n_chosen} vertices are matched to the border of the "
-                "post-operative skin and left out",
-                why="the scan ends there, or the landmarks carry the skin past it",
-                fix="evaluate the face alone with mask='face', or a mask of what was simulated",
+                "post-operative skin and excluded",
+                why="the scan ends there, or the landmarks map the skin past its end",
+                fix="evaluate only the face with mask='face', or use a mask of the simulated skin",
             )
         )
     folds = warp.folds(places) if warp is not None else None
@@ -477,9 +478,9 @@ def _findings(
             Finding.warning(
                 "correspondence-folds",
                 f"the map between the landmarks folds at {folds.count} of {n_chosen} vertices",
-                why="points paired there are not the same anatomy",
-                fix="check the landmarks: one may be swapped with another, or lie on a different "
-                "point of the face",
+                why="points that are paired there do not correspond anatomically",
+                fix="check the landmarks: one may be swapped with another, or placed at a "
+                "different point of the face",
             )
         )
     return found

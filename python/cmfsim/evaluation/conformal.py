@@ -30,14 +30,14 @@ BISECTIONS = 60
 
 
 def calibrate(scores: ArrayLike, coverage: float) -> BandFactor:
-    """The factor on the standard deviation that holds a share of further cases.
+    """The factor on the standard deviation for which the band covers a share of further cases.
 
     Parameters
     ----------
     scores : (n,) float64
-        One for each calibration case, never one for each vertex: cases are what is exchangeable.
+        One for each calibration case, never one for each vertex: the cases are exchangeable.
     coverage : float
-        The share of cases that are to lie within the band, above 0 and below 1.
+        The share of cases that should lie within the band, above 0 and below 1.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def calibrate(scores: ArrayLike, coverage: float) -> BandFactor:
     if n < needed:
         raise CalibrationError(
             f"a coverage of {share:.4g} needs at least {needed} calibration cases, and there are "
-            f"{n}: add cases, or ask for at most {n / (n + 1):.4g}"
+            f"{n}: add cases, or request at most {n / (n + 1):.4g}"
         )
     if not np.isfinite(values).all() or values[0] < 0.0:
         bad = int(np.flatnonzero(~(np.isfinite(values) & (values >= 0.0)))[0])
@@ -73,7 +73,7 @@ def calibrate(scores: ArrayLike, coverage: float) -> BandFactor:
 
 
 def cases_needed(coverage: float) -> int:
-    """The fewest calibration cases that a coverage can be asked of: 9 for 90 %, 19 for 95 %.
+    """The smallest number of calibration cases for a coverage: 9 for 90 %, 19 for 95 %.
 
     Parameters
     ----------
@@ -90,9 +90,9 @@ def cases_needed(coverage: float) -> int:
 
 
 def covered_interval(factor: BandFactor, tests: int) -> tuple[int, int]:
-    """Between how many of some further cases lie in the band, with a probability of at least 90 %.
+    """The range of the number of further cases inside the band, with at least 90 % probability.
 
-    The number is beta-binomial: with p of the beta distribution of the coverage, binomial of p.
+    The number is beta-binomial: binomial with a p from the beta distribution of the coverage.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def region_scores(
     Returns
     -------
     dict of str to float
-        Regions without a measured vertex are left out.
+        Regions without a measured vertex are omitted.
 
     Raises
     ------

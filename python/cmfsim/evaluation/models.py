@@ -1,4 +1,4 @@
-"""Several predictions of one patient beside each other, and beside leaving the face as it was."""
+"""Comparison of several predictions of one patient with each other and with no change."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,20 +27,20 @@ __all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_mode
 
 # The pre-operative skin taken as a prediction: what any model must beat.
 NO_CHANGE = "no change"
-# Name of the whole evaluated part beside the names of regions.
+# Name of the whole evaluated part, next to the names of regions.
 WHOLE = "whole"
 
 
 @dataclass(frozen=True)
 class Improvement:
-    """What a prediction gains over leaving the face as it was, on the same vertices.
+    """The gain of a prediction over leaving the face unchanged, on the same vertices.
 
     Attributes
     ----------
     before, after : float, mm
         Mean |distance| of the pre-operative skin, and of the prediction.
     share_better : float
-        Share of vertices at which the prediction is nearer.
+        Share of vertices at which the prediction is closer.
     """
 
     before: float
@@ -49,7 +49,7 @@ class Improvement:
 
     @property
     def gain(self) -> float:
-        """Mean |distance| less than before, mm; negative where the prediction makes it worse."""
+        """Reduction of the mean |distance|, mm; negative if the prediction is worse."""
         return self.before - self.after
 
     def as_dict(self) -> dict[str, float]:
@@ -140,26 +140,26 @@ def compare_models(  # noqa: PLR0913 (options by name)
     exclude_borders: bool = True,
     max_distance: float | None = None,
 ) -> ModelComparison:
-    """Predictions of several models against the post-operative skin, and against no change.
+    """Comparison of several models with the post-operative skin, and with no change.
 
     Parameters
     ----------
     preoperative : SurfaceData or Surface
         The skin before the operation.
     predictions : mapping of str to (v, 3) float64, mm
-        Where each model takes the vertices of that skin: vertices plus displacements.
+        Predicted positions of the vertices of that skin: vertices plus displacements.
     postoperative : SurfaceData or Surface
     landmarks : (landmarks, landmarks), optional
         Of the *pre-operative* and of the post-operative skin; the first follow each prediction.
     method, mask, exclude_borders, max_distance
         As in `compare_skins`. Regions and the mask "face" are placed on the pre-operative skin, so
-        that they hold the same vertices for every model.
+        that they contain the same vertices for every model.
     regions : mapping of str to (v,) bool, optional
         Parts of the pre-operative skin; default: `skin_regions` where the landmarks have their
         names.
     thickening : (v,) float64, mm, optional
         How far each vertex is moved outward, along its normal, before anything is compared: in
-        every prediction, and where nothing changes (`fitted_thickness`).
+        every prediction, and in "no change" (`fitted_thickness`).
 
     Returns
     -------
@@ -191,7 +191,7 @@ def compare_models(  # noqa: PLR0913 (options by name)
         if len(moved[name]) != len(skin.vertices):
             raise CaseInputError(
                 f"prediction {name!r} has {len(moved[name])} vertices, the pre-operative skin "
-                f"{len(skin.vertices)}: the same are needed, in the same order"
+                f"{len(skin.vertices)}: both must have the same vertices in the same order"
             )
     if thickening is not None:
         moved = {name: moved_outward(skin, at, thickening) for name, at in moved.items()}

@@ -20,8 +20,9 @@ Place = tuple[float, float]
 PAIRS = ("exocanthion", "endocanthion", "alare", "cheilion")
 REGIONS: Mapping[str, str] = MappingProxyType(
     {
-        "face": "from the brow to below the chin, a little wider than the eyes",
-        "lower face": "the same from below the lower eyelids on: what jaws move, without the eyes",
+        "face": "from the brow to below the chin, slightly wider than the eyes",
+        "lower face": "the part of the face below the lower eyelids: what the jaws move, "
+        "without the eyes",
         "nose": "from nasion to subnasale, with the wings",
         "upper lip": "from subnasale to the line of the mouth, between its corners",
         "lower lip": "from the line of the mouth half way down to pogonion",
@@ -64,13 +65,13 @@ def skin_regions(
     points : (n, 3) float64, mm
         Vertices of a skin, in any frame.
     landmarks : mapping of str to (3,) float64, mm
-        The fourteen of `SKIN_LANDMARKS` on the same skin; others are left alone.
+        The fourteen of `SKIN_LANDMARKS` on the same skin; others are ignored.
 
     Returns
     -------
     dict of str to (n,) bool
         "face", "lower face", "nose", "upper lip", "lower lip", "chin", "left cheek", "right cheek".
-        All but the first two are apart from each other.
+        All but the first two are disjoint.
 
     Raises
     ------
@@ -95,7 +96,7 @@ def skin_regions(
 def unmoved_regions(
     points: ArrayLike, landmarks: Mapping[str, ArrayLike]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Which points of a skin lie where operations on the jaws move nothing.
+    """The points of a skin in regions that operations on the jaws do not move.
 
     Parameters
     ----------
@@ -106,7 +107,7 @@ def unmoved_regions(
     Returns
     -------
     dict of str to (n,) bool
-        "forehead", "left temple", "right temple", apart from each other and from the face's.
+        "forehead", "left temple", "right temple", disjoint from each other and from the face.
 
     Raises
     ------
@@ -171,19 +172,19 @@ def _check_face(at: Mapping[str, Floats]) -> None:
     for pair in PAIRS:
         if at[f"{pair}_L"][0] <= at[f"{pair}_R"][0]:
             raise LandmarkInputError(
-                f"{pair}_L lies to the right of {pair}_R: exchange their names (left is the "
+                f"{pair}_L lies to the right of {pair}_R: swap their names (left is the "
                 "patient's left)"
             )
     order = ("nasion", "subnasale", "labiale_superius", "labiale_inferius", "pogonion")
     for above, below in itertools.pairwise(order):
         if at[above][1] <= at[below][1]:
             raise LandmarkInputError(
-                f"{above} lies below {below}: are the landmarks in the frame of the skin, and "
-                "their names in their places?"
+                f"{above} lies below {below}: check that the landmarks are in the frame of the "
+                "skin, and that no names are swapped"
             )
     if at["pronasale"][2] <= 0.5 * (at["exocanthion_L"][2] + at["exocanthion_R"][2]):
         raise LandmarkInputError(
-            "pronasale lies behind the eyes: left and right are exchanged, or the frame mirrors"
+            "pronasale lies behind the eyes: left and right are swapped, or the frame is mirrored"
         )
 
 

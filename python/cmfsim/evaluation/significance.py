@@ -15,8 +15,9 @@ __all__ = ["PAIRED_BY", "PairedTest", "wilcoxon_test"]
 PAIRED_BY = ("vertex", "patient")
 CAVEATS = {
     "vertex": (
-        "neighbouring vertices move together and are not independent samples: p describes this one "
-        "face, not what to expect of the next patient, and falls with every refinement of the mesh"
+        "neighbouring vertices move together and are not independent samples: p describes this "
+        "one face, says nothing about the next patient, and falls with every refinement of the "
+        "mesh"
     ),
     "patient": "",
 }
@@ -35,7 +36,7 @@ class PairedTest:
     n : int
         Pairs.
     n_equal : int
-        Pairs without a difference, which the test leaves out.
+        Pairs without a difference, which the test excludes.
     statistic : float
         The smaller sum of ranks.
     p : float
@@ -45,7 +46,7 @@ class PairedTest:
     effect : float
         Rank-biserial correlation, −1 (the first is larger in each pair) to 1 (smaller in each).
     caveat : str
-        What p does not say; to be printed with it.
+        The limits of p; to be printed with it.
     """
 
     by: str
@@ -80,7 +81,7 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
     first, second : (n,) float64, mm
         Errors of two models at the same vertices, or mean errors of the same patients.
     by : str
-        "vertex" or "patient": which caveat belongs to the outcome.
+        "vertex" or "patient": decides the caveat of the outcome.
 
     Returns
     -------
@@ -104,20 +105,21 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
     >>> found.p, found.effect
     (0.125, 1.0)
     >>> found.caveat
-    '4 pairs cannot give p below 0.125, whatever the models do'
+    '4 pairs cannot give p below 0.125, regardless of the models'
     """
     check_one_of("by", by, PAIRED_BY)
     a, b = as_floats("first errors", first), as_floats("second errors", second)
     if a.ndim != 1 or a.shape != b.shape or not len(a):
         raise CaseInputError(
-            f"errors have shapes {a.shape} and {b.shape}: (n,) both, in pairs, with n above 0"
+            f"errors have shapes {a.shape} and {b.shape}: both must be (n,), in pairs, with n "
+            "above 0"
         )
     difference = a - b
     n_used = int(np.count_nonzero(difference))
     caveat = CAVEATS[by]
     least = 2.0 ** (1 - n_used)
     if by == "patient" and least > LEVEL:
-        caveat = f"{n_used} pairs cannot give p below {min(least, 1.0):g}, whatever the models do"
+        caveat = f"{n_used} pairs cannot give p below {min(least, 1.0):g}, regardless of the models"
     statistic, p, effect = 0.0, 1.0, 0.0
     if n_used:
         stats = third_party("scipy.stats", "the signed-rank test is made", "report")

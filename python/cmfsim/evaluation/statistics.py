@@ -22,7 +22,7 @@ WHISKER = 1.5
 
 @dataclass(frozen=True)
 class DistanceStatistics:
-    """What a set of signed distances comes to; all but the signed figures are of their sizes.
+    """Statistics of signed distances; all except the signed figures are of their absolute values.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class DistanceStatistics:
         Of |distance|.
     outliers : int
         Sizes above the upper quartile by more than 1.5 times the distance of the quartiles, as a
-        box plot has it (Tukey 1977). They are counted, and left in.
+        box plot has it (Tukey 1977). They are counted and kept.
     """
 
     count: int
@@ -74,7 +74,7 @@ class DistanceStatistics:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "DistanceStatistics":
-        """The figures of which `as_dict` gave these values.
+        """The statistics from the values that `as_dict` returned.
 
         Raises
         ------
@@ -105,7 +105,7 @@ def distance_statistics(
     ----------
     signed : (k,) float64, mm
     weights : (k,) float64, optional
-        How much each counts, above 0: areas, say. Equal weights change nothing.
+        Weight of each distance, above 0, such as an area. Equal weights change nothing.
     limits : tuple of float, mm
         For the shares within.
 

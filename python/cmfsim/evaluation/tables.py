@@ -45,7 +45,7 @@ class ErrorTable:
     patients, models, regions : tuple of str
         "whole" is the first region.
     cells : mapping of (patient, region, model) to DistanceStatistics
-        A region that a patient has no vertex in is absent, and so is a model that failed.
+        Regions in which a patient has no vertex are absent, and so are models that failed.
     """
 
     patients: tuple[str, ...]
@@ -146,8 +146,8 @@ class ErrorTable:
         patients = self.complete(region)
         if not patients:
             raise CaseInputError(
-                f"no patient has an error of each of {', '.join(self.models)} in {region!r}: there "
-                "is nothing to average"
+                f"no patient has an error of each of {', '.join(self.models)} in {region!r}, so "
+                "there is nothing to average"
             )
         return [self.cells[patient, region, model].mean for patient in patients]
 
@@ -186,8 +186,8 @@ def error_table(patients: Mapping[str, ModelComparison]) -> ErrorTable:
         as_text("patient", patient)
         if set(comparison.statistics) != set(models):
             raise CaseInputError(
-                f"patient {patient!r} has the models {', '.join(comparison.statistics)}, the first "
-                f"has {', '.join(models)}: the same are needed"
+                f"patient {patient!r} has the models {', '.join(comparison.statistics)}, the "
+                f"first has {', '.join(models)}: all patients need the same models"
             )
         table = {WHOLE: comparison.statistics, **comparison.regions}
         regions += [region for region in table if region not in regions]

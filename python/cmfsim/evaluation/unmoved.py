@@ -33,7 +33,7 @@ MOST_CHANGE = 0.5
 
 @dataclass(frozen=True)
 class ThicknessChange:
-    """How much thicker the soft tissue became, as one share of its depth.
+    """The change of the soft tissue's thickness, as one fraction of its depth.
 
     Attributes
     ----------
@@ -139,8 +139,8 @@ def fitted_thickness(signed: ArrayLike, depth: ArrayLike) -> ThicknessChange:
     if abs(share) > MOST_CHANGE:
         raise CaseInputError(
             f"the soft tissue would have become {100 * share:+.0f} % thicker where nothing was "
-            f"operated on, by {share * d.mean():+.1f} mm: swelling does not explain that; check "
-            "that the face after the operation lies in the frame of the one before"
+            f"operated on, by {share * d.mean():+.1f} mm: swelling does not explain this; check "
+            "that the face after the operation is in the same frame as the one before"
         )
     before, after = float(np.abs(e).mean()), float(np.abs(e + share * d).mean())
     return ThicknessChange(share, len(e), float(d.mean()), before, after)

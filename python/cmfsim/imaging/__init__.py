@@ -1,4 +1,4 @@
-"""A head CT to anatomy (paper 2.1), and two scans of one head laid on each other (paper 3)."""
+"""A head CT to anatomy (paper 2.1), and registration of two scans of one head (paper 3)."""
 
 from cmfsim.imaging.alignment import VolumeAlignment, register_volumes
 from cmfsim.imaging.alignment_options import AlignmentOptions

@@ -25,12 +25,12 @@ CLIPPED = (0.2, 99.8)
 
 @dataclass(frozen=True, eq=False)
 class VolumeAlignment:
-    """Where a volume lies in the frame of another.
+    """Position of a volume in the frame of another.
 
     Attributes
     ----------
     matrix : (4, 4) float64, mm
-        Takes places of the moving volume to the fixed one.
+        Maps points of the moving volume to the fixed one.
     information : float
         Mutual information of both over the mask at the end, nats.
     similarity : float
@@ -66,18 +66,18 @@ def register_volumes(
     initial: ArrayLike | None = None,
     options: AlignmentOptions | None = None,
 ) -> VolumeAlignment:
-    """The rigid motion that takes a moving volume onto a fixed one.
+    """The rigid motion that aligns a moving volume with a fixed one.
 
     Parameters
     ----------
     moving, fixed : ImageData
         Scans of one head; their values need not be in the same unit.
     mask : ImageData, optional
-        On the grid of `fixed`, not 0 where both show the same: the skull that the operation left
-        alone (`undeformed_mask`). Without it the whole of `fixed`, moved jaws and skin included,
-        has a say.
+        On the grid of `fixed`, not 0 where both show the same: the skull that the operation did not
+        change (`undeformed_mask`). Without it, all of `fixed` is used, including moved jaws and
+        skin.
     initial : (4, 4) float64, mm, optional
-        Rigid motion to start from; else both stay where their files say.
+        Rigid motion to start from; by default the positions stated in the files.
     options : AlignmentOptions, optional
 
     Returns
@@ -89,16 +89,16 @@ def register_volumes(
     RegistrationError
         A mask on another grid, empty or too small, values without contrast, an initial matrix that
         is not rigid (also `ValueError`); volumes that do not overlap, no convergence, volumes that
-        do not look alike at the end.
+        do not match at the end.
     ImageError
         SimpleITK is missing.
 
     Notes
     -----
     Mutual information after Mattes et al. (2003), by SimpleITK, from coarse to fine. The result is
-    the same for any number of threads. The step is scaled by the inertia of the mask: a turn
-    and a shift that move its points equally far count the same, without which the turn of a round
-    skull converges slowly.
+    the same for any number of threads. The step is scaled by the inertia of the mask: a turn and a
+    shift that move its points equally far count the same; otherwise the rotation of a round skull
+    would converge slowly.
 
     Examples
     --------
@@ -138,14 +138,14 @@ def register_volumes(
     if overlap < options.least_overlap:
         raise RegistrationError(
             f"only {overlap:.0%} of the mask lies in the moving volume (correlation there "
-            f"{similarity:.2f}): at least {options.least_overlap:.0%} is needed; bring the volumes "
-            "closer with `initial`, or draw the mask where both were scanned"
+            f"{similarity:.2f}): at least {options.least_overlap:.0%} is needed; bring the "
+            "volumes closer with `initial`, or restrict the mask to what both scans show"
         )
     if similarity < options.least_similarity:
         raise RegistrationError(
             f"the volumes do not match after registration: correlation {similarity:.2f}, needed "
-            f"{options.least_similarity:g}; start closer with `initial`, mask out what was moved, "
-            "and see whether both show the same person"
+            f"{options.least_similarity:g}; start closer with `initial`, mask out what was "
+            "moved, and check that both show the same person"
         )
     return VolumeAlignment(inverse(to_moving), information, similarity, overlap, tuple(iterations))
 
@@ -177,7 +177,7 @@ def _checked_mask(mask: ImageData | None, fixed: ImageData) -> Mask:
     same = mask.values.shape == fixed.values.shape and np.allclose(mask.lowest, fixed.lowest)
     if not (same and np.allclose(mask.spacing, fixed.spacing)):
         raise RegistrationInputError(
-            f"the mask lies on another grid ({mask.values.shape} at {mask.lowest.tolist()} mm) "
+            f"the mask is on another grid ({mask.values.shape} at {mask.lowest.tolist()} mm) "
             f"than the fixed volume ({fixed.values.shape} at {fixed.lowest.tolist()} mm)"
         )
     chosen = np.asfortranarray(mask.values != 0)
@@ -195,7 +195,7 @@ def _range(name: str, values: NDArray[Any]) -> tuple[float, float]:
     low, high = (float(v) for v in np.percentile(values, CLIPPED))
     if not low < high:
         raise RegistrationInputError(
-            f"{name} is {low:g} nearly everywhere (in the mask): there is nothing to register by"
+            f"{name} is {low:g} nearly everywhere (in the mask), so it cannot be registered"
         )
     return low, high
 

@@ -1,4 +1,4 @@
-"""How two volumes are brought together."""
+"""Options of the registration of two volumes."""
 
 import itertools
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ __all__ = ["AlignmentOptions"]
 
 @dataclass(frozen=True)
 class AlignmentOptions:
-    """How two volumes are brought together; the defaults suit a CT of a head.
+    """Options of the registration of two volumes; the defaults suit a CT of a head.
 
     Attributes
     ----------

@@ -61,7 +61,7 @@ LEAST_LENGTH = 18.0
 # The face lies in front of this part of the head's depth: ears, folded or not, lie behind.
 FACE_PART = 0.45
 ONE_SIDED_TEXT = "with no counterpart on the other side"
-FLAT_TEXT = "flat, with a step all round as no part of a face has"
+FLAT_TEXT = "flat, with a step all round that no part of a face has"
 # A flat thing whose middle lies within the box of another one, wider by this, is the same, mm.
 SAME = 10.0
 # A nose stands out farther than this from what larger balls, of the second radius, sweep in the
@@ -228,10 +228,10 @@ def _finding(thing: _Thing) -> Finding:
         "skin-attachment",
         f"something protrudes from the face, {thing.kind}: {size} mm{volume}",
         where=f"skin at ({x:.0f}, {y:.0f}, {z:.0f}) mm",
-        why="a tube, a holder, a pad or tape on the face is taken for skin, and is moved and "
+        why="a tube, a holder, a pad or tape on the face is treated as skin: it is moved and "
         "compared as skin",
-        fix="look at it in the image; erase it there (air, −1000 HU), or leave that part of the "
-        "face out of the evaluation",
+        fix="check it in the image; erase it there (air, −1000 HU), or exclude that part of the "
+        "face from the evaluation",
     )
 
 

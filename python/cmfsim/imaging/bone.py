@@ -108,8 +108,8 @@ def _without_islands(
     labels, count = label(solid, corners=True)
     if not count:
         raise ImageInputError(
-            f"no bone above {options.least_bone:g} HU inside the skin: is it a CT in HU? If not, "
-            "set bone_threshold"
+            f"no bone above {options.least_bone:g} HU inside the skin: check that this is a CT "
+            "in HU; if it is not, set bone_threshold"
         )
     volumes = sizes_of(labels, count) * float(np.prod(work.spacing))
     kept = volumes > min(options.island, float(volumes.max()) - 1e-9)
@@ -123,7 +123,8 @@ def _without_islands(
                 f"{count - np.count_nonzero(kept)} pieces of bone below {options.island:g} mm³ "
                 f"each, {dropped / 1000.0:.1f} cm³ together, were dropped",
                 where="bone",
-                why="they are thin bone, calcified vessels or noise, and become soft tissue",
+                why="they are thin bone, calcified vessels or noise, and are treated as soft "
+                "tissue",
                 fix="lower bone_threshold or island if a wanted piece is missing",
             )
         )

@@ -30,7 +30,7 @@ BELOW_SKIN = 6.0
 # Smaller losses between the rim and the middle of the head are fat, muscle and brain, HU: clinical
 # CTs show the middle brighter, for fat lies below the skin.
 LEAST_LOSS = 90.0
-# Fewer voxels tell nothing.
+# Fewer voxels are not conclusive.
 LEAST_VOXELS = 500
 AIR_LEVEL = -300.0
 # No correction goes further than this, HU: what is that dark is no soft tissue.
@@ -64,8 +64,8 @@ def without_cupping(work: Working) -> tuple[Volume, tuple[Finding, ...]]:
         "is typical of cone-beam scanners; the values were scaled between air and soft tissue to "
         "compensate",
         where="image",
-        why="one threshold finds too much bone near the skin and too little in the middle",
-        fix="check bone by eye; a CT of a fan-beam scanner has no such loss",
+        why="a single threshold finds too much bone near the skin and too little in the middle",
+        fix="check the bone visually; a CT from a fan-beam scanner does not have this effect",
     )
     return corrected, (finding,)
 

@@ -45,7 +45,7 @@ class Places:
         extent = np.ptp(self.points, axis=0)
         if (extent < LEAST_EXTENT).any():
             raise RegistrationInputError(
-                f"the mask reaches over {' × '.join(f'{e:.0f}' for e in extent)} mm: at least "
+                f"the mask measures {' × '.join(f'{e:.0f}' for e in extent)} mm: at least "
                 f"{LEAST_EXTENT:g} mm along each axis are needed to find a rotation"
             )
         # Mean square of the shift of the mask's points by a turn of 1 rad about each axis, mm².
@@ -151,8 +151,8 @@ def _descend(
         method.Execute(fixed, moving)
     except RuntimeError as error:
         raise RegistrationError(
-            f"the volumes do not overlap enough at {size:g} mm to go on "
-            f"({str(error).strip().splitlines()[-1]}); bring them nearer with `initial`"
+            f"the volumes do not overlap enough at {size:g} mm to continue "
+            f"({str(error).strip().splitlines()[-1]}); bring them closer with `initial`"
         ) from error
     steps = int(method.GetOptimizerIteration())
     reason = method.GetOptimizerStopConditionDescription()

@@ -1,4 +1,4 @@
-"""Where bone ends between voxels: half-way between soft tissue and the bone behind the surface.
+"""The surface of bone between voxels: half-way between soft tissue and the bone behind the surface.
 
 A voxel that bone fills by half shows the mean of both. One threshold for all bone lies below that
 for compact bone, and makes it thicker all round by a third of a voxel. Half the height of the step

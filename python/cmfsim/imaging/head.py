@@ -48,10 +48,10 @@ def segment_head(
     Parameters
     ----------
     image : ImageData
-        A CT in LPS; in HU, or in a scale that its histogram gives away (a finding says so).
+        A CT in LPS, in HU or in a scale that its histogram reveals (reported as a finding).
     options : SegmentOptions, optional
     landmarks : mapping of str to (3,) float64, mm, optional
-        Of the skull, LPS: they tell the mandible from the rest. Without them its shape does.
+        Of the skull, LPS. They separate the mandible from the rest; without them, its shape does.
     progress : callable, optional
         Called with the name of each stage: "grid", "metal", "skin", "bone", "jaw", "air".
 
@@ -157,8 +157,8 @@ def _check_head(work: Working, inside: Mask) -> None:
     if volume < LEAST_HEAD:
         raise ImageInputError(
             f"the largest object in the image that could be a head has {volume:.0f} cm³: a face "
-            f"has at least {LEAST_HEAD:g}; is the head cut off, empty (a phantom), or the scale "
-            "wrong?"
+            f"has at least {LEAST_HEAD:g}; check whether the head is cut off or hollow (a "
+            "phantom), and whether the scale is right"
         )
 
 

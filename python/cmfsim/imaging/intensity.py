@@ -1,4 +1,4 @@
-"""Which numbers of a CT are air, soft tissue and bone, and the way from them to HU."""
+"""The values of air, soft tissue and bone in a CT, and their conversion to HU."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -52,8 +52,8 @@ BELOW_SATURATED = 100.0
 STATED_TOLERANCE = 250.0
 # What to do where the histogram misleads.
 STATE_IT = (
-    "If it is a CT, state how its values convert to HU, so that nothing is guessed: rescale = [1, "
-    "0] in [image] for HU, [1, -1024] for values that are 1024 too large"
+    "If it is a CT, state how its values convert to HU, so that cmfsim need not guess: rescale "
+    "= [1, 0] in [image] for HU, [1, -1024] for values that are 1024 too large"
 )
 # About as many voxels as a histogram needs.
 SAMPLE = 500_000
@@ -64,7 +64,7 @@ BLOCK = 3
 
 @dataclass(frozen=True)
 class Calibration:
-    """The way to HU: `slope`·value + `offset`, and what was found out on it."""
+    """The conversion to HU, `slope`·value + `offset`, with findings."""
 
     slope: float
     offset: float
@@ -185,8 +185,8 @@ def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float,
     above = tops[centres[tops] > centres[air] + 0.08 * (high - low)]
     if not len(above):
         raise ImageInputError(
-            f"the image has one peak only, at {centres[air]:g}, in its histogram: a CT of a "
-            f"head with air around it is needed. {STATE_IT}"
+            f"the image has only one peak, at {centres[air]:g}, in its histogram: a CT of a head "
+            f"with air around it is needed. {STATE_IT}"
         )
     best = above[np.argmax(smooth[above])]
     # Fat has the larger peak in some heads; muscle and brain lie a tenth of the way above it.
@@ -198,12 +198,13 @@ def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float,
 def _not_hu(air: float, soft: float, slope: float, offset: float) -> Finding:
     return Finding.warning(
         "ct-not-hu",
-        f"the image is not in HU: air is at {air:.4g}, soft tissue at {soft:.4g}; taken as HU = "
-        f"{slope:.4g}·value {'+' if offset >= 0.0 else '−'} {abs(offset):.4g}",
+        f"the image is not in HU: air is at {air:.4g}, soft tissue at {soft:.4g}; converted as "
+        f"HU = {slope:.4g}·value {'+' if offset >= 0.0 else '−'} {abs(offset):.4g}",
         where="image",
-        why="thresholds of skin and bone are in HU; a guessed scale moves the bone's surface",
+        why="thresholds of skin and bone are in HU; an error in the guessed scale moves the "
+        "surface of the bone",
         fix="state the scale in the case file (rescale = [slope, intercept] in [image]), or "
-        "export the CT with it; check skin and bone by eye",
+        "export the CT with its scale; check skin and bone visually",
     )
 
 
@@ -245,7 +246,8 @@ def weak_bone(hu: Volume, threshold: float) -> tuple[Finding, ...]:
     return (
         Finding.warning(
             "bone-weak",
-            f"compact bone reaches {compact:.0f} HU only, so that {threshold:g} HU misses much",
+            f"compact bone reaches only {compact:.0f} HU, so a threshold of {threshold:g} HU "
+            "misses much of it",
             where="image",
             why="thin bone is lost and the skull gets holes",
             fix=f"try bone_threshold = {round(half, -1):.0f}",

@@ -119,7 +119,7 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
     domain = np.asfortranarray(bone.mask[box])
     seeds = _seeds(work.part(box), bone, landmarks, box)
     if not ((seeds == 1).any() and (seeds == 2).any()):
-        return Jaws(None, None, None, (_not_parted("the landmarks lie far from bone"),))
+        return Jaws(None, None, None, (_not_parted("the landmarks are far from bone"),))
     deep = depth(domain, work.spacing) / np.float32(FLOOD_DEPTH)
     dense = np.clip(smoothed(bone.hu[box], 0.7, work.spacing) / np.float32(FLOOD_HU), 0.0, 2.0)
     # What lies among seeds of its own kind is known, and floods nothing.
@@ -175,7 +175,7 @@ def _not_parted(reason: str) -> Finding:
         "jaws-not-parted",
         f"the mandible could not be separated from the skull: {reason}",
         where="bone",
-        why="mandible and cranium would move as one",
+        why="mandible and cranium would move together",
         fix="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
         "ready surfaces of both bones",
     )

@@ -111,8 +111,8 @@ def find_metal(work: Working, options: SegmentOptions) -> Metal:
         f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³ above {threshold:.0f} HU, between "
         f"z = {low:.0f} and {high:.0f} mm; " + _streaks_text(work, streaked),
         where="image",
-        why="streaks hide skin and bone at that height",
-        fix="check lips, cheeks and tooth rows by eye",
+        why="streaks obscure skin and bone at that height",
+        fix="check lips, cheeks and tooth rows visually",
     )
     return Metal(mask, streaked, hu, (*noticed, finding))
 

@@ -28,7 +28,8 @@ def without_noise(hu: Volume) -> tuple[Volume, tuple[Finding, ...]]:
         f"the noise of the image is {noise:.0f} HU in voxels of the working grid; bone was found "
         f"in the image smoothed by a Gaussian of {sigma:g} voxels",
         where="image",
-        why="thin bone, as in the orbits and sinus walls, is lost, or appears where there is none",
-        fix="use a smoother reconstruction (kernel) of the same scan, and check thin bone by eye",
+        why="thin bone, as in the orbits and sinus walls, may be lost, or appear where there is "
+        "none",
+        fix="use a smoother reconstruction (kernel) of the same scan, and check thin bone visually",
     )
     return smoothed(hu, sigma), (finding,) if noise >= REPORTED else ()

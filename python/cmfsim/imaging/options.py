@@ -1,4 +1,4 @@
-"""What a person may set in the segmentation of a head."""
+"""Options of the segmentation of a head."""
 
 from dataclasses import dataclass
 
@@ -22,18 +22,18 @@ class SegmentOptions:
     Attributes
     ----------
     skin_threshold : float, HU
-        Between air (−1000) and fat (−100); −300 lies near half way to muscle.
+        Between air (−1000) and fat (−100); −300 is about half-way to muscle.
     bone_threshold : float or None, HU
         Between soft tissue (up to 100) and compact bone (700 and more): bone's surface lies at this
-        value. None: bone is what exceeds 250, and its surface lies at half the height of the step
-        from soft tissue to the bone behind it, where that is more.
+        value. None: bone is everything above 250, and its surface is at half the height of the step
+        from soft tissue to the bone behind it, if that is higher.
     metal_threshold : float or None, HU
         Above enamel (up to 2200): fillings, crowns, plates. None: 2500, or just below the value at
         which the image saturates where that is lower.
     working_spacing : float, mm
         Finer voxels are averaged until they would be larger than this; coarser ones are kept.
     most_voxels : int
-        The working grid is made coarser, with a finding, where it would have more voxels.
+        If the working grid would have more voxels, it is made coarser, with a finding.
     closing : float, mm
         Holes of bone up to twice this wide are bridged where a hollow lies behind.
     least_skin : float, mm
@@ -41,10 +41,10 @@ class SegmentOptions:
     island : float, mm³
         Pieces of bone below this volume are dropped.
     part_jaws : bool
-        Whether to look for the mandible; else the bone is one "skull".
+        Whether to separate the mandible; otherwise the bone is one "skull".
     rescale : tuple of float or None
-        Slope and intercept from the image's values to HU. None: the values are HU, or a scale that
-        the histogram gives away, with a finding.
+        Slope and intercept from the image's values to HU. None: the values are HU, or in a scale
+        that the histogram reveals, with a finding.
 
     Raises
     ------
@@ -77,7 +77,7 @@ class SegmentOptions:
         if not -1000.0 < self.skin_threshold < self.least_bone < metal:
             raise ImageInputError(
                 f"thresholds are skin {self.skin_threshold:g}, bone {self.least_bone:g}, metal "
-                f"{metal:g} HU: they must ascend and lie above −1000"
+                f"{metal:g} HU: they must increase in this order and be above −1000"
             )
         if self.rescale is not None:
             slope, intercept = self.rescale
@@ -86,5 +86,5 @@ class SegmentOptions:
 
     @property
     def least_bone(self) -> float:
-        """What is denser is bone, HU."""
+        """Threshold above which voxels are bone, HU."""
         return BONE if self.bone_threshold is None else self.bone_threshold

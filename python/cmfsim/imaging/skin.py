@@ -155,8 +155,9 @@ def _rest_removed(volume: float) -> Finding:
         "rest-removed",
         f"{volume / 1000.0:.0f} cm³ of couch, pillow or head-rest was removed",
         where="behind or beside the head",
-        why="where it touched, the skin is drawn from the head's shape, not from the image",
-        fix="check the back of the head by eye if it matters",
+        why="where it touched the head, the skin comes from the shape of the head, not from the "
+        "image",
+        fix="check the back of the head visually if it matters",
     )
 
 
@@ -169,7 +170,7 @@ def _filled_in_layers(tissue: Mask) -> Mask:
 
 
 def _without_couch(tissue: Mask, spacing: NDArray[np.float64]) -> tuple[Mask, Mask]:
-    """What is left without that which shows alike in all slices; and that."""
+    """The mask without the parts that are the same in all slices, and these parts."""
     part = tissue.mean(axis=2)
     always = part > IN_ALL_SLICES
     # The head changes from slice to slice: what shows in some slices tells where it is.
@@ -233,7 +234,7 @@ def _core(tissue: Mask, spacing: NDArray[np.float64]) -> Mask:
 def _beyond_scalp(
     tissue: Mask, bone: Mask, y: NDArray[np.float64], spacing: NDArray[np.float64]
 ) -> Mask:
-    """What lies behind or beside the skull's vault, farther from it than the scalp is thick."""
+    """The parts behind or next to the skull's vault, farther away than the scalp is thick."""
     nothing = np.zeros_like(tissue)
     layers = np.flatnonzero(bone.any(axis=(0, 1)))
     if not len(layers) or bone[:, :, -1].any():

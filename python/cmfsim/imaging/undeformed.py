@@ -24,7 +24,7 @@ def undeformed_mask(
     threshold: float = 250.0,
     margin: float = 4.0,
 ) -> ImageData:
-    """The skull above the jaws, which surgery of the jaws leaves alone, with a margin round it.
+    """A mask of the skull above the jaws, which jaw surgery does not change, with a margin.
 
     Parameters
     ----------
@@ -33,15 +33,15 @@ def undeformed_mask(
     landmarks : mapping of str to (3,) float64, mm
         Of the skull: "suborbital_L", "suborbital_R", "supraglenoid_L", "supraglenoid_R".
     threshold : float, HU
-        Bone lies above.
+        Bone is above this.
     margin : float, mm
         Round the bone: the metric needs both sides of its surface.
 
     Returns
     -------
     ImageData
-        uint8, 1 in the mask, on the grid of the image. For a Le Fort III or an operation of the
-        vault draw a mask by hand.
+        uint8, 1 in the mask, on the grid of the image. For a Le Fort III or an operation on the
+        vault, draw a mask by hand.
 
     Raises
     ------
@@ -61,8 +61,8 @@ def undeformed_mask(
     missing = [name for name in CRANIAL_LANDMARKS if name not in landmarks]
     if missing:
         raise LandmarkInputError(
-            f"landmarks lack {', '.join(missing)}: the plane above the jaws runs through "
-            f"{', '.join(CRANIAL_LANDMARKS)}"
+            f"landmarks lack {', '.join(missing)}: they define the plane above the jaws, which "
+            f"runs through {', '.join(CRANIAL_LANDMARKS)}"
         )
     points = as_rows(
         "landmarks", np.array([as_floats(name, landmarks[name]) for name in CRANIAL_LANDMARKS]), 3
@@ -73,16 +73,17 @@ def undeformed_mask(
     normal = axes[2] if axes[2, 2] > 0.0 else -axes[2]
     if sizes[1] < 0.1 * sizes[0]:
         raise LandmarkInputError(
-            f"the landmarks {', '.join(CRANIAL_LANDMARKS)} lie nearly on one line: no plane runs "
-            "through them alone"
+            f"the landmarks {', '.join(CRANIAL_LANDMARKS)} are nearly on one line, so they do "
+            "not define a plane"
         )
     x, y, z = image.axes()
     height = (x - centre[0]) * normal[0] + (y - centre[1]) * normal[1] + (z - centre[2]) * normal[2]
     bone = (image.values > threshold) & (height > 0.0)
     if not bone.any():
         raise RegistrationInputError(
-            f"the image has no voxel above {threshold:g} HU on the upper side of the plane through "
-            f"{', '.join(CRANIAL_LANDMARKS)}: is it in HU, and are both in one frame?"
+            f"the image has no voxel above {threshold:g} HU on the upper side of the plane "
+            f"through {', '.join(CRANIAL_LANDMARKS)}: check that it is in HU, and that image and "
+            "landmarks are in one frame"
         )
     near = distance(np.asfortranarray(bone), image.spacing, margin) <= margin
     return image.with_values((near & (height > 0.0)).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""What of the head the image leaves out, and whether it shows it the right way round."""
+"""Checks of whether the image shows the whole head, and with the right orientation."""
 
 import numpy as np
 
@@ -57,7 +57,7 @@ def _turned(code: str, what: str) -> Finding:
         f"{what}: the image is flipped, or its header is wrong",
         where="image",
         why="front and back, or up and down, would be swapped; left and right may be swapped as "
-        "well, which no image can show",
+        "well, but an image cannot show that",
         fix="export the image again with its orientation, and check left and right",
     )
 
@@ -111,7 +111,7 @@ def _round(work: Working, skin: Skin) -> list[Finding]:
             f"mm across: skin or tissue meets its border over {area / 100.0:.0f} cm²",
             where="border of the field of view",
             why="the surface is closed there, and values near the border are too high",
-            fix="compare and plan well inside the field, or use a scan of the whole head",
+            fix="plan and evaluate only well inside the field, or use a scan of the whole head",
         )
     ]
 
@@ -129,7 +129,7 @@ def _top(bone: Bone, area: float) -> Finding:
         "ct-cut-vertex",
         f"the vertex is cut off: {what}",
         where="top border of the image",
-        why="the skull is closed flat there; the face is not affected",
+        why="the skull is closed by a flat surface there; the face is not affected",
     )
 
 
@@ -145,6 +145,6 @@ def _missing(side: str, part: str, what: str) -> Finding:
         f"ct-cut-{side}",
         f"{part} cut off: {what}",
         where=f"{side} border of the image",
-        why="the surface is closed flat there, and the prediction near it is meaningless",
-        fix="use an image that holds the whole face, or leave that region out of the evaluation",
+        why="the surface is closed by a plane there, and the prediction near it is meaningless",
+        fix="use an image that shows the whole face, or exclude that region from the evaluation",
     )

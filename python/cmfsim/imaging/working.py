@@ -155,12 +155,12 @@ def _check_size(image: ImageData, spacing: NDArray[np.float64]) -> None:
         raise ImageInputError(
             f"image has {' × '.join(map(str, shape))} voxels over "
             f"{' × '.join(f'{e:.0f}' for e in extent)} mm: at least {LEAST_VOXELS} voxels and "
-            f"{LEAST_EXTENT:g} mm along each axis are needed to hold a face"
+            f"{LEAST_EXTENT:g} mm along each axis are needed for a face"
         )
     if (extent > 2000.0).any() or (spacing > 10.0).any():
         raise ImageInputError(
-            f"image has voxels of {spacing.tolist()} mm over {extent.round().tolist()} mm: no head "
-            "is that large; is its spacing in µm, or wrong?"
+            f"image has voxels of {spacing.tolist()} mm over {extent.round().tolist()} mm: no "
+            "head is that large; check whether its spacing is in µm, or wrong"
         )
     if image.values.dtype.kind == "f":
         finite = np.isfinite(image.values)
@@ -180,8 +180,8 @@ def _spacing_findings(spacing: NDArray[np.float64]) -> list[Finding]:
             "ct-spacing-coarse",
             f"voxels are {' × '.join(f'{s:g}' for s in spacing)} mm",
             where="image",
-            why=f"thin bone, lips and eyelids vanish between slices more than {COARSE_SLICES:g} mm "
-            "apart; surfaces are a millimetre less accurate",
+            why="thin bone, lips and eyelids are lost between slices more than "
+            f"{COARSE_SLICES:g} mm apart; surfaces are a millimetre less accurate",
             fix="use the thin-slice reconstruction of the same scan",
         )
     ]
@@ -221,7 +221,7 @@ def _coarsened(target: NDArray[np.float64], options: SegmentOptions) -> Finding:
         "ct-coarsened",
         f"the head was resampled at {' × '.join(f'{t:.2f}' for t in target)} mm",
         where="image",
-        why=f"more than most_voxels = {options.most_voxels} would have been needed",
+        why=f"a finer grid would have more than most_voxels = {options.most_voxels} voxels",
         fix="crop the image to the face, or raise most_voxels",
     )
 

@@ -44,7 +44,7 @@ _CALIBRATION = table(
 
 
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """The calibration that a file holds.
+    """The calibration in a file.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
 
 
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
-    """Writes a calibration; the same calibration is the same bytes.
+    """Writes a calibration; the same calibration always gives the same bytes.
 
     Parameters
     ----------

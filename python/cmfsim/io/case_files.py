@@ -76,7 +76,7 @@ TABLES = (
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A patient: what to read, where to cut, what moves, and how to solve.
+    """A patient: input files, cuts, plan and solver options.
 
     Attributes
     ----------
@@ -97,18 +97,18 @@ class Case:
     plan : mapping of str to CaseMotion
         Segments that it does not name stay.
     achieved : bool
-        The plan is what the operation achieved, read off the bones after it; `plan` is empty.
+        The plan is measured on the post-operative bones; `plan` is empty.
     node_kinds : mapping of str to plain values
         Options of the stage that classifies nodes.
     tissue : TissueData
         Fat: everywhere in a homogeneous model, between the muscles in the others.
     muscles : CaseMuscles or None
-        None leaves them out of what `cmfsim build` makes.
+        None: `cmfsim build` makes a model without muscles.
     solver : SolverOptions
     band : CaseBand
     postoperative : CasePostoperative or None
     note : str
-        What readers of its report should know, such as that the patient is made by code.
+        A remark for readers of the report, such as that the patient is synthetic.
     lines : mapping of str to int
         The line of each dotted key in the case file, for findings.
 
@@ -144,7 +144,7 @@ class Case:
         if (self.image is None) == (self.surfaces is None):
             raise CaseInputError("a case has either an image or surfaces")
         if self.achieved and self.plan:
-            raise CaseInputError("a plan is given or achieved, not both")
+            raise CaseInputError("a plan is either given or achieved, not both")
         for name in ("plan", "node_kinds", "lines"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
@@ -164,7 +164,7 @@ class Case:
         Raises
         ------
         FileNotFoundError
-            The case file does not exist. Files that it names are not looked for.
+            The case file does not exist. The files that it names are not checked.
         CaseError
             (also `ValueError`) Not TOML, an unknown key, a value of another type or out of range:
             with file, line and key.
@@ -190,7 +190,7 @@ class Case:
         """
         document = read_tables(Path(path)).only("plan")
         if not list(document.table("plan")):
-            document.fail("plan", "has no motion: tables [plan.SEGMENT] are needed")
+            document.fail("plan", "has no motion: add tables [plan.SEGMENT]")
         return replace(self, plan=plan_of(document, Path(path).parent), achieved=False)
 
     def where(self, key: str) -> str:
@@ -224,8 +224,8 @@ def as_case(case: CaseOrPath) -> Case:
     if isinstance(case, str | os.PathLike):
         return Case.load(case)
     raise CaseInputError(
-        f"the case is of type {type(case).__name__}: give a Case, or the path of a case.toml or of "
-        "the folder that holds it"
+        f"the case is of type {type(case).__name__}: give a Case, or the path of a case.toml or "
+        "of the folder that contains it"
     )
 
 
@@ -236,8 +236,8 @@ def _case_file(path: Path) -> Path:
     file = path / CASE_FILE
     if not file.exists():
         raise CaseInputError(
-            f"{path.resolve()}: is a folder without a {CASE_FILE}: name the case file, or the "
-            "folder that holds it"
+            f"{path.resolve()}: is a folder without a {CASE_FILE}: give the path of the case "
+            "file, or of the folder that contains it"
         )
     return file
 

@@ -60,7 +60,7 @@ def is_achieved(document: Table) -> bool:
     if "image" not in after and "bones" not in after:
         document.fail(
             "plan",
-            "is achieved, but there is no bone after the operation to read it from: add "
+            'is "achieved", but the case has no post-operative bone to measure it on: add '
             "[postoperative] image, or [postoperative.bones]",
         )
     return True

@@ -114,9 +114,14 @@ def image_of(table: Table, folder: Path) -> CaseImage:
     bone = table.number("bone_threshold", "HU", low=-1024.0, high=3071.0)
     metal = table.number("metal_threshold", "HU", low=-1024.0, high=MOST_HU)
     if skin is not None and bone is not None and skin >= bone:
-        table.fail("skin_threshold", f"is {skin:g}, bone_threshold {bone:g}: it must be below")
+        table.fail(
+            "skin_threshold", f"is {skin:g}, bone_threshold is {bone:g}: the former must be smaller"
+        )
     if bone is not None and metal is not None and bone >= metal:
-        table.fail("bone_threshold", f"is {bone:g}, metal_threshold {metal:g}: it must be below")
+        table.fail(
+            "bone_threshold",
+            f"is {bone:g}, metal_threshold is {metal:g}: the former must be smaller",
+        )
     low, high = WORKING_SPACINGS
     spacing = table.number("working_spacing", "mm", low=low, high=high)
     path = file_of(table, "file", folder)
@@ -156,7 +161,10 @@ def surfaces_of(table: Table, folder: Path) -> CaseSurfaces:
     bones = table.table("bones")
     names = list(bones)
     if not names:
-        table.fail("bones" if "bones" in table else None, 'names no bone: cranium = "file.ply"')
+        table.fail(
+            "bones" if "bones" in table else None,
+            'names no bone: add a line such as cranium = "file.ply"',
+        )
     return CaseSurfaces(
         skin=file_of(table, "skin", folder),
         bones={checked_name(bones, name, name): file_of(bones, name, folder) for name in names},
@@ -348,7 +356,8 @@ def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
         table.fail("image", "is given together with skin: give one of them")
     if "image" in table and "bones" in table:
         table.fail(
-            "bones", "is given together with image, from which bones are read: give one of them"
+            "bones",
+            "is given together with image, from which bones are segmented: give one of them",
         )
     if "series" in table and "image" not in table:
         table.fail("series", "chooses among the DICOM series of an image, but there is no image")

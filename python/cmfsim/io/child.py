@@ -190,7 +190,7 @@ class _Child:
         code = self.process.wait()
         self.end()
         if late or (os.name == "posix" and code == -signal.SIGXCPU):
-            return "its reader took longer than a file of this size needs"
+            return "reading it took longer than a file of this size should need"
         if code < 0:
             return f"its reader crashed ({signal.Signals(-code).name})"
         return f"its reader ended with exit code {code}"
@@ -224,7 +224,7 @@ class _Child:
 def _error_of(kind: str, text: str) -> Exception:
     """The error of a class that the package or Python names, as it was raised in the child."""
     if kind == "MemoryError":
-        return ReaderError("its reader asked for more memory than a file of this size needs")
+        return ReaderError("reading it needed more memory than a file of this size should need")
     found = PLAIN_ERRORS.get(kind) or getattr(errors, kind, None)
     if isinstance(found, type) and issubclass(found, Exception):
         return found(text)

@@ -39,7 +39,7 @@ def on_cluster(
     CaseError
         (also `ValueError`) No Dask installed, or no cluster at the address.
     """
-    distributed = third_party("distributed", "work is spread over a cluster", "study")
+    distributed = third_party("distributed", "work is distributed over a cluster", "study")
     try:
         client = distributed.Client(scheduler, timeout=ANSWER_TIME)
     except (OSError, ValueError) as error:

@@ -53,7 +53,7 @@ class Cohort:
     def __post_init__(self) -> None:
         as_text("cohort name", self.name)
         if not self.cases:
-            raise CaseInputError("a cohort needs a case")
+            raise CaseInputError("a cohort needs at least one case")
         for model in self.models:
             check_one_of("model", model, MODELS)
 
@@ -64,8 +64,8 @@ class Cohort:
         Parameters
         ----------
         path : path
-            Of the file, or of a folder that holds a `cohort.toml`. A folder without one stands for
-            the cases in its folders, `NAME/case.toml`, with all models.
+            Of the file, or of a folder that holds a `cohort.toml`. A folder without one is the
+            cohort of the cases in its folders, `NAME/case.toml`, with all models.
 
         Returns
         -------
@@ -74,7 +74,7 @@ class Cohort:
         Raises
         ------
         FileNotFoundError
-            The file does not exist. Cases that it names are not looked for.
+            The file does not exist. The cases that it names are not checked.
         CaseError
             (also `ValueError`) Not TOML, an unknown key, a case twice, an unknown model: with file,
             line and key; a folder without a cohort file or cases.

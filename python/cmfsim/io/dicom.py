@@ -148,7 +148,7 @@ def _headers(folder: Path) -> tuple[list[DicomHeader], list[Finding]]:
                 "dicom-other-files",
                 f"skipped {counted(len(others), 'file')} not in DICOM: {listed(others)}",
                 where=folder.name,
-                why="a slice with damaged first bytes would be among them",
+                why="a slice whose first bytes are damaged would also be skipped",
             )
         )
     return headers, findings

@@ -37,7 +37,7 @@ class Slice:
             tag = {"position": "0020,0032", "orientation": "0020,0037"}.get(key, "0028,0030")
             raise ImageInputError(
                 f"{self.name}: does not state its {key.replace('_', ' ')} (DICOM tag {tag} is "
-                f"{self.text(key)[:60]!r}): export the series again as it was scanned"
+                f"{self.text(key)[:60]!r}): export the series again from the scanner or archive"
             )
         return found
 

@@ -108,7 +108,7 @@ def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[F
         "orientation): "
         f"{listed(left)}",
         where=name,
-        why="they show the head from other directions",
+        why="they show the head from different directions",
         fix="" if not others else "check that none of these is a slice of the volume",
     )
     return groups[0], [finding]
@@ -198,9 +198,9 @@ def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
     if off.max() > READERS_AGREE:
         worst = int(np.argmax(off))
         raise ImageInputError(
-            f"{stack.slices[worst].name}: two readings of its place disagree: "
-            f"{expected[worst].tolist()} and {places[worst].tolist()} (position and pixel spacing "
-            "in mm): export the series again"
+            f"{stack.slices[worst].name}: two readings of its position disagree: "
+            f"{expected[worst].tolist()} and {places[worst].tolist()} (position and pixel "
+            "spacing in mm): export the series again"
         )
     return answer.arrays["values"]
 
@@ -269,9 +269,9 @@ def _check_acquisitions(name: str, stack: Stack) -> None:
     for (_, high, first), (low, _, second) in itertools.pairwise(spans):
         if low < high:
             raise ImageInputError(
-                f"{name}: the slices of acquisitions {first or '-'} and {second or '-'} lie "
-                f"between one another ({low:.2f} to {high:.2f} mm along the normal): two scans or "
-                "times in one series; keep the slices of one acquisition in the folder"
+                f"{name}: the slices of acquisitions {first or '-'} and {second or '-'} are "
+                f"interleaved ({low:.2f} to {high:.2f} mm along the normal): two scans or times "
+                "in one series; keep the slices of one acquisition in the folder"
             )
 
 
@@ -380,13 +380,14 @@ def _tilt_findings(
         findings.append(
             Finding.warning(
                 "dicom-tilted",
-                f"{what}, resampled by each slice's own position "
+                f"{what}, resampled by the position of each slice "
                 f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)",
                 where=name,
-                why=f"without resampling the head would be sheared; between slices {gap:.1f} mm "
-                f"apart the skin is known to {SKIN_SHARE * gap:.1f} mm; outside the slices there "
-                "is air, so the neck may end on an oblique plane, where nothing is fixed",
-                fix=f"check the skin by eye; {_whole_heights(stack)}",
+                why=f"without resampling, the head would be sheared; between slices {gap:.1f} mm "
+                f"apart the skin is known to {SKIN_SHARE * gap:.1f} mm; outside the slices "
+                "there is air, so the neck may end on an oblique plane on which nothing is "
+                "fixed",
+                fix=f"check the skin visually; {_whole_heights(stack)}",
             )
         )
     if abs(abs(tilt) - angle) > TILTS_AGREE:
@@ -397,8 +398,8 @@ def _tilt_findings(
                 f"{angle:.1f}°; the positions were used",
                 where=name,
                 why="if another program wrote the positions without the tilt, the head is sheared",
-                fix="export the series from the scanner or archive as it was made, and check the "
-                "head's shape by eye",
+                fix="export the original series from the scanner or archive, and check the "
+                "shape of the head visually",
             )
         )
     return findings
@@ -427,7 +428,7 @@ def _uneven(name: str, stack: Stack, uneven: list[int]) -> Finding:
         f"{steps.max():.3g} mm: {_steps(stack, uneven)}; resampled by their positions",
         where=name,
         why="shapes are less certain where slices are further apart",
-        fix="use a reconstruction with even slices if there is one",
+        fix="use a reconstruction with evenly spaced slices if there is one",
     )
 
 
@@ -436,7 +437,7 @@ def _oblique(name: str, angle: float) -> Finding:
         "image-oblique",
         f"the image's axes are turned by {angle:.1f}° from the patient's; it was resampled",
         where=name,
-        why="everything works on a grid along the patient's axes",
+        why="all stages need a grid along the patient's axes",
     )
 
 
@@ -445,7 +446,7 @@ def _coarse(name: str, gap: float) -> Finding:
         "ct-spacing-coarse",
         f"slices are {gap:.3g} mm apart",
         where=name,
-        why=f"thin bone, lips and eyelids vanish between slices more than {COARSE_SLICES:g} mm "
+        why=f"thin bone, lips and eyelids are lost between slices more than {COARSE_SLICES:g} mm "
         "apart; surfaces are a millimetre less accurate",
         fix="use the thin-slice reconstruction of the same scan",
     )
@@ -461,6 +462,6 @@ def _rescale_findings(name: str, stack: Stack) -> list[Finding]:
             f"the header states that values are {', '.join(sorted(kinds))!r}, not HU",
             where=name,
             why="thresholds of skin and bone are in HU",
-            fix="check skin and bone by eye, or set skin_threshold and bone_threshold",
+            fix="check skin and bone visually, or set skin_threshold and bone_threshold",
         )
     ]

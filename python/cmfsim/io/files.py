@@ -1,4 +1,4 @@
-"""What every reader and writer of the package does: names in errors, documents, safe replacement.
+"""Shared by all readers and writers: names in errors, documents, safe replacement.
 
 Files come from strangers: paths may not lead out of a folder, sizes are checked before memory is
 taken. A file is written under a temporary name and renamed, so a run that fails leaves the old one
@@ -134,7 +134,7 @@ def _mode(path: Path, error: type[ValueError]) -> int | None:
         # Path.exists and Path.is_file raise these too: a name of 300 characters, for one.
         raise error(f"{_shown(path)}: cannot be opened ({other.strerror})") from other
     except ValueError as other:
-        raise error(f"{_shown(path)!r}: no file has that name ({other})") from other
+        raise error(f"{_shown(path)!r}: this is not a valid file name ({other})") from other
 
 
 def _shown(path: Path) -> str:
@@ -327,5 +327,9 @@ def check_version(version: object) -> None:
     if isinstance(version, bool) or not isinstance(version, int):
         raise CaseInputError(f"version is {version!r}: a whole number is needed")
     if version != FORMAT_VERSION:
-        hint = "a newer cmfsim wrote it: update" if version > FORMAT_VERSION else "unknown version"
+        hint = (
+            "the file was written by a newer cmfsim: update cmfsim"
+            if version > FORMAT_VERSION
+            else "unknown version"
+        )
         raise CaseInputError(f"version is {version}, this cmfsim reads {FORMAT_VERSION}; {hint}")

@@ -145,8 +145,8 @@ def check_below(folder: Path, base: Path) -> None:
         raise CaseInputError(f"{folder}: cannot be followed ({error})") from error
     if leads_out:
         raise CaseInputError(
-            f"{folder}: is a link that points outside the case's folder, to {real}: remove it, or "
-            f"write there by -o {real}"
+            f"{folder}: is a link that points outside the case's folder, to {real}: remove it, "
+            f"or choose the target with -o {real}"
         )
 
 
@@ -166,7 +166,7 @@ def check_writable(folder: Path) -> None:
     if not there.is_dir():
         what = "is a broken link" if there.is_symlink() else "is a file"
         raise CaseInputError(
-            f"{there}: {what}; the output folder cannot be made there: give another by -o"
+            f"{there}: {what}, so the output folder cannot be created; choose another one with -o"
         )
     try:
         # The folder itself is made when there is something to put in it.
@@ -174,7 +174,7 @@ def check_writable(folder: Path) -> None:
     except OSError as error:
         raise OSError(
             error.errno,
-            f"the output cannot be written there ({error.strerror}); give another folder by -o",
+            f"the output folder is not writable ({error.strerror}); choose another one with -o",
             str(there),
         ) from error
 

@@ -1,4 +1,4 @@
-"""What the header of an image file may state: shared checks of numbers, sizes, places and names.
+"""Shared checks of image headers: numbers, sizes, positions and names.
 
 A header may crash or mislead a reader: numbers of a thousand digits, infinite places, sizes beyond
 any memory, data files in other folders, sheared axes that are silently made orthogonal. Each format
@@ -174,7 +174,7 @@ def _unpacked_length(name: str, data: Path, start: int, needed: int, packing: st
         ) from error
     if reader.eof and left:
         raise ImageInputError(
-            f"{name}: holds {left} bytes or more behind the end of its voxels: copy it again"
+            f"{name}: holds {left} bytes or more after the end of its voxels: copy it again"
         )
     if found <= needed and not reader.eof:
         raise ImageInputError(
@@ -210,7 +210,7 @@ def data_file(path: Path, name: str) -> Path:
         raise ImageInputError(f"{path.name}: its data file is {shown!r}: {how}")
     given = Path(name)
     if given.is_absolute() or ".." in given.parts or "\\" in name or ":" in name:
-        raise ImageInputError(f"{path.name}: its data file {shown!r} lies elsewhere: {how}")
+        raise ImageInputError(f"{path.name}: its data file {shown!r} is in another folder: {how}")
     data = path.parent / given
     if not is_below(data, path.parent):
         raise ImageInputError(
@@ -233,8 +233,8 @@ def unstated(path: Path, stated: str, how: str) -> Finding:
         "image-frame-unstated",
         f"{stated}: its axes were assumed to be left, posterior and superior",
         where=path.name,
-        why="if that is wrong, left and right of the face are swapped, or front and back; no image "
-        "can show left and right",
+        why="if this is wrong, left and right of the face are swapped, or front and back; left "
+        "and right cannot be recognised in an image",
         fix=f"export the image again with its orientation ({how}), and check left and right",
     )
 

@@ -122,9 +122,9 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
 
 
 def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
-    """Nothing; the image is in a file, whose name ends in .nrrd, .nii, .nii.gz or .mha.
+    """Writes an image to a file whose name ends in .nrrd, .nii, .nii.gz or .mha.
 
-    It is written under another name first, so that a failure leaves an older file whole.
+    It is written under another name first, so that a failure leaves an older file intact.
 
     Raises
     ------
@@ -202,8 +202,9 @@ def _read_file(path: Path, header: ImageHeader) -> ImageFile:
         affine = theirs
     elif not header.scaled and (off := apart(affine, theirs, header.size)) > READERS_AGREE:
         raise ImageInputError(
-            f"{path.name}: two readings of its header disagree by {off:.4g} mm on where it lies "
-            f"({affine.round(4).tolist()} and {theirs.round(4).tolist()}): export the image again"
+            f"{path.name}: two readings of its header disagree by {off:.4g} mm about its "
+            f"position ({affine.round(4).tolist()} and {theirs.round(4).tolist()}): export the "
+            "image again"
         )
     return _placed(path, values, affine, header.findings)
 
@@ -239,15 +240,15 @@ def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:
             f"the image's axes are turned by {turn_of(affine):.1f}° from the patient's; it was "
             "resampled",
             where=path.name,
-            why="everything works on a grid along the patient's axes",
+            why="all stages need a grid along the patient's axes",
         )
     return Finding.warning(
         "image-sheared",
         f"the image's axes are {shear:.1f}° from right angles, as in a CT with a tilted gantry; it "
         "was resampled by its stated axes",
         where=path.name,
-        why="programs that assume perpendicular axes shear the head",
-        fix="check the skin by eye against the scan",
+        why="a program that assumes perpendicular axes would show the head sheared",
+        fix="compare the skin with the scan visually",
     )
 
 

@@ -79,7 +79,7 @@ def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) ->
     path : path
     frame : str, optional
         "LPS" or "RAS", for a file that does not state its frame; a statement in the file wins.
-        Without both, the format's own rule holds and a warning is logged.
+        Without both, the rule of the format applies and a warning is logged.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def _known_labels(
         f"{len(renamed)} labels are spelled differently: {', '.join(renamed[:4])}{more}",
         where=where,
         why="the second spelling is used",
-        fix="nothing needs to be done; one spelling is easier to find",
+        fix="nothing needs to be done, but a single spelling is easier to find",
     )
     return MappingProxyType({labels[label]: point for label, point in points.items()}), [finding]
 
@@ -173,7 +173,7 @@ def write_landmarks(
 ) -> None:
     """Writes landmarks as a `.mrk.json` file of 3D Slicer, LPS mm.
 
-    An existing file is replaced in one step; `read_landmarks` gives the same numbers back.
+    An existing file is replaced in one step; `read_landmarks` returns the same numbers.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def write_landmarks(
         Ends in `.mrk.json`.
     landmarks : mapping of str to (3,) float64, mm
     descriptions : mapping of str to str, optional
-        What 3D Slicer shows with a point, by label.
+        Description that 3D Slicer shows with each point, by label.
 
     Raises
     ------
@@ -285,7 +285,7 @@ def _landmark_file(
                 code="landmark-frame-unstated",
                 what=f"the file does not state its frame: read as {chosen}, {origin}",
                 where=path.name,
-                why="RAS read as LPS turns the head by half a turn about its long axis",
+                why="reading RAS as LPS rotates the head by 180° about its long axis",
                 fix='state it: "coordinateSystem": "LPS" (.mrk.json), # CoordinateSystem = LPS '
                 "(.fcsv),"
                 ' or frame = "LPS" under [landmarks]',
@@ -298,7 +298,7 @@ def _landmark_file(
                 "landmark-unset",
                 f"{len(unset)} points were never placed and are skipped: {names}",
                 where=path.name,
-                why="whatever is placed from them uses its default or is refused",
+                why="items placed from them use their defaults or are refused",
                 fix="place them in 3D Slicer, or delete them",
             )
         )

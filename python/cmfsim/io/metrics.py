@@ -146,14 +146,14 @@ def read_picture(path: Path) -> bytes:
 
 
 def write_metrics(path: str | os.PathLike[str], metrics: Any) -> None:
-    """Writes figures as `.json` (all of them) or `.csv` (a table); an old file goes in one step.
+    """Writes figures as `.json` (all) or `.csv` (a table), replacing an old file in one step.
 
     Parameters
     ----------
     path : path
     metrics : SkinComparison, ModelComparison, AchievedPlan, ErrorTable, … or mapping
-        For `.json` what has `as_dict()`, or a mapping of plain values; for `.csv` what has `csv()`,
-        as an `ErrorTable` has.
+        For `.json` an object with `as_dict()`, or a mapping of plain values; for `.csv` an object
+        with `csv()`, such as an `ErrorTable`.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def write_metrics(path: str | os.PathLike[str], metrics: Any) -> None:
 def _call(path: Path, metrics: Any, method: str) -> Any:
     if not callable(getattr(metrics, method, None)):
         raise CaseInputError(
-            f"{path.name}: a {type(metrics).__name__} has no {method}(): give what compare_skins, "
-            "compare_models, achieved_plan or error_table return"
+            f"{path.name}: a {type(metrics).__name__} has no {method}(): give a result of "
+            "compare_skins, compare_models, achieved_plan or error_table"
         )
     return getattr(metrics, method)()

@@ -38,13 +38,13 @@ def write_model(
     model: PatientModel,
     draw: Callable[[Path], Iterable[str]] | None = None,
 ) -> list[str]:
-    """The names of the files that a model is written as, in a folder that is made if need be.
+    """The names of the files of a model, written to a folder, which is created if necessary.
 
     `scene.npz` (what `cmfsim solve` takes), `tissue.vtu` (nodes with their kind and segment),
     `skin.ply`, `segment-NAME.ply`, and `build.json` (counts, quality, findings, timings, hashes).
-    All files are written beside the old ones first and then take their places, the summary last;
-    where one cannot, the old ones come back. Segments and pictures that `build.json` of an earlier
-    build lists and this model has not are taken away.
+    All files are written next to the old ones first and then moved into place, the summary last; if
+    this fails, the old files are restored. Segments and pictures that the `build.json` of an
+    earlier build lists but this model does not have are removed.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def write_model(
     Raises
     ------
     OSError
-        The folder cannot be made or written to.
+        The folder cannot be created or written to.
 
     Examples
     --------

@@ -230,7 +230,7 @@ def _no_unit(path: Path, spacing: NDArray[np.float64]) -> Finding:
         f"it states no unit of length: voxels were taken as {text} mm",
         where=path.name,
         why="every length of the head depends on it",
-        fix="compare a distance with one on the patient, or export with units of mm",
+        fix="compare a distance in the image with one on the patient, or export with units of mm",
     )
 
 
@@ -253,7 +253,7 @@ def _affine(path: Path, header: _Header) -> tuple[NDArray[np.float64], list[Find
         off = apart(turned, rows, header.size)
         if min(off, apart(turned, _orthogonal(rows, spacing), header.size)) > PLACES_AGREE:
             raise ImageInputError(
-                f"{path.name}: its two statements of where it lies disagree by {off:.4g} mm "
+                f"{path.name}: its two statements of its position disagree by {off:.4g} mm "
                 f"(qform, code {code_turn}: {turned.round(4).tolist()}; sform, code {code_rows}: "
                 f"{rows.round(4).tolist()}): keep the right one and set the code of the other to "
                 "0, or convert the DICOM series again"
@@ -271,7 +271,7 @@ def _template(path: Path, code: int, severity: str, used: str) -> Finding:
         code="image-template-space",
         what=f"its sform (code {code}) leads to the space of a template{used}",
         where=path.name,
-        why="lengths in a template's space are not those of the patient",
+        why="lengths in the space of a template differ from those of the patient",
         fix="" if used else "use the image in the scanner's space",
     )
 

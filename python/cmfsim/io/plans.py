@@ -20,7 +20,7 @@ BARE = re.compile(r"[A-Za-z0-9_-]+")
 def write_plan(
     path: str | os.PathLike[str], plan: Mapping[str, ArrayLike], *, made_for: str = ""
 ) -> None:
-    """Writes rigid motions as tables `[plan.SEGMENT]`: what `cmfsim predict --plan` reads.
+    """Writes rigid motions as tables `[plan.SEGMENT]`, which `cmfsim predict --plan` reads.
 
     Parameters
     ----------

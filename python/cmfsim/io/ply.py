@@ -170,7 +170,7 @@ def _header(data: bytes) -> tuple[list[_Element], str, int]:
             elements.append(_Element(name, int(words[2]), ()))
         elif words[0] == b"property":
             if not elements:
-                fail("stands before the first element")
+                fail("comes before the first element")
             found_property = _property(words)
             if found_property is None:
                 fail(f"types are {', '.join(name.decode() for name in TYPES)}")

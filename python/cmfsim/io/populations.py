@@ -39,12 +39,12 @@ def part_of(index: int) -> str:
 
 @dataclass(frozen=True)
 class PopulationEntry:
-    """What became of one drawn patient.
+    """The state of one drawn patient.
 
     Attributes
     ----------
     state : str
-        "made"; "failed": there is no truth, and `reason` says why; "pending": not tried yet.
+        "made"; "failed": there is no truth, and `reason` states why; "pending": not tried yet.
     part : str
         "train", "calibration" or "test".
     operation : str
@@ -68,14 +68,14 @@ class PopulationEntry:
 
 @dataclass(frozen=True)
 class Population:
-    """Drawn patients, those whose truth failed among them.
+    """Drawn patients, including those whose truth failed.
 
     Attributes
     ----------
     patients : mapping of str to PopulationEntry
         By name, in their order.
     settings : mapping
-        What they were drawn and computed with.
+        The settings with which they were drawn and computed.
     """
 
     patients: Mapping[str, PopulationEntry]

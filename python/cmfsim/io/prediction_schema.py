@@ -1,4 +1,4 @@
-"""What `prediction.json` may hold, and the names of a prediction's files."""
+"""The allowed contents of `prediction.json`, and the names of a prediction's files."""
 
 import re
 

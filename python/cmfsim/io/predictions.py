@@ -188,17 +188,16 @@ def write_prediction(
     prediction: Prediction,
     draw: Callable[[Path], Iterable[str]] | None = None,
 ) -> list[str]:
-    """The names of the files that a prediction is written as, in a folder that is made if need be.
+    """The names of the files of a prediction, written to a folder, which is created if necessary.
 
     `prediction.vtp` (the mesh's skin at rest with its `displacement`, and with its band where it
     has one), `prediction.stl` (the same where it goes), `face.vtp` and `face.stl` (likewise the
-    whole skin in full detail),
-    `prediction.vtu` (tissue with `displacement`, `force`, muscle `fraction` and `fibre`),
-    `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments before the operation,
-    with their `displacement`) and `muscles.vtp`, each vertex with the number of its `part` (the
-    summary lists their names), `timings.json`, and `prediction.json` (counts, parameters, findings,
-    versions, hashes). All take their places together, or none does. Predictions, a comparison and a
-    report in the folder that belong to another plan are removed.
+    whole skin in full detail), `prediction.vtu` (tissue with `displacement`, `force`, muscle
+    `fraction` and `fibre`), `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments
+    before the operation, with their `displacement`) and `muscles.vtp`, each vertex with the number
+    of its `part` (the summary lists their names), `timings.json`, and `prediction.json` (counts,
+    parameters, findings, versions, hashes). All files are moved into place together, or none is.
+    Predictions, a comparison and a report in the folder that belong to another plan are removed.
 
     Parameters
     ----------
@@ -214,7 +213,7 @@ def write_prediction(
     Raises
     ------
     OSError
-        The folder cannot be made or written to.
+        The folder cannot be created or written to.
 
     Examples
     --------

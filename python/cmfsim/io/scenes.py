@@ -62,7 +62,7 @@ TISSUE_TEXTS = ("kind", "law", "preset", "mixing")
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
-    """The scene in a file: one `.npz`, or a `.toml` beside its mesh and surfaces.
+    """The scene in a file: one `.npz`, or a `.toml` next to its mesh and surfaces.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
         One table per segment under `plan`: `translation`, `angle` (degrees), `axis`, `centre`; or
         `matrix` (4 × 4); or `moved_surface` with `surface` (files beside this one).
     scene : Scene
-        Its segments are those that the plan may name; those that it leaves out are an error.
+        The plan must name all of its segments and no others.
 
     Returns
     -------
@@ -162,7 +162,8 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
         for name in scene.segments:
             if name not in table:
                 raise CaseInputError(
-                    f"[plan] lacks segment {name!r}: give it translation = [0, 0, 0] if it stays"
+                    f"[plan] lacks segment {name!r}: give it translation = [0, 0, 0] if it does "
+                    "not move"
                 )
         return {name: _motion(name, table, path.parent) for name in scene.segments}
 
@@ -198,7 +199,7 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
     }
     for member in members:
         if member not in known:
-            raise CaseInputError(f"has the array {member!r}, which is none of this scene's")
+            raise CaseInputError(f"has the array {member!r}, which does not belong to this scene")
     return Scene(
         nodes=member_of(members, "nodes"),
         tets=member_of(members, "tets"),

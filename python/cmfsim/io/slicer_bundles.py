@@ -111,7 +111,9 @@ def _check_names(members: Sequence[zipfile.ZipInfo]) -> None:
         leads_out = place.is_absolute() or ".." in place.parts or DRIVE.match(name)
         too_long = len(name) > MAX_PATH or any(len(p.encode()) > MAX_NAME for p in place.parts)
         if leads_out or not place.parts or too_long or any(c in name for c in "\\\0"):
-            raise CaseInputError(f"names the file {shown!r}, which would be outside: not unpacked")
+            raise CaseInputError(
+                f"names the file {shown!r}, which would be outside the folder: nothing is unpacked"
+            )
         if stat.S_ISLNK(member.external_attr >> 16):
             raise CaseInputError(f"holds the link {shown!r}: links are not unpacked")
         if member.flag_bits & ENCRYPTED:

@@ -107,7 +107,7 @@ class SlicerScene:
             above = self.nodes.get(parent)
             if above is None or above.kind != "transform":
                 raise CaseInputError(
-                    f"{self.file.name}: {node.name!r} lies under the transform {parent[:60]!r}, "
+                    f"{self.file.name}: {node.name!r} is under the transform {parent[:60]!r}, "
                     "which is not in the scene: save the scene again"
                 )
             if above in found:
@@ -154,7 +154,9 @@ class SlicerScene:
             # Slicer's files hold the map from the parent; it is inverted here.
             return read_transform_file(node.file, direction="from-parent").matrix
         if node.matrix is None:
-            raise CaseInputError("the scene has neither a file nor a matrix for it: is it linear?")
+            raise CaseInputError(
+                "the scene has neither a file nor a matrix for it: check that it is linear"
+            )
         try:
             numbers = np.array([float(word) for word in node.matrix.split()])
         except ValueError as error:
@@ -231,12 +233,12 @@ def _file(name: str, folder: Path) -> tuple[Path | None, str]:
     decoded = unquote(name).replace("\\", "/")
     shown = decoded[:MAX_NAME]
     if "\0" in decoded:
-        return folder / "?", f"{shown!r}: no file has that name"
+        return folder / "?", f"{shown!r}: this is not a valid file name"
     path = folder / decoded
     if not is_below(path, folder):
         return path, (
-            f"{shown}: lies outside the folder of the scene, and is not opened: save the scene as "
-            "an .mrb, or copy the file to the scene's folder and save the scene there"
+            f"{shown}: is outside the folder of the scene, so it is not opened: save the scene "
+            "as an .mrb, or copy the file to the scene's folder and save the scene there"
         )
     try:
         is_file = is_there(path) and path.is_file()

@@ -40,19 +40,19 @@ def read_surface(
     units: str = "mm",
     frame: str | None = None,
 ) -> SurfaceData:
-    """The triangles of a file, in LPS mm, with vertices in the same place made one.
+    """The triangles of a file, in LPS mm, with coincident vertices merged.
 
     Parameters
     ----------
     path : path
         STL, PLY, OBJ, VTP, VTU, legacy VTK, Gmsh, or another file of triangles that meshio reads.
-        Polygons become triangles where a fan of these fills them.
+        Polygons are split into triangles if a fan fills them.
     crease_angle : float, degrees
     units : str
         Of the numbers in the file: "mm", "cm", "m", "um", "inch".
     frame : str, optional
-        Of the numbers in the file: "LPS" or "RAS". If left out, what the file's header states, as
-        3D Slicer writes it (`SPACE=RAS`); LPS where it states none.
+        Of the numbers in the file: "LPS" or "RAS". Default: the frame in the file's header, as 3D
+        Slicer writes it (`SPACE=RAS`); LPS if it states none.
 
     Returns
     -------

@@ -256,11 +256,11 @@ class Table:
         """A path to read, against a folder unless it is absolute; `~` is the home folder."""
         name = self.text(key)
         if "\0" in name:
-            self.fail(key, "holds a zero character: no file has that name")
+            self.fail(key, "contains a zero character, which no file name can have")
         try:
             path = folder / Path(name).expanduser()
         except RuntimeError:
-            self.fail(key, f"is {name!r}: no home folder has this name; write the path")
+            self.fail(key, f"is {name!r}: no user has this name; write the full path")
         try:
             is_there(path)
         except CaseInputError as error:

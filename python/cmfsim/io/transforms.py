@@ -42,9 +42,9 @@ DEFAULT_DIRECTION, DEFAULT_FRAME = "to-parent", "LPS"
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 # The choice of directions, as part of an error message.
 DIRECTION_CHOICE = (
-    'direction = "from-parent" if the file takes the moved bone back to its old place, as 3D '
-    "Slicer saves a transform that was applied to the bone; "
-    'direction = "to-parent" if it takes the bone to its new place, as when ITK registers the bone '
+    'direction = "from-parent" if the transform maps the moved bone back to its old position, '
+    "as in a file that 3D Slicer saved for a transform applied to the bone; direction = "
+    '"to-parent" if it maps the bone to its new position, as when ITK registers the bone '
     "after (moving image) to the bone before (fixed image)"
 )
 ITK_IS_LPS = "is an ITK transform, which is always LPS: remove frame"
@@ -249,7 +249,7 @@ def write_transform(
             raise CaseInputError(f"{path.name}: {ITK_IS_LPS}")
         if direction is None:
             raise CaseInputError(
-                f'{path.name}: state direction = "from-parent" for 3D Slicer, which shows the '
+                f'{path.name}: give direction = "from-parent" for 3D Slicer, which shows the '
                 'inverse of the file as the motion, or "to-parent" to write the motion itself'
             )
         text = transform_text(m, direction=direction)
@@ -328,7 +328,7 @@ def _itk(text: str) -> Floats:
         elif name not in {"Parameters", "FixedParameters"}:
             raise CaseInputError(f"line {number}: unknown entry {name[:60]!r}")
         elif not blocks:
-            raise CaseInputError(f"line {number}: {name} stands before 'Transform: ...'")
+            raise CaseInputError(f"line {number}: {name} comes before 'Transform: ...'")
         elif name in blocks[-1]:
             raise CaseInputError(f"line {number}: {name} again")
         else:

@@ -30,7 +30,7 @@ def signed_level(surface: SurfaceData, grid: ImageData) -> ImageData:
     Parameters
     ----------
     surface : SurfaceData
-        Closed; inside is where its winding number exceeds one half, so that overlapping parts and
+        Closed; points whose winding number exceeds one half are inside, so overlapping parts and
         small holes do no harm.
     grid : ImageData
         Its values are not used.
@@ -77,7 +77,7 @@ def anatomy_from_surfaces(
     bones : mapping of str to SurfaceData
         Closed, outward; they may overlap one another and the skin.
     spacing : float, mm
-        Of the grid; about a third of the edge length of the mesh to come.
+        Of the grid; about a third of the edge length of the later mesh.
 
     Returns
     -------
@@ -97,15 +97,15 @@ def anatomy_from_surfaces(
     """
     as_positive("spacing", spacing)
     if not bones:
-        raise MeshInputError("no bone is given: the tissue would not be attached to anything")
+        raise MeshInputError("no bone is given, so the tissue would not be attached to anything")
     vertices = skin.vertices
     lowest = vertices.min(axis=0) - MARGIN * spacing
     shape = np.ceil((vertices.max(axis=0) - lowest) / spacing) + 1 + MARGIN
     if shape.prod() > MAX_VOXELS:
         size = " × ".join(f"{extent:.0f}" for extent in np.ptp(vertices, axis=0))
         raise MeshInputError(
-            f"skin measures {size} mm: at voxels of {spacing:g} mm that is more than "
-            f"{MAX_VOXELS:.0e}; are the surfaces in mm?"
+            f"skin measures {size} mm: at voxels of {spacing:g} mm, that is more than "
+            f"{MAX_VOXELS:.0e}; check that the surfaces are in mm"
         )
     nx, ny, nz = (int(n) for n in shape)
     # A grid without memory: only its shape is asked for.
@@ -116,12 +116,13 @@ def anatomy_from_surfaces(
         if not (level.values > 0.0).any():
             raise MeshInputError(
                 f"bone {name!r} encloses no voxel of {spacing:g} mm inside the box of the skin: "
-                "is it closed, outward, and in the frame and unit of the skin?"
+                "check that it is closed, that its normals point outwards, and that it has the "
+                "frame and unit of the skin"
             )
     skin_level = signed_level(skin, grid)
     if not (skin_level.values > 0.0).any():
         raise MeshInputError(
-            "skin encloses nothing: it is not closed, or its triangles face inwards"
+            "the skin encloses no volume: it is not closed, or its triangles face inwards"
         )
     findings = [_outside(name, level, skin_level) for name, level in levels.items()]
     return Anatomy(
@@ -144,7 +145,7 @@ def _outside(name: str, bone: ImageData, skin: ImageData) -> Finding | None:
         "bone-outside-skin",
         f"{volume:.0f} mm³ of bone {name!r} lie outside the skin",
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        why="there is no tissue over it, so the face cannot be predicted there",
-        fix="check that skin and bone belong to one patient, in one frame; if the spine protrudes, "
-        "cut the neck lower",
+        why="no tissue covers it, so the face cannot be predicted there",
+        fix="check that skin and bone are from one patient and in one frame; if the spine "
+        "protrudes, cut the neck lower",
     )

@@ -1,4 +1,4 @@
-"""What a mesh is worth: shapes, volume and boundary, in figures that a report can print."""
+"""The quality of a mesh: shapes, volume and boundary, in figures that a report can print."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -41,10 +41,11 @@ class MeshReport:
     worst : tuple of mapping
         The ten tets of smallest dihedral angle: `tet`, `min_dihedral` (degrees), `centroid` (mm).
     dropped_parts : int
-        Bodies too small to keep, and `dropped_volume` (mm³) their volume.
+        Bodies that were removed because they were too small; `dropped_volume` (mm³) is their
+        volume.
     dropped_volume : float, mm³
     dropped_tets : int
-        Poor tets at the surface that were left out.
+        Poor tets at the surface that were removed.
     """
 
     n_nodes: int
@@ -96,19 +97,19 @@ class MeshReport:
             )
         if self.dropped_parts:
             lines.append(
-                f"left out      {self.dropped_parts} parts of {self.dropped_volume:.1f} mm³ in all"
+                f"removed       {self.dropped_parts} parts of {self.dropped_volume:.1f} mm³ in all"
             )
         return "\n".join(lines)
 
 
 def mesh_report(mesh: TetMesh, making: Mapping[str, Any] | None = None) -> MeshReport:
-    """The quality of a mesh, with what its making said where it is known.
+    """The quality of a mesh, with the figures of its creation if they are known.
 
     Parameters
     ----------
     mesh : TetMesh
     making : mapping, optional
-        What `_core.stuff_image` returns beside the mesh.
+        The values that `_core.stuff_image` returns together with the mesh.
 
     Returns
     -------
@@ -172,7 +173,7 @@ def report_of_part(part: TetMesh, whole: MeshReport) -> MeshReport:
 
 
 def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
-    """What a person should know of a mesh: poor tets, and specks that were left out."""
+    """Findings on a mesh: poor tets, and specks that were removed."""
     findings = []
     if report.min_dihedral < LEAST_DIHEDRAL:
         worst = report.worst[0]
@@ -182,8 +183,8 @@ def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
                 "mesh-poor-tet",
                 f"tet {worst['tet']} has a dihedral angle of {report.min_dihedral:.1f}°",
                 where=f"mesh, at ({x:.1f}, {y:.1f}, {z:.1f}) mm",
-                why="its deformation is inaccurate, and the system is less well conditioned",
-                fix="change edge_length a little, or set refinements = 0",
+                why="its deformation is inaccurate, and it worsens the conditioning of the system",
+                fix="change edge_length slightly, or set refinements = 0",
             )
         )
     if report.dropped_parts:
@@ -194,7 +195,7 @@ def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
                 "all were removed",
                 where="mesh",
                 why="they are not attached to anything",
-                fix="none is needed; check the thresholds if a part of the face is missing",
+                fix="nothing to do; check the thresholds if a part of the face is missing",
             )
         )
     return tuple(findings)

@@ -39,7 +39,7 @@ def separated_mesh(mesh: TetMesh, surface: SurfaceData) -> SeparatedMesh:
 
 
 def part_mesh(mesh: TetMesh, surface: SurfaceData) -> TetMesh:
-    """The mesh separated along an open surface, as lips that an image shows as one.
+    """The mesh separated along an open surface, such as lips that an image shows as one piece.
 
     Nodes close to the surface move onto it, and edges that still cross it are cut, so that both
     sides of the crack are as smooth as the surface.

@@ -20,7 +20,7 @@ MAX_REFINEMENTS = 3
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How tissue is filled with tets.
+    """Options of filling tissue with tets.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class MeshOptions:
     refinements : int
         How often the edge may be halved where tissue, or a gap in it, is thinner than an edge.
     least_body : float, mm³
-        Bodies apart from the largest below this volume are specks and left out.
+        Bodies below this volume, except the largest, are specks and are removed.
 
     Examples
     --------
@@ -55,7 +55,7 @@ class MeshOptions:
 
 @dataclass(frozen=True, eq=False)
 class TissueMesh:
-    """A mesh, the report of its quality, and what should be known of it.
+    """A mesh, the report of its quality, and findings.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ def mesh_from_labels(
     *,
     refinements: int = 1,
 ) -> TetMesh:
-    """The tets of what a label image marks, with dihedral angles of at least 10°.
+    """The tets of the tissue marked in a label image, with dihedral angles of at least 10°.
 
     Parameters
     ----------
@@ -94,8 +94,8 @@ def mesh_from_labels(
     Returns
     -------
     TetMesh
-        Bodies that do not hang together are all there; nodes lie on the boundary between labels,
-        with the steps between voxels rounded. The same bits for any number of threads.
+        Disconnected bodies are all kept; nodes lie on the boundary between labels, with the steps
+        between voxels rounded. The same bits for any number of threads.
 
     Raises
     ------
@@ -142,11 +142,10 @@ def mesh_from_level(
         Positive in the tissue, zero on its surface.
     options : MeshOptions, optional
     allowed : (nx, ny, nz) array of whole numbers, optional
-        How often the edge may be halved for what is thin at each voxel; as often as the options
-        say if left out.
+        How often the edge may be halved for thin tissue at each voxel; default: as in the options.
     needed : (nx, ny, nz) array of whole numbers, optional
-        How often it is halved at least, thin or not, in the cube that holds each voxel's centre:
-        no more often than the options say.
+        How often it is at least halved, thin or not, in the cube that contains each voxel's centre:
+        no more often than in the options.
 
     Returns
     -------

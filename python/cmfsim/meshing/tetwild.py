@@ -54,7 +54,10 @@ def mesh_with_tetwild(surface: SurfaceData, edge_length: float = 3.0) -> TetMesh
             edge_length_abs=edge_length,
         )[:2]
     if not len(tets):
-        raise MeshInputError("fTetWild found no tets: is the surface closed and outward?")
+        raise MeshInputError(
+            "fTetWild found no tets: check that the surface is closed and that "
+            "its normals point outwards"
+        )
     corners = nodes[tets]
     edges = corners[:, 1:] - corners[:, :1]
     inverted = np.linalg.det(edges) < 0.0

@@ -1,4 +1,4 @@
-"""Which part of a head is soft tissue to be meshed: outside the bones, in front of a plane."""
+"""The part of a head that is meshed as soft tissue: outside the bones, in front of a plane."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class TissueRegion:
     lower, upper : float or None, mm
         Heights (S axis) that bound the region.
     foramen_radius : float, mm
-        Hollows behind openings up to this radius are no tissue.
+        Hollows behind openings up to this radius are not tissue.
 
     Examples
     --------
@@ -79,7 +79,7 @@ class TissueRegion:
 
 
 def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tuple[Finding, ...]]:
-    """The level image of the soft tissue in front of the posterior plane, and what was left out.
+    """The level image of the soft tissue in front of the posterior plane, and findings.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
     Raises
     ------
     MeshError
-        (also `ValueError`) Nothing of the head lies in the region.
+        (also `ValueError`) No part of the head is in the region.
 
     Examples
     --------
@@ -116,7 +116,7 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
     if not (level > 0.0).any():
         raise MeshInputError(
             "no soft tissue lies in front of the posterior plane: check its point and normal, "
-            "and that skin and bones are of one patient"
+            "and that skin and bones are from one patient"
         )
     findings = tuple(_without_hollows(level, bone, grid, region))
     return grid.with_values(level), findings
@@ -190,5 +190,5 @@ def _without_hollows(
         f"{volume / 1000.0:.1f} cm³ behind bone were removed from the tissue",
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
         why="the cranial cavity and closed sinuses do not deform with the face",
-        fix="none is needed; lower foramen_radius if tissue of the face is missing",
+        fix="nothing to do; lower foramen_radius if tissue of the face is missing",
     )

@@ -28,7 +28,7 @@ from cmfsim.values.tissue_data import MIXINGS, TissueData
 __all__ = ["INSIDE_TESTS", "Mixture", "MuscleVolume", "equivalent_material"]
 
 INSIDE_TESTS = ("winding", "normal")
-# Part of a closed muscle that may lie outside the mesh before a finding says so.
+# Fraction of a closed muscle that may be outside the mesh before a finding reports it.
 LOST_PART = 0.02
 
 _log = logging.getLogger(__name__)
@@ -51,12 +51,13 @@ class MuscleVolume:
     inside : float, mm³
         Inside the muscle and the mesh.
     shared : float, mm³
-        The same where k muscles overlap counted 1/k: these sum to the muscle in the mesh.
+        The same, but where k muscles overlap each counts 1/k, so that the sum is the muscle in the
+        mesh.
     error : float, mm³
         Standard error of `inside`, from those of the tets' fractions.
     enclosed : float or None, mm³
-        What the surface encloses, in the mesh or not, what overlaps itself twice; None where it is
-        not closed.
+        Volume enclosed by the surface, in the mesh or not; parts that overlap count twice. None if
+        it is not closed.
     """
 
     inside: float
@@ -67,7 +68,7 @@ class MuscleVolume:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """What muscles make of the tets of a mesh.
+    """The effect of muscles on the tets of a mesh.
 
     Attributes
     ----------
@@ -76,8 +77,8 @@ class Mixture:
     fibre : (m, 3) float64
         Unit vectors, zero where there is no muscle; the component of largest size is positive.
     coherence : (m,) float64
-        How far one direction leads in the tet: 1 parallel fibres, 0 none (then the fibre is that of
-        the first of the muscles, in an order that their shapes give).
+        How dominant one direction is in the tet: 1 for parallel fibres, 0 for none (then the fibre
+        is that of the first of the muscles, in an order that depends on their shapes).
     error : (m,) float64
         Standard error of `fraction`, 0.7 q^(1/3) samples^(−2/3) with q = min(p, 1−p), where the
         surface is smooth over the tet; that of as many random points, √(p(1−p)/samples), at most.
@@ -86,7 +87,7 @@ class Mixture:
     volumes : mapping of str to MuscleVolume
         By the muscle's name, in the order given.
     samples : int
-        Points whose side of a muscle was asked for.
+        Points that were tested against a muscle.
     findings : tuple of Finding
         Muscles that are inside out, open, outside the mesh, sheets.
     summary : mapping
@@ -154,20 +155,20 @@ def equivalent_material(
 ) -> Mixture:
     """The tissue of every tet, fat and muscle mixed by volume.
 
-    A tet that no muscle's surface crosses is decided by one evaluation, many at once where they lie
-    together, and none where no muscle is near. A crossed tet takes `samples` points of a
-    low-discrepancy sequence, uniform in volume, shifted anew for each tet. A point inside several
-    muscles counts once in the fraction; each of k muscles gets 1/k of it. The fibre of a tet is the
-    principal eigenvector of Σ w a aᵀ over the directions a at its points in muscle, the first 16 in
-    each, with these weights w. The result does not depend on the number of threads nor on the order
-    of the muscles.
+    A tet that no muscle's surface crosses is decided by one evaluation, many neighbouring tets at
+    once, and without evaluation if no muscle is near. A crossed tet takes `samples` points of a
+    low-discrepancy sequence, uniform in volume, with a different shift for each tet. A point inside
+    several muscles counts once in the fraction; each of k muscles gets 1/k of it. The fibre of a
+    tet is the principal eigenvector of Σ w a aᵀ over the directions a at its points in muscle, the
+    first 16 in each, with these weights w. The result does not depend on the number of threads nor
+    on the order of the muscles.
 
     Parameters
     ----------
     mesh : TetMesh
     muscles : Musculature, morphed template, or sequence of MuscleSurface, SurfaceData or Surface
-        Without a name they are called "muscle_0", "muscle_1", ... None at all: homogeneous fat,
-        which a finding says.
+        Without a name they are called "muscle_0", "muscle_1", ... Without any muscle, the tissue is
+        homogeneous fat, with a finding.
     preset : str
         One of `PRESETS`: constants of fat and muscle (Table 1).
     samples : int
@@ -178,9 +179,9 @@ def equivalent_material(
         "moduli": Young's moduli and Poisson's ratio mix with the fraction (the paper); "stiffness":
         C = Σ p_i C(a_i) + (1 − Σ p_i) C_fat with the share p_i and fibre a_i of each muscle.
     inside : str
-        "winding": the generalised winding number exceeds ½, right also for surfaces that overlap or
-        have small holes or a few flipped triangles; "normal": the closest normal points away (the
-        paper), right for closed surfaces that do not overlap themselves.
+        "winding": the generalised winding number exceeds ½, which is also correct for surfaces that
+        overlap or have small holes or a few flipped triangles; "normal": the closest normal points
+        away (the paper), which is correct for closed surfaces that do not overlap themselves.
     moduli : TissueModuli, optional
         Moduli (MPa) of fat, of all muscles or of single ones instead of the preset's.
 
@@ -351,7 +352,7 @@ def _findings(
     if not volumes:
         yield Finding.warning(
             "muscles-none",
-            "no muscle was given: every tet is fat",
+            "no muscle was given, so every tet is fat",
             why="The tissue is homogeneous and isotropic.",
         )
     for (name, volume), was_turned, (surface, fibres) in zip(
@@ -368,15 +369,16 @@ def _findings(
                 "muscle-open",
                 f"the surface of {name} is not closed: {surface.n_border_edges} border edges",
                 where=name,
-                why="Inside is where the winding number exceeds one half, which bridges holes.",
+                why="Points with a winding number above one half count as inside, which bridges "
+                "holes.",
             )
         if volume.inside == 0.0:
             yield Finding.warning(
                 "muscle-missed",
-                f"{name} holds no sample of any tet",
+                f"{name} contains no sample of any tet",
                 where=name,
                 why="It does not affect the tissue: it lies outside the mesh, or encloses nothing.",
-                fix="Check its frame and that its surface is closed; or take more samples.",
+                fix="Check its frame and that its surface is closed, or use more samples.",
             )
         elif volume.enclosed is not None:
             lost = 1.0 - volume.inside / volume.enclosed
@@ -391,6 +393,6 @@ def _findings(
                 "muscle-sheet",
                 f"{name} is a sheet: second extent {fibres.sheet_ratio:.2f} of the first",
                 where=name,
-                why="Its outline hardly shows the direction of its fibres.",
-                fix="Give the course of its fibres.",
+                why="The direction of its fibres can hardly be determined from its outline.",
+                fix="Add fibre lines (course) for this muscle.",
             )

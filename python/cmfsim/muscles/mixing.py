@@ -127,7 +127,8 @@ def moduli_findings(moduli: TissueModuli, preset: str, where: str = "") -> Itera
         "muscle-moduli",
         f"moduli differ from those of {preset}, MPa: {'; '.join(stated)}",
         where=where,
-        why="Displacements depend on their ratios; accuracy was measured with the preset's.",
+        why="Displacements depend on the ratios of moduli; the accuracy was measured with those "
+        "of the preset.",
     )
     low, high = USUAL_YOUNG
     unusual = [
@@ -141,6 +142,6 @@ def moduli_findings(moduli: TissueModuli, preset: str, where: str = "") -> Itera
             "muscle-moduli-unusual",
             f"Young's moduli of muscle beyond {low:g} to {high:g} MPa: {', '.join(unusual)}",
             where=where,
-            why="No published muscle is so soft or so stiff.",
+            why="No published value for muscle is that low or that high.",
             fix="Moduli are in MPa: 10 kPa is 0.01.",
         )

@@ -31,12 +31,12 @@ HALF_MOLAR = 5.0
 
 @dataclass(frozen=True)
 class DentalArches:
-    """The dental arches of a head, and the segments that bear them.
+    """The dental arches of a head, and the segments that carry them.
 
     Attributes
     ----------
     by_jaw : mapping of str to DentalArch
-        "upper" and "lower"; empty where neither landmarks nor teeth tell.
+        "upper" and "lower"; empty if neither landmarks nor teeth locate them.
     bearers : mapping of str to frozenset of int
         Of each jaw, the numbers of the segments that tissue slides on.
     findings : tuple of Finding
@@ -68,7 +68,7 @@ def dental_arches(
     Raises
     ------
     CaseError
-        (also `ValueError`) Landmarks that span no arch.
+        (also `ValueError`) Landmarks that do not span an arch.
 
     Examples
     --------
@@ -107,8 +107,8 @@ def _nothing_slides(missing: Sequence[str]) -> Finding:
         f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing, and the "
         "image does not show teeth apart from bone",
         where="landmarks",
-        why="lips and cheeks would stick to the teeth",
-        fix="place them, give regions, or set sliding = false",
+        why="lips and cheeks would be attached to the teeth",
+        fix="place them, define regions, or set sliding = false",
     )
 
 
@@ -118,8 +118,8 @@ def _from_teeth(missing: Sequence[str]) -> Finding:
         f"landmarks {', '.join(missing)} are missing: the sliding regions were placed from the "
         "teeth that the image shows",
         where="landmarks",
-        why="the depth of the vestibule is then accurate to about 3 mm",
-        fix="place the landmarks if lips or cheeks matter",
+        why="the depth of the vestibule is accurate only to about 3 mm",
+        fix="place the landmarks if lips or cheeks are important",
     )
 
 

@@ -1,4 +1,4 @@
-"""Which node of a mesh is fixed, joined, sliding or free.
+"""Classification of the nodes of a mesh: fixed, joined, sliding or free.
 
 A node lies on a bone if it is near the bone's surface *and* its part of the boundary faces that
 surface: where skin is thinner than a tet is long, nearness alone would take skin for interface.
@@ -33,7 +33,7 @@ HOLDING_NODES = 3
 
 @dataclass(frozen=True, eq=False)
 class ClassifiedNodes:
-    """The kinds of all nodes, with counts and what was noticed.
+    """The kinds of all nodes, with counts and findings.
 
     Attributes
     ----------
@@ -66,11 +66,12 @@ def classify_nodes(  # noqa: PLR0913 (options by name)
     arches: DentalArches | None = None,
     contacts: Mapping[str, SurfaceData] | None = None,
 ) -> ClassifiedNodes:
-    """The kind of every node of a tissue mesh, and the segment of those that a bone holds.
+    """The kind of every node of a tissue mesh, and the segment of the nodes attached to bone.
 
-    A node on a plane that fixes is fixed. Of the others, those on a bone (the nearest one counts)
-    slide where they lie in its sliding region, else are joined if the bone moves and fixed if not.
-    All others are free. Nodes also slide on bones that stay: their contact surface does not move.
+    A node on a fixing plane is fixed. Of the others, those on a bone (the nearest one counts) slide
+    if they are in its sliding region; otherwise they are joined if the bone moves, and fixed if it
+    does not. All others are free. Nodes also slide on bones that do not move; the contact surface
+    of these bones does not move either.
 
     Parameters
     ----------
@@ -79,18 +80,18 @@ def classify_nodes(  # noqa: PLR0913 (options by name)
     boundary_triangles : (t, 3) uint32
         Boundary of the mesh, outward.
     anatomy : Anatomy
-        Its teeth, where known, bound the sliding region; its grid has the borders.
+        Its teeth, if known, bound the sliding region; its grid defines the borders.
     segments : sequence of BoneSegment
     moved : collection of str
         Names of the segments that the plan moves.
     landmarks : mapping of str to (3,) float64, mm, optional
-        Skull landmarks, LPS; `supradentale`, `infradentale`, `supra_m2_L/R` and `sub_m2_L/R`
-        place the sliding regions; without them the teeth that the anatomy shows do.
+        Skull landmarks, LPS; `supradentale`, `infradentale`, `supra_m2_L/R` and `sub_m2_L/R` place
+        the sliding regions; without them, the teeth in the anatomy do.
     fixed_planes : mapping of str to (point, normal), optional
         Planes that cut the tissue (posterior, neck), by name: each a point (3,) mm and a normal.
     options : KindOptions, optional
     arches : DentalArches, optional
-        What `dental_arches` gives, where it is known already.
+        The result of `dental_arches`, if it is already known.
     contacts : mapping of str to SurfaceData, optional
         Contact sheets (`contact_sheet`) by segment: at the arches, only nodes on them slide. Those
         deeper behind them, on the palate or where teeth bite, are joined or fixed as other nodes
@@ -201,7 +202,7 @@ def segment_data(
     ----------
     kinds : NodeKinds
     segments : sequence of BoneSegment
-        Those that the kinds were found with.
+        The segments with which the kinds were determined.
     contacts : mapping of str to SurfaceData, optional
         Contact surfaces in place of the segments' own, by segment (see `contact_surface`).
     gap : float, mm, or "rest"
@@ -210,8 +211,8 @@ def segment_data(
     Returns
     -------
     dict of str to SegmentData
-        Without the segments that no node is joined to or slides on: the plan of a scene names
-        these and no others.
+        Only segments to which a node is joined or on which one slides; the plan of a scene names
+        exactly these.
 
     Raises
     ------
@@ -276,7 +277,7 @@ def _checked_names(
 ) -> tuple[str, ...]:
     if not segments:
         raise CaseInputError(
-            "there is no bone segment: the tissue would not be attached to anything"
+            "there is no bone segment, so the tissue would not be attached to anything"
         )
     for segment in segments:
         check_instance("segment", segment, BoneSegment)
@@ -361,7 +362,7 @@ def _noticed(
             f"({counts[f'sliding on {name}']} slide on it)",
             where=name,
             why="its motion does not reach the tissue",
-            fix="look at the picture; raise bone_distance, or leave it out of the plan",
+            fix="check the picture; increase bone_distance, or remove the segment from the plan",
         )
         for name in kinds.segments
         if name in moved and not counts[f"joined on {name}"]
@@ -376,7 +377,7 @@ def _noticed(
                 "are needed",
                 where="node kinds",
                 why="the tissue could drift as a whole, so there is no unique solution",
-                fix="give fixed_planes (posterior), or raise bone_distance",
+                fix="give fixed_planes (posterior), or increase bone_distance",
             )
         )
     return findings

@@ -1,4 +1,4 @@
-"""Which fixed nodes lie where a surgeon lifts the periosteum above a Le Fort I cut."""
+"""Fixed nodes where a surgeon lifts the periosteum above a Le Fort I cut."""
 
 from collections.abc import Collection, Sequence
 
@@ -35,12 +35,12 @@ def lifted_tissue(
     moved : collection of str
         Names of the segments that are cut or moved.
     options : KindOptions, optional
-        `lifted` says how far from the maxilla.
+        `lifted` is the distance from the maxilla.
 
     Returns
     -------
     LiftedTissue or None
-        None where no maxilla was separated from the cranium.
+        None if no maxilla was separated from the cranium.
 
     Notes
     -----

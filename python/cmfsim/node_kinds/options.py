@@ -87,17 +87,17 @@ class KindOptions:
     Attributes
     ----------
     bone_distance : float
-        How far from a bone's surface a node still lies on it, as a part of the mean length of the
-        boundary edges at the node.
+        Largest distance at which a node counts as on the bone's surface, as a fraction of the mean
+        length of the boundary edges at the node.
     facing : float
-        Least part of a node's boundary area that faces the bone, from 0 to 1.
+        Least fraction of a node's boundary area that faces the bone, from 0 to 1.
     plane_distance : float
-        As `bone_distance`, from a plane that fixes.
+        As `bone_distance`, for the distance from a fixing plane.
     fixed_borders : tuple of str
         Borders of the image on which nodes are fixed: "left", "right", "anterior", "posterior",
         "inferior", "superior"; the neck of most CTs ends on "inferior".
     sliding : bool
-        False: what would slide is joined or fixed with its bone.
+        False: nodes that would slide are joined or fixed with their bone.
     upper_front, upper_molars : float, mm
         How far above supradentale, and above supra-M2, tissue slides on the upper jaw: the depth
         of the vestibule. Above, muscles arise and tissue is attached: nodes are joined.
@@ -108,21 +108,22 @@ class KindOptions:
         How far behind the second molars' landmarks: over the tuberosity of the upper jaw, and to
         the front edge of the ramus of the lower, where masseter and temporalis begin.
     beside : float, mm
-        How far beside them.
+        How far lateral to them.
     teeth_distance : float, mm
-        Largest distance from the teeth, where these are known apart from bone.
+        Largest distance from the teeth, if these are known separately from bone.
     lifted : float, mm
         How far above the cut of a Le Fort I osteotomy tissue is lifted off the cranium, as the
         surgeon lifts the periosteum between the piriform aperture and the infraorbital foramen:
-        within this distance of the maxilla, what a plan does not press against the bone is free
-        of it. 0: none.
+        within this distance of the maxilla, nodes that a plan does not press against the bone are
+        free. 0: none.
     contact_surface : str
-        What they slide on at the arches: "sheet", the labial and buccal face of gums and crowns,
-        bridged between teeth and continued past their edges (`contact_sheet`), or "bone", the
-        blurred bone (`contact_surface`), on which nodes also lie on palate and biting faces.
+        The surface on which nodes slide at the arches: "sheet", the labial and buccal face of gums
+        and crowns, bridged between teeth and continued past their edges (`contact_sheet`), or
+        "bone", the blurred bone (`contact_surface`), on which nodes also lie on palate and biting
+        faces.
     regions : tuple of SlidingBox or SlidingSphere
-        Where nodes slide on the segments that they name, instead of the above, and on the blurred
-        bone.
+        Regions in which nodes slide on the named segments, instead of the above; there they slide
+        on the blurred bone.
     """
 
     bone_distance: float = 0.5
@@ -150,8 +151,8 @@ class KindOptions:
             as_number(name, getattr(self, name))
         if not 0.0 <= as_number("lifted", self.lifted) <= MOST_LIFTED:
             raise CaseInputError(
-                f"lifted is {self.lifted:g} mm: 0 (none) to {MOST_LIFTED:g} is allowed, since the "
-                "orbits lie above"
+                f"lifted is {self.lifted:g} mm: 0 (none) to {MOST_LIFTED:g} is allowed, because "
+                "the orbits are above"
             )
         if not 0.0 <= as_number("facing", self.facing) <= 1.0:
             raise CaseInputError(f"facing is {self.facing:g}: 0 to 1 is allowed")

@@ -1,4 +1,4 @@
-"""Where tissue slides: on teeth and mucosa of the two dental arches, or in given regions."""
+"""The sliding regions: on teeth and mucosa of the two dental arches, or as given."""
 
 from collections.abc import Mapping, Sequence
 
@@ -18,7 +18,7 @@ from cmfsim.values.surface_data import SurfaceData
 __all__ = ["sliding_nodes"]
 
 # Share of the nodes at an arch that lie on its sheet at least: half or more on three heads, and the
-# others on lingual faces and the palate. Fewer nodes than so many on a segment tell nothing.
+# others on lingual faces and the palate. Fewer nodes than this on a segment are not conclusive.
 LEAST_SHARE, MANY = 0.25, 50
 # How far past half-way to the other arch tissue slides behind the teeth, mm: on the ramus above it
 # temporalis ends.
@@ -71,9 +71,9 @@ def _far_sheet(name: str, on_sheet: int, within: int) -> Finding:
         f"of {within} nodes on {name!r} at the arch only {on_sheet} lie within {SHEET_DEPTH:g} mm "
         "of its contact sheet; the others are joined",
         where=f"segment {name}",
-        why="lips and cheeks would stick to the teeth there",
-        fix="check the arch's landmarks and the bone in anatomy.png, or set contact_surface = "
-        '"bone" in [node_kinds]',
+        why="lips and cheeks would be attached to the teeth there",
+        fix="check the landmarks of the arch and the bone in anatomy.png, or set "
+        'contact_surface = "bone" in [node_kinds]',
     )
 
 

@@ -50,7 +50,7 @@ def write_phantom_case(
     Parameters
     ----------
     folder : path
-        Made if it is not there.
+        Created if it does not exist.
     head : PhantomHead
     spacing : float, mm
         Of the CT.
@@ -64,7 +64,7 @@ def write_phantom_case(
     Raises
     ------
     OSError
-        The folder cannot be made or written to.
+        The folder cannot be created or written to.
 
     Examples
     --------

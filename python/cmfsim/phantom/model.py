@@ -72,7 +72,7 @@ LEAST_VAULT = 2.5
 
 @dataclass(frozen=True, eq=False)
 class PhantomHead:
-    """A head made by code, known exactly: skin, skull, mandible, teeth, airway and muscles.
+    """A synthetic head, known exactly: skin, skull, mandible, teeth, airway and muscles.
 
     Coordinates are LPS mm: x to the left, y backwards, z up; the origin lies midway between the ear
     canals and z = 0 is the Frankfort plane. Without asymmetry the right half is the exact mirror
@@ -385,7 +385,7 @@ class PhantomHead:
     ) -> ImageData:
         """The head as a CT would show it, int16 HU, with partial volume at every surface.
 
-        Bone has a cortex about cancellous bone; tissue deep in the head is lean. The neck ends in
+        Bone has a cortex around cancellous bone; tissue deep in the head is lean. The neck ends in
         a flat cut.
 
         Parameters

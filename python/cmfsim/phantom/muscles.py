@@ -129,10 +129,10 @@ class Muscle:
     def fibre(self, points: ArrayLike) -> Floats:
         """The unit directions of the fibres at points, (n, 3), from origin towards insertion.
 
-        By definition the principal axis of the mean of a aᵀ over the fibre lines, a the tangent
-        of a line where it is nearest, weighted by the inverse fourth power of the distance
-        (softened by a hundredth of the mean length): on a line it is its tangent. Ask it near the
-        muscle: far away it is only defined.
+        By definition the principal axis of the mean of a aᵀ over the fibre lines, a the tangent of
+        a line where it is nearest, weighted by the inverse fourth power of the distance (softened
+        by a hundredth of the mean length): on a line it is its tangent. Use it near the muscle: far
+        away it is defined but has no meaning.
 
         Parameters
         ----------
@@ -243,7 +243,7 @@ def _skin(tissue: Tissue) -> Field:
 
 
 def _placed(tissue: Tissue, points: Floats, place: Floats) -> Floats:
-    """Course points put between skin and bone, as `courses` says."""
+    """Course points placed between skin and bone, as described in `courses`."""
     depth = np.where(place > 1.0, place, 0.0)
     share = np.where(place > 1.0, 0.0, place)
     moves = place > 0.0

@@ -1,4 +1,4 @@
-"""What makes one phantom a different person from another."""
+"""The parameters that distinguish one phantom from another."""
 
 from dataclasses import dataclass, fields
 from types import MappingProxyType

@@ -2,7 +2,7 @@
 
 A level is close to the signed distance in mm near its surface. Coordinates come as three arrays
 that broadcast, so that a grid is evaluated from its axes and what depends on one axis alone is
-computed once per line. Shapes further than REACH from the asked box are left out. They could not
+computed once per line. Shapes further than REACH from the requested box are skipped. They could not
 have moved what is near a surface, so that levels there do not depend on which points are asked
 together; far outside a level is merely negative.
 """

@@ -308,7 +308,7 @@ def _body() -> FlatTube:
 
 
 def teeth_shape(*, upper: bool) -> Blend:
-    """One tooth row: crowns with roots in the bone, third molars left out."""
+    """One tooth row: crowns with roots in the bone, without third molars."""
     arch, widths = (UPPER_ARCH, UPPER_WIDTHS) if upper else (LOWER_ARCH, LOWER_WIDTHS)
     depths, edges = (UPPER_DEPTHS, UPPER_EDGES) if upper else (LOWER_DEPTHS, LOWER_EDGES)
     curve = smooth_curve(arch, 12)

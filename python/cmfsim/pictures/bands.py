@@ -25,8 +25,8 @@ def picture_band(
 ) -> None:
     """Writes a picture of half the width of a band: from the right, the front and the left.
 
-    Where no calibration case says anything the skin is grey. Without a calibration, each view
-    states that.
+    Where no calibration case has data, the skin is grey. Without a calibration, each view states
+    that.
 
     Parameters
     ----------

@@ -77,8 +77,8 @@ window.Render()
 # Time after which the probe counts as failed, s; it takes half a second.
 PROBE_TIME = 60.0
 NO_OPENGL = (
-    "on a machine without a screen install OpenGL for software rendering "
-    "(Debian: libgl1, libegl1, libosmesa6)"
+    "on a machine without a screen, install OpenGL for software rendering (Debian: libgl1, "
+    "libegl1, libosmesa6)"
 )
 
 
@@ -367,6 +367,6 @@ def pyvista_module() -> Any:
     except ImportError as error:
         # VTK without libGL fails as an ImportError that names the library.
         raise CaseInputError(
-            f"pictures are drawn with PyVista, which cannot be imported ({error}): "
-            "pip install 'cmfsim[view]', and where libGL is missing install it (Debian: libgl1)"
+            f"pictures are drawn with PyVista, which cannot be imported ({error}): pip install "
+            "'cmfsim[view]', and install libGL if it is missing (Debian: libgl1)"
         ) from error

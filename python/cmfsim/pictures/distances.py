@@ -230,5 +230,5 @@ def _values(distances: ArrayLike, count: int) -> tuple[Floats, NDArray[np.bool_]
             f"distances have shape {shown.shape}, but the skin has {count} vertices"
         )
     if not shown.any():
-        raise CaseInputError("every distance is masked: there is nothing to show")
+        raise CaseInputError("every distance is masked, so there is nothing to show")
     return as_floats("distances", np.ma.filled(np.ma.asarray(distances, dtype=float), 0.0)), shown

@@ -61,7 +61,7 @@ def picture_landmarks(
     views : sequence of str
         Of "front", "left", "right": those to draw.
     size : (int, int), pixels, optional
-        Of the picture; 700 by 700 for each view if left out.
+        Of the picture; default: 700 by 700 for each view.
 
     Raises
     ------
@@ -105,9 +105,7 @@ def picture_landmarks(
 
     panels = [View(name, f"{kind}, {name}") for kind in points for name in views]
     count = sum(len(names) for names in wrong.values())
-    words = [
-        f"Blue balls: landmarks. Red cubes with red names: doubtful ones ({count}) to look at."
-    ]
+    words = [f"Blue balls: landmarks. Red cubes with red names: doubtful ones ({count}) to check."]
     draw(path, panels, corners, size, paint, columns=len(views), words=words)
 
 

@@ -38,8 +38,8 @@ def picture_muscles(
 ) -> None:
     """Writes a picture of muscles: in colours with their names, or with their fibres.
 
-    In colours, from the front and the left, muscles of both sides that are called alike have one
-    colour. With fibres, boxes of muscles whose outline hardly tells the direction are orange,
+    In colours, from the front and the left; muscles of both sides with the same name have one
+    colour. With fibres, boxes of muscles whose outline hardly determines the direction are orange,
     others blue; where fibre lines are known the directions follow them.
 
     Parameters
@@ -110,7 +110,7 @@ def picture_muscles(
         for muscle in musculature:
             add_muscle(plotter, muscle, colours[_without_side(muscle.name)])
 
-    # The legend stands beside the heads, not on them.
+    # The legend is next to the heads, not on them.
     views = (View("front", ""), View("front", "front"), View("left", "left"))
     rows = int(size[1]) // LEGEND_ROW - 1
     draw(path, views, corners, size, paint_names, legend=list(colours.items())[:rows])

@@ -1,4 +1,4 @@
-"""Where the skin of a mesh ends: at the back, below and above its triangles are ragged."""
+"""The ends of the skin of a mesh: at the back, below and above, its triangles are ragged."""
 
 from dataclasses import dataclass
 from typing import Any

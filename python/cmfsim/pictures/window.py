@@ -46,7 +46,7 @@ class ViewPart:
     values : (v,) float64 or None
         At the vertices, shown in colours from 0 to the largest.
     shown : bool
-        At first; the box beside its name shows and hides it.
+        Initial state; the box next to its name shows and hides it.
     """
 
     name: str
@@ -72,7 +72,7 @@ def view_parts(
     parts : sequence of ViewPart
     title : str
     unit : str
-        Of the values, beside their colours.
+        Of the values, next to their colours.
     screenshot : path, optional
         Ends in `.png`: nothing is opened.
     size : (int, int), pixels
@@ -94,7 +94,7 @@ def view_parts(
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     if path is None and not has_screen():
         raise CaseInputError(
-            "there is no screen to open a window on: write a picture (--screenshot FILE.png)"
+            "there is no screen for a window: write a picture instead (--screenshot FILE.png)"
         )
     width, height = (int(as_positive("window size", n)) for n in size)
     pv = pyvista_module()
@@ -128,7 +128,7 @@ def view_parts(
 
 
 def has_screen() -> bool:
-    """Whether windows can be opened here, as far as the environment says."""
+    """Whether windows can be opened here, according to the environment."""
     if sys.platform.startswith(("win", "darwin")):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

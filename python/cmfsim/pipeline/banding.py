@@ -78,8 +78,8 @@ def predict_with_band(
 
     Notes
     -----
-    The standard deviation at a vertex is √Σ(n·∂u/∂p σ_p)² over tissue and plan, and what is added
-    along the normal n without a solve: change of thickness, segmentation, scan noise.
+    The standard deviation at a vertex is √Σ(n·∂u/∂p σ_p)² over tissue and plan, plus the sources
+    that act along the normal n without a solve: change of thickness, segmentation, scan noise.
 
     Examples
     --------
@@ -103,10 +103,10 @@ def predict_with_band(
 
 
 def band_settings(prediction: Prediction) -> dict[str, Any]:
-    """What the band of a prediction depends on besides its case, as plain values.
+    """The settings on which the band of a prediction depends besides its case, as plain values.
 
-    Predictions whose settings are equal may be calibrated by one another. The edge length is no
-    part of it: what a coarser mesh costs is for a convergence study to state.
+    Predictions with equal settings may calibrate one another. The edge length is not included: use
+    a convergence study to find the effect of a coarser mesh.
 
     Examples
     --------
@@ -132,10 +132,10 @@ def band_settings(prediction: Prediction) -> dict[str, Any]:
 
 
 def band_regions(patient: PatientModel) -> dict[str, NDArray[np.bool_]]:
-    """The vertices of a patient's skin in each region that a band holds.
+    """The vertices of a patient's skin in each region of a band.
 
     They are placed on the skin before the operation, as those of an evaluation, by the skin
-    landmarks of the case or by proposed ones; none where neither are there.
+    landmarks of the case or by proposed ones; empty if there are neither.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def _check_settings(calibration: Calibration, settings: Mapping[str, Any]) -> No
     ]
     raise CalibrationError(
         f"the calibration was made under other settings: {'; '.join(differing)}; calibrate with "
-        "cases that were predicted under the settings of this one"
+        "cases that were predicted with the settings of this prediction"
     )
 
 
@@ -241,9 +241,9 @@ def _factors(
 ) -> dict[str, BandFactor]:
     if not regions:
         raise CalibrationError(
-            "a calibrated band holds regions of the face, and the case has no skin landmarks that "
-            f"place them: add {', '.join(SKIN_LANDMARKS)} to [landmarks], or have cmfsim "
-            "landmarks propose them"
+            "a calibrated band needs the regions of the face, but the case has no skin "
+            f"landmarks to place them: add {', '.join(SKIN_LANDMARKS)} to [landmarks], or let "
+            "cmfsim landmarks propose them"
         )
     if options.group is not None and options.group not in calibration.groups:
         known = ", ".join(repr(group) for group in calibration.groups)

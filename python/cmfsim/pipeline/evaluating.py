@@ -40,14 +40,15 @@ from cmfsim.values.surface_data import SurfaceData
 __all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
 
 WILCOXON_NOTE = (
-    "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices are "
-    "not independent, so its p values are far too small; look at the size of the difference."
+    "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices "
+    "are not independent, so its p values are far too small; judge by the size of the "
+    "difference."
 )
 
 
 @dataclass(frozen=True, eq=False)
 class CaseEvaluation:
-    """How well models predict one patient.
+    """The comparison of models with one patient's outcome.
 
     Attributes
     ----------
@@ -55,14 +56,14 @@ class CaseEvaluation:
     postoperative : Postoperative
     comparison : ModelComparison
     key : str
-        Of everything that the result depends on: inputs, models, version.
+        A digest of everything on which the result depends: inputs, models, version.
     failed : mapping of str to str
-        Why a model has no prediction, by its name.
+        The reason why a model has no prediction, by its name.
     unmoved : SkinComparison or None
         The face before against the face after where nothing was operated on; None where the scans
         do not show it.
     thickness : ThicknessChange or None
-        The change of the soft tissue's thickness that was fitted there, where that was asked for.
+        The change of the soft tissue's thickness that was fitted there, if requested.
     fitted : ModelComparison or None
         The comparison with that change applied to every prediction, and to no change.
     notes : tuple of Finding
@@ -112,7 +113,7 @@ class CaseEvaluation:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What was noticed of the face after the operation, and of the comparison with it."""
+        """Findings on the post-operative face and on the comparison with it."""
         compared = [f for c in self.comparison.comparisons.values() for f in c.findings]
         return tuple(dict.fromkeys([*self.postoperative.findings, *self.notes, *compared]))
 
@@ -161,10 +162,10 @@ def evaluate(
     on_findings: OnFindings | None = None,
     fit_thickness: bool = False,
 ) -> CaseEvaluation:
-    """The predictions of several models for a case, compared with what came after.
+    """The predictions of several models for a case, compared with the post-operative face.
 
-    Errors are taken over the face where the case has skin landmarks before and after, else over
-    all of the skin (Kim et al. 2010, section 3.2).
+    Errors are computed over the face if the case has skin landmarks before and after, otherwise
+    over all of the skin (Kim et al. 2010, section 3.2).
 
     Parameters
     ----------
@@ -206,7 +207,8 @@ def evaluate(
     postoperative = read_postoperative(case)
     if postoperative.skin is None:
         raise CaseInputError(
-            f"{case.where('postoperative')}: there is no face to compare with: add skin or image"
+            f"{case.where('postoperative')}: the case has no face to compare with: add skin or "
+            "image"
         )
     options = BuildOptions(
         progress=progress,
@@ -233,8 +235,8 @@ def evaluate(
     if fit_thickness:
         if unmoved is None:
             raise CaseInputError(
-                "a change of thickness is fitted where nothing was operated on, and "
-                f"{why[0].what if why else 'there is no such place'}: leave out --fit-thickness"
+                "a change of thickness is fitted where nothing was operated on, but "
+                f"{why[0].what if why else 'there is no such place'}: omit --fit-thickness"
             )
         depth = compared.depth()
         thickness = fitted_thickness(unmoved.signed, depth[unmoved.vertices])
@@ -289,7 +291,7 @@ class _Compared:
         except RegistrationError as error:
             return None, (_not_shown(str(error)),)
         if found is None:
-            return None, (_not_shown("the tissue that was simulated ends below the forehead"),)
+            return None, (_not_shown("the simulated tissue ends below the forehead"),)
         return found, ()
 
     def depth(self) -> Floats:
@@ -302,11 +304,11 @@ class _Compared:
 def _landmarks_unused() -> Finding:
     return Finding.note(
         "landmarks-after-unused",
-        "the landmarks of the face after the operation are not used: those before it were found "
-        "automatically",
+        "the landmarks of the post-operative face are not used, because the pre-operative ones "
+        "were found automatically",
         where="postoperative.landmarks",
-        why="Distances are those to the closest point, which does not see skin that slid along "
-        "itself; an error of a proposed landmark would count as an error of the prediction.",
+        why="Distances are those to the closest point, which ignores skin that slid along "
+        "itself. An error of a proposed landmark would count as an error of the prediction.",
         fix="Place the skin landmarks before the operation as well, and name the file under "
         "[landmarks].",
     )
@@ -317,8 +319,8 @@ def _not_shown(reason: str) -> Finding:
         "not-operated-none",
         f"the error where nothing was operated on is not known: {reason}",
         where="postoperative",
-        why="Errors of registration, swelling and weight cannot be separated from those of a "
-        "model.",
+        why="Errors of registration, swelling and weight cannot be separated from the error of "
+        "a model.",
         fix="Use scans that both show the forehead and temples.",
     )
 

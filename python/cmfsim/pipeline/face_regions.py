@@ -63,12 +63,12 @@ def _proposed(points: Mapping[str, Floats], errors: Mapping[str, float]) -> Face
     worst = max(errors[name] for name in SKIN_LANDMARKS)
     note = Finding.note(
         "regions-proposed",
-        "regions of the face are placed by proposed landmarks, each expected to be right to "
-        f"{worst:.1f} mm",
+        "regions of the face are placed by proposed landmarks, each with an expected error of "
+        f"up to {worst:.1f} mm",
         where="landmarks.skin",
         why="The case has no complete skin landmarks. The borders between regions are equally "
         "uncertain.",
-        fix="Look at them with cmfsim landmarks, and save them.",
+        fix="Check them with cmfsim landmarks, and save them.",
     )
     return FaceLandmarks({name: points[name] for name in SKIN_LANDMARKS}, (note,))
 

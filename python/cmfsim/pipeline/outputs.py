@@ -1,4 +1,4 @@
-"""What commands on cases write: predictions with pictures, errors, and the report of both.
+"""The outputs of commands on cases: predictions with pictures, errors, and their report.
 
 All files of a command take their places together at its end: whoever reads the folder finds the
 results of one run. What belongs to another plan, or to other inputs or another version, goes.
@@ -262,7 +262,7 @@ def _warn_of_removed(output: Path, names: Sequence[str]) -> None:
     if not names:
         return
     _log.warning(
-        "%s: removed %d files of another plan, other inputs or another version: %s",
+        "%s: removed %d files that belong to another plan, other inputs or another version: %s",
         output,
         len(names),
         ", ".join(_statements(names)),

@@ -1,4 +1,4 @@
-"""Pictures drawn in a process of their own, beside the work that they are not needed for.
+"""Pictures drawn in a separate process, in parallel with work that does not need them.
 
 VTK takes seconds to load and to draw, on one core. Where it crashes for want of OpenGL, it takes
 that process along and no other.
@@ -20,7 +20,7 @@ __all__ = ["Painter", "draw_packed", "load"]
 
 
 class Painter:
-    """A process that draws pictures one after the other, while the caller goes on.
+    """A process that draws pictures one after another while the caller continues.
 
     It starts with the first picture, or with `load`. Used in a `with` statement, it ends with that.
     """

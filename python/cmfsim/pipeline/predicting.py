@@ -42,7 +42,7 @@ def predict(
 ) -> Prediction:
     """The face that a model predicts for a case; nothing is written.
 
-    Models with muscles take the case's template, or the package's own where the case names none.
+    Models with muscles use the template of the case, or the built-in one if the case names none.
 
     Parameters
     ----------
@@ -53,9 +53,9 @@ def predict(
     progress : callable, optional
         Called with the name of each stage as it begins.
     check : bool
-        Whether the doctor looks at the case first; an error that it finds ends the work.
+        Whether the doctor checks the case first; an error that it finds ends the work.
     band : BandOptions, optional
-        Makes a band around the face, which is the prediction's `band`; without, there is none.
+        Adds a band around the face, as the prediction's `band`.
 
     Returns
     -------
@@ -103,19 +103,19 @@ def predict_models(  # noqa: PLR0913 (options by name)
     anatomy : Anatomy, optional
         The head, where it is known; the image or surfaces of the case are then not read.
     after : Postoperative, optional
-        What is known after the operation, where that was read already.
+        The post-operative data, if they were already read.
     failed : dict, optional
-        Where given, a model whose solution does not come about (contact that does not settle, say)
-        is put there with its error, and the others go on.
+        If given, a model that cannot be solved (for example, because contact does not converge) is
+        recorded here with its error, and the others continue.
     on_findings : callable, optional
-        Called with new findings as the stages of building and each solution notice them.
+        Called with new findings of each stage and each solution.
     band : BandOptions, optional
         As for `predict`.
 
     Yields
     ------
     Prediction
-        One by one, as each is solved.
+        One at a time, as each is solved.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def build_patient(
     for name, found in patient.summary["inputs"].items():
         if hashes.get(name, found) != found:
             raise CaseInputError(
-                f"{name}: changed while the case was running; run it again once nothing writes to "
-                "this file"
+                f"{name}: changed while the case was running; run the case again when no other "
+                "program writes to this file"
             )
     return replace(patient, summary={**patient.summary, "inputs_key": key, "plan_key": about})

@@ -1,4 +1,4 @@
-"""What a command finds out before it works: the packages it needs, and that it can write."""
+"""Checks of a command before it works: required packages, and a writable output."""
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Need:
-    """A module of an extra, and what it does; some are done without."""
+    """A module of an extra, and its purpose; some are optional."""
 
     module: str
     extra: str
@@ -57,7 +57,7 @@ def prepare(
 
 
 def check_extras(needs: Iterator[_Need] | Sequence[_Need]) -> None:
-    """Refuses to begin without modules that are needed, and warns of those done without."""
+    """Refuses to begin without required modules, and warns of missing optional ones."""
     missing = [need for need in dict.fromkeys(needs) if not _is_there(need.module)]
     if not missing:
         return
@@ -65,7 +65,7 @@ def check_extras(needs: Iterator[_Need] | Sequence[_Need]) -> None:
     reasons = "; ".join(dict.fromkeys(f"{need.module}: {need.purpose}" for need in missing))
     line = f"{reasons}; install with: pip install 'cmfsim[{extras}]'"
     if all(need.is_optional for need in missing):
-        _log.warning("done without: %s", line)
+        _log.warning("skipped: %s", line)
         return
     raise CaseInputError(f"packages are missing: {line}")
 
@@ -75,19 +75,19 @@ def _needs(case: Case, *, report: bool, evaluation: bool) -> Iterator[_Need]:
     images = [case.image, None if after is None else after.image]
     if any(image is not None for image in images):
         yield _Need("SimpleITK", "imaging", "reads images")
-    yield _Need("scipy", "imaging", "works on the grid of the tissue")
-    yield _Need("skimage", "imaging", "makes surfaces of the grid")
+    yield _Need("scipy", "imaging", "computes on the grid of the tissue")
+    yield _Need("skimage", "imaging", "makes surfaces from the grid")
     if case.image is not None or case.osteotomies:
-        yield _Need("fast_simplification", "imaging", "makes surfaces of bone coarser")
+        yield _Need("fast_simplification", "imaging", "coarsens surfaces of bone")
     for path in _surface_files(case):
         yield _Need("meshio", "mesh", "reads surfaces and meshes")
         if path.lower().endswith(".vtp"):
             yield _Need("pyvista", "mesh", "reads VTP")
     if report:
-        yield _Need("jinja2", "report", "makes the report (or: --no-report)")
+        yield _Need("jinja2", "report", "writes the report (or use --no-report)")
         yield _Need("pyvista", "mesh", "draws 3-D pictures", is_optional=True)
     if evaluation:
-        yield _Need("scipy", "report", "tests differences between models")
+        yield _Need("scipy", "report", "tests the differences between models")
         yield _Need("matplotlib", "report", "draws the chart of errors", is_optional=not report)
 
 

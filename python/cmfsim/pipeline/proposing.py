@@ -50,18 +50,18 @@ def propose_landmarks(
     *,
     templates: Sequence[TemplateHead] = (),
 ) -> ProposedLandmarks:
-    """The landmarks of a head without hand work: each site where its own definition holds.
+    """The landmarks of a head, found automatically by the definition of each site.
 
-    The head's plane of symmetry and the fit of a synthetic cranium give its pose; each site is
+    The head's plane of symmetry and the fit of a synthetic cranium give its pose. Each site is
     found in the views from front and side by its definition, on either side and independently of
-    the jaw's posture; heads whose landmarks are known correct the definitions' bias as far as the
-    head resembles them. It takes a few seconds.
+    the jaw's posture. Heads whose landmarks are known correct the bias of the definitions, as far
+    as the head resembles them. It takes a few seconds.
 
     Parameters
     ----------
     bones : mapping of str to SurfaceData
-        LPS mm, upright within about 30°. The lower jaw is what is called "mandible"; without one,
-        sites of the jaws are missing.
+        LPS mm, upright within about 30°. The lower jaw must be called "mandible"; without it, sites
+        of the jaws are missing.
     skin : SurfaceData, optional
         Without it, no landmark of the skin is found.
     templates : sequence of TemplateHead, optional
@@ -76,7 +76,7 @@ def propose_landmarks(
     Raises
     ------
     LandmarkError
-        (also `ValueError`) The bones show no face, or lie otherwise than LPS says.
+        (also `ValueError`) The bones show no face, or are not in LPS.
     CaseError
         scipy is missing.
 
@@ -250,8 +250,8 @@ def _separated_again(apart: Mapping[str, float]) -> Finding:
         f"they moved by {np.mean(list(apart.values())):.1f} mm on average, {apart[name]:.1f} mm at "
         f"most ({name})",
         where="bone",
-        why="by shape alone, the cut between the tooth rows is some millimetres off",
-        fix="place skull landmarks by hand where a millimetre matters",
+        why="with shape alone, the cut between the tooth rows is some millimetres off",
+        fix="place skull landmarks by hand if a millimetre matters",
     )
 
 
@@ -260,8 +260,8 @@ def _not_separated_again() -> Finding:
         "jaws-not-separated-again",
         "the landmarks found separate the jaws less well than shape does: they are inconsistent",
         where="bone",
-        why="the cut between the tooth rows may be some millimetres off, and with it the landmarks "
-        "of teeth and jaw",
+        why="the cut between the tooth rows may be some millimetres off, and so may the "
+        "landmarks of teeth and jaw",
         fix="place the landmarks of the skull by hand and name the file under [landmarks]",
     )
 

@@ -29,7 +29,7 @@ MISPLACED_DISTANCE, MISPLACED_SCORE = 12.0, 4.0
 
 @dataclass(frozen=True, eq=False)
 class LandmarkAgreement:
-    """How far each landmark lies from where the others put it.
+    """The distance of each landmark from where the others place it.
 
     Attributes
     ----------
@@ -37,10 +37,11 @@ class LandmarkAgreement:
     predicted : (n, 3) float64, mm
         Where the spline of all other landmarks takes the source landmark.
     distances : (n,) float64, mm
-        From there to its target. A landmark far from the others is predicted worse, right or not.
+        From there to its target. A landmark far from the others is predicted less accurately,
+        whether it is correct or not.
     scores : (n,) float64
-        The distance over what its place among the others lets expect, in robust standard deviations
-        of this set: 3.5 and more stands out.
+        The distance relative to the distance expected from its position among the others, in robust
+        standard deviations of this set: 3.5 and more is an outlier.
     """
 
     names: tuple[str, ...]
@@ -60,15 +61,15 @@ class LandmarkAgreement:
 
     @property
     def outliers(self) -> tuple[str, ...]:
-        """The landmarks that stand out, worst first."""
+        """The outliers, worst first."""
         scores = dict(zip(self.names, self.scores, strict=True))
         return tuple(name for name in self.ranking if scores[name] >= OUTLIER_SCORE)
 
     @property
     def misplaced(self) -> tuple[str, ...]:
-        """The landmarks that stand out by more than heads differ, worst first.
+        """The outliers by more than the usual difference between heads, worst first.
 
-        Correct landmarks of a real head stand out from a template by up to 10 mm.
+        Correct landmarks of a real head differ from a template by up to 10 mm.
         """
         rows = {n: (d, s) for n, d, s in zip(self.names, self.distances, self.scores, strict=True)}
         return tuple(
@@ -96,12 +97,12 @@ class LandmarkAgreement:
 def leave_one_out(
     source: ArrayLike, target: ArrayLike, names: Sequence[str] | None = None
 ) -> LandmarkAgreement:
-    """How far each landmark lies from where the thin-plate spline of the others puts it.
+    """The distance of each landmark from where the thin-plate spline of the others places it.
 
     Parameters
     ----------
     source, target : (n, 3) array_like, mm
-        Landmarks in the same order, five at least.
+        Landmarks in the same order, at least five.
     names : sequence of str, optional
         Their names; numbers without.
 
@@ -112,8 +113,8 @@ def leave_one_out(
     Raises
     ------
     RegistrationError, LandmarkError
-        (also `ValueError`) What no spline goes through; fewer than five landmarks; one without
-        which the others lie in a plane; another number of names, or a name twice.
+        (also `ValueError`) Landmarks through which no spline passes; fewer than five landmarks; a
+        landmark without which the others are in a plane; a wrong number of names, or a name twice.
 
     Notes
     -----
@@ -138,11 +139,11 @@ def leave_one_out(
     if len(labels) != n or len(set(labels)) != n:
         raise LandmarkInputError(
             f"{len(labels)} names, {len(set(labels))} of them different, for {n} landmarks: give "
-            "one to each"
+            "each landmark its own name"
         )
     if n < LEAST_LANDMARKS:
         raise LandmarkInputError(
-            f"{n} landmarks: {LEAST_LANDMARKS} are needed for one to be judged by the others"
+            f"{n} landmarks: {LEAST_LANDMARKS} are needed to check each against the others"
         )
     about = s - s.mean(axis=0)
     about = about / np.linalg.norm(about, axis=1).max()
@@ -153,8 +154,8 @@ def leave_one_out(
     if freedom.min() < LEAST_FREEDOM:
         name = labels[int(np.argmin(freedom))]
         raise LandmarkInputError(
-            f"without {name} the other {n - 1} landmarks lie in one plane and cannot judge it: "
-            "add some"
+            f"without {name} the other {n - 1} landmarks are in one plane and cannot be used to "
+            "check it: add more"
         )
     g = null @ np.linalg.solve(null.T @ kernel @ null, null.T)
     error = (g @ (y - y.mean(axis=0))) / np.diag(g)[:, None]

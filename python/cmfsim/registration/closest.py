@@ -29,27 +29,27 @@ def icp(  # noqa: PLR0913 (options by name)
     Parameters
     ----------
     moving : (n, 3) array_like, Surface or SurfaceData, mm
-        Of a surface, its vertices, each counting alike.
+        Of a surface, its vertices, all with equal weight.
     fixed : (k, 3) array_like, Surface or SurfaceData, mm
     initial : (4, 4) array_like, optional
         Rigid motion to begin with; `matrix` includes it.
     trim : float
-        Share of the pairs, those farthest apart, that each step leaves out: 0 to below 1. Take a
-        little more than the share of points without a partner.
+        Share of the pairs, those farthest apart, that each step excludes: 0 to below 1. Choose
+        slightly more than the share of points without a partner.
     method : str, optional
         "plane" steps to tangent planes and needs a surface; "point" steps to the closest points.
         Without it, "plane" for a surface and "point" for points.
     max_iterations : int
     tolerance : float
-        The points rest when a step moves none by more than this share of their radius. 0: exactly
-        `max_iterations` steps.
+        The iteration has converged when a step moves no point by more than this share of their
+        radius. 0: exactly `max_iterations` steps.
     max_distance : float, optional, mm
-        Pairs farther apart are left out.
+        Pairs farther apart are excluded.
     max_angle : float, optional, degrees
-        Pairs of surfaces whose normals differ by more are left out.
+        Pairs of surfaces whose normals differ by more are excluded.
     keep_border : bool
-        Whether pairs on the border of an open surface count. Where the moving points reach past it,
-        their closest points there are not their partners.
+        Whether pairs on the border of an open surface count. Where the moving points extend past
+        the border, their closest points on it are not their partners.
 
     Returns
     -------
@@ -66,8 +66,8 @@ def icp(  # noqa: PLR0913 (options by name)
     Notes
     -----
     Besl & McKay (1992), with trimming (Chetverikov et al. 2002) and steps to tangent planes (Chen &
-    Medioni 1992); one that raises the distances is replaced by a step to the points. It finds the
-    nearest solution, so begin within about 20 mm and 10°.
+    Medioni 1992); one that increases the distances is replaced by a step to the points. It finds
+    the nearest solution, so start within about 20 mm and 10°.
 
     Examples
     --------

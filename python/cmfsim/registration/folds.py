@@ -18,7 +18,7 @@ class FoldReport:
     Attributes
     ----------
     n_points, n_folded : int
-        Points looked at, and those where the warp folds.
+        Points tested, and those where the warp folds.
     smallest : float or None
         Smallest determinant at the points: 1 keeps volumes, 0 and less folds; None without points.
     worst_point : (3,) float64, mm, or None
@@ -26,7 +26,7 @@ class FoldReport:
     folded_landmarks : tuple of int
         Landmarks that the warp folds next to, by index: two that were swapped, or one misplaced.
     smallest_at_landmarks : float
-        Smallest determinant on the way to any landmark.
+        Smallest determinant on the approach to any landmark.
     """
 
     n_points: int
@@ -62,7 +62,7 @@ def fold_report(warp: ThinPlateSpline, points: ArrayLike) -> FoldReport:
     ----------
     warp : ThinPlateSpline
     points : (k, 3) array_like, mm
-        Before the warp, such as the vertices of the muscles that it will carry.
+        Before the warp, such as the vertices of the muscles to be mapped.
 
     Returns
     -------

@@ -23,7 +23,7 @@ LEAST_DISTANCE = 0.01
 PLANAR_THICKNESS = 1e-3
 # A mirrored set fits at least this much better after mirroring: share of the rms distance.
 MIRRORED_SHARE = 0.5
-# Names that a message lists before it says how many more there are.
+# Number of names that a message lists before it states how many more there are.
 LISTED = 6
 
 
@@ -37,7 +37,7 @@ class LandmarkMatch:
         As the source spells them, in its order.
     source, target : (n, 3) float64, mm
     findings : tuple of Finding
-        Landmarks that were left out, labels that are spelled differently.
+        Landmarks that were ignored, labels that are spelled differently.
     """
 
     names: tuple[str, ...]
@@ -60,7 +60,8 @@ def match_landmarks(
     """The landmarks that both sets have, in the order of the source.
 
     Labels match if they differ only in capitals, spaces, hyphens and underscores. Sides are
-    compared wherever the sets lie: a pair `…_L`, `…_R` swapped in one of them is an error.
+    compared in any position of the sets: a pair `…_L`, `…_R` that is swapped in one of them is an
+    error.
 
     Parameters
     ----------
@@ -169,8 +170,8 @@ def _spelling(keys: Mapping[str, Mapping[str, str]], shared: Iterable[str]) -> l
             "landmark-spelling",
             f"{len(different)} labels are spelled differently: {_listed(different)}",
             where="landmarks",
-            why="they are taken as the same landmarks",
-            fix="spell them alike in both files",
+            why="they are treated as the same landmarks",
+            fix="use the same spelling in both files",
         )
     ]
 
@@ -190,7 +191,7 @@ def _extra(keys: Mapping[str, Mapping[str, str]], *, strict: bool) -> list[Findi
                 what,
                 where=f"landmarks of the {name}",
                 why="they are not used",
-                fix=f"if they should be used, place them in the {other} as well",
+                fix=f"to use them, place them in the {other} as well",
             )
         )
     return findings
@@ -233,7 +234,7 @@ def _check_sides(names: tuple[str, ...], source: Floats, target: Floats) -> None
         every = len(swapped) == n_pairs and n_pairs > 1
         raise LandmarkInputError(
             f"left and right are swapped {where} in {_listed(swapped)}: swap the labels _L and _R"
-            + ("; or all of it is mirrored: export it again" if every else " of these")
+            + ("; if the whole head is mirrored, export it again" if every else " of these")
         )
     mirror = np.array([-1.0, 1.0, 1.0])
     try:

@@ -1,4 +1,4 @@
-"""Where the landmarks of an average head lie: what a set of landmarks is compared with by name.
+"""The landmarks of an average head, with which a set of landmarks is compared by name.
 
 The places are those of the synthetic head (`cmfsim.make_head()`), LPS mm, the origin midway between
 the ear canals; of pairs the left one.

@@ -10,7 +10,7 @@ from cmfsim.errors import RegistrationError
 
 __all__ = ["side_pairs", "side_vectors", "swapped_pairs", "wrong_sides"]
 
-# A landmark off the middle by less than this does not tell left from right, mm.
+# A landmark closer to the middle than this does not distinguish left from right, mm.
 SIDE_MARGIN = 3.0
 # Distance to the partner of the other side over that to the own one below which sides are swapped.
 SWAPPED_SHARE = 0.5

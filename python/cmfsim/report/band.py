@@ -13,14 +13,14 @@ MOST_SOURCES = 12
 
 UNCALIBRATED = (
     "UNCALIBRATED. The half widths below are {factor:.2f} standard deviations of the sources "
-    "listed below, at one point at a time. They aim at {percent} of faces but have not been "
-    "checked on cases with a known outcome: the true face may lie outside more often. Give a "
-    "calibration ([band] in the case, or --calibration)."
+    "listed below, for each point separately. They are intended to cover {percent} of faces but "
+    "have not been checked on cases with a known outcome, so the true face may be outside more "
+    "often. Use a calibration ([band] in the case, or --calibration)."
 )
 CALIBRATED = (
-    "In {percent} of cases like those of the calibration, all of a region lies within its band at "
+    "In {percent} of cases like those of the calibration, all of a region is within its band at "
     "the same time: its distance from the predicted skin, along the normal, is at most the half "
-    "width everywhere. Calibrated by {file}{note}. Each region is calibrated by itself."
+    "width everywhere. Calibrated with {file}{note}. Each region is calibrated separately."
 )
 
 
@@ -62,8 +62,9 @@ def _widths(band: Values) -> Table:
             worth = (number(factor["factor"]), str(factor["n"]), f"{low:.0f} to {high:.0f} %")
         rows.append((name, *(number(cell) for cell in cells), *worth))
     caption = (
-        "Half the width of the band, mm; the factor on the standard deviation, the calibration "
-        "cases n, and the share of further cases that n of them can vouch for (90 % interval)."
+        "Half the width of the band, mm; the factor on the standard deviation; the number n of "
+        "calibration cases; and the share of further cases within the band that n cases can "
+        "guarantee (90 % interval)."
     )
     return Table(columns, tuple(rows), caption)
 
@@ -94,5 +95,5 @@ def _priors(band: Values) -> Table:
         (name, f"{entry['sd']:g}", entry["unit"], entry["reference"])
         for name, entry in priors.items()
     )
-    caption = "Standard deviations of the sources before anything is known of this patient."
+    caption = "Standard deviations assumed for the sources, independent of this patient."
     return Table(("source", "SD", "unit", "from"), rows, caption, numeric=False)

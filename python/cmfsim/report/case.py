@@ -24,19 +24,20 @@ MODEL_NAMES: Mapping[str, str] = {
 }
 # Pictures in the order of a report, with what they show. The names are those of the files.
 PICTURES: Mapping[str, str] = {
-    "prediction": "The face before the operation and as predicted after it, and how far it moves.",
+    "prediction": "The face before the operation, the predicted face, and how far the skin moves.",
     "band": "Half the width of the band around the predicted skin, mm; grey where no calibration "
     "case has data.",
-    "plan": "The plan: bone segments in their planned places, with outlines of their old ones.",
-    "muscles": "The muscles, fitted from the template to the skull by its landmarks.",
+    "plan": "The plan: bone segments in their planned positions, with outlines of their "
+    "original positions.",
+    "muscles": "The muscles of the template, fitted to the skull by landmarks.",
     "anatomy": "Skin and bone segments.",
-    "node_kinds": "Kinds of node (Kim et al. 2010, Figure 4): fixed pink, joined orange, sliding "
-    "blue, free white.",
+    "node_kinds": "Kinds of nodes (Kim et al. 2010, Figure 4): fixed pink, joined orange, "
+    "sliding blue, free white.",
 }
 
 NO_PICTURES = (
-    "This report has no pictures: none could be drawn on the machine that wrote it. PyVista and "
-    "OpenGL draw them (pip install 'cmfsim[view]'; Debian: libgl1, libegl1)."
+    "This report has no pictures because the machine that wrote it could not draw them. "
+    "Pictures need PyVista and OpenGL (pip install 'cmfsim[view]'; Debian: libgl1, libegl1)."
 )
 
 
@@ -177,12 +178,14 @@ def _alerts(findings: Sequence[Finding], left_out: str) -> list[Alert]:
     notes = [finding for finding in findings if finding.severity == "note"]
     if notes:
         lines = tuple(group.line for group in grouped(notes))
-        alerts.append(Alert("note", f"{counted(notes)}, in full below under Findings", lines))
+        alerts.append(
+            Alert("note", f"{counted(notes)}, listed in full below under Findings", lines)
+        )
     return alerts
 
 
 def _note_section(prediction: Values) -> list[Section]:
-    """What the case's own note says of it."""
+    """The section with the case's own note."""
     note = prediction.get("note")
     return [Section("About this case", (Note(note, "warning"),))] if note else []
 
@@ -208,7 +211,7 @@ def _prediction_section(
 
 
 def _band_sections(shown: Values, pictures: Mapping[str, bytes]) -> list[Section]:
-    """How far to trust the model that is shown, where that was asked for."""
+    """The section on how far to trust the model that is shown, if requested."""
     return [band_section(shown["band"], _picture("band", pictures))] if "band" in shown else []
 
 
@@ -227,14 +230,15 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
     table = Table(
         ("segment", "L", "P", "S", "turn, °", "axis (L, P, S)"),
         tuple(rows),
-        "Motion of each bone segment: that of its centre, mm, and the turn about it.",
+        "Motion of each bone segment: translation of its centre, mm, and rotation about the "
+        "centre.",
     )
     notes = []
     if bent:
         notes.append(
             Note(
-                "Moved vertex by vertex, with the nearest rigid motion and its residual in the "
-                f"table: {', '.join(bent)}."
+                "Moved vertex by vertex (the table has the nearest rigid motion and its "
+                f"residual): {', '.join(bent)}."
             )
         )
     words = [
@@ -253,7 +257,7 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
 
 
 def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
-    """How well each segment was laid on the bone after the operation."""
+    """The table of how well each segment was registered to the post-operative bone."""
     if achieved is None:
         return []
     rows = tuple(
@@ -266,11 +270,11 @@ def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
         for name, found in achieved["segments"].items()
     )
     caption = (
-        "The plan was read from the bones after the operation: remaining distance between each "
-        "segment and that bone, mm, and the share of its vertices that lie on it. RMS and maximum "
-        "are of those vertices, median and 95th percentile of all. Size: after the operation as a "
-        "share of before, with its 95 % interval; it is not part of the motion. Empty: the motion "
-        "follows from paired vertices alone."
+        "The plan was measured on the post-operative bones: remaining distance between each "
+        "segment and the bone, mm, and the share of its vertices that are on the bone. RMS and "
+        "maximum refer to these vertices, median and 95th percentile to all. Size: "
+        "post-operative relative to pre-operative size, with its 95 % interval; it is not part "
+        "of the motion. Empty: the motion follows from paired vertices alone."
     )
     heads = ("segment", "RMS", "largest", "median", "P95", "share", "size")
     return [Table(heads, rows, caption)]
@@ -297,14 +301,14 @@ def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -
         blocks.append(
             statistics_table(
                 entry["regions"],
-                f"Model {model}: distance of the prediction from the face after the operation, mm.",
+                f"Model {model}: distance of the prediction from the post-operative face, mm.",
             )
         )
     if "no_change" in evaluation:
         blocks.append(
             statistics_table(
                 evaluation["no_change"]["regions"],
-                "For comparison, the face before the operation taken as the prediction, mm.",
+                "For comparison, the same with the pre-operative face as the prediction, mm.",
             )
         )
     blocks += [Note(text) for text in evaluation.get("notes", ())]
@@ -327,7 +331,7 @@ def _mean_table(evaluation: Values) -> Table:
         )
         for region in regions
     )
-    caption = "Mean distance from the face after the operation, mm, by region and model."
+    caption = "Mean distance from the post-operative face, mm, by region and model."
     method = next(iter(entries.values())).get("comparison", {}).get("method")
     if method in MEASURES:
         caption += f" Measured {MEASURES[method]}."
@@ -367,7 +371,7 @@ def _moduli(used: Values) -> list[Note | Table | Figure]:
         Table(
             ("tissue", "along fibres, MPa", "across, MPa", "Poisson's ratio"),
             tuple((name, *(f"{value:g}" for value in values)) for name, *values in rows),
-            "Moduli of fat and muscle, before they are mixed in a tet.",
+            "Moduli of fat and muscle before mixing within a tet.",
         )
     ]
 
@@ -403,7 +407,7 @@ def _model_section(
         (name, number(held["joined"]), number(held["sliding"]))
         for name, held in shown["segments"].items()
     )
-    caption = "Nodes on each segment; models without sliding join those that could slide."
+    caption = "Nodes on each segment; models without sliding join the nodes that could slide."
     kinds = Table(("segment", "joined", "sliding"), segments, caption)
     mesh = Table.of_pairs(labelled(shown["mesh"], MESH), "The mesh, the same for all models.")
     left_out = [
@@ -422,7 +426,7 @@ def _time_section(predictions: Sequence[Values]) -> Section:
     ]
     rows.append(("sum", *(number(float(sum(entry["timings"].values()))) for entry in predictions)))
     columns = ("stage", *(entry["model"] for entry in predictions))
-    note = Note("A case is built once for all its models; each sum includes the time of building.")
+    note = Note("A case is built once for all its models; each total includes the build time.")
     table = Table(columns, tuple(rows), "Wall time of each stage, s.")
     return Section("Time", (table, *([note] if len(predictions) > 1 else [])))
 
@@ -434,7 +438,7 @@ def _finding_section(findings: Sequence[Finding]) -> Section:
     blocks = [
         Note(f"{f.severity}: {_sentence(f)}", kinds.get(f.severity, "plain")) for f in ordered
     ]
-    return Section("Findings", tuple(blocks or [Note("Nothing was noticed.")]))
+    return Section("Findings", tuple(blocks or [Note("No findings.")]))
 
 
 def _sentence(finding: Finding, *, with_what: bool = True) -> str:
@@ -448,7 +452,7 @@ def _sentence(finding: Finding, *, with_what: bool = True) -> str:
 
 def _input_section(prediction: Values) -> Section:
     rows = tuple(prediction["inputs"].items())
-    return Section("Inputs", (Table(("file", "SHA-256"), rows, "What was read.", numeric=False),))
+    return Section("Inputs", (Table(("file", "SHA-256"), rows, "Input files.", numeric=False),))
 
 
 def _picture(name: str, pictures: Mapping[str, bytes]) -> list[Figure]:

@@ -1,4 +1,4 @@
-"""What the error of an evaluation consists of: what no model makes, and what a model does."""
+"""The parts of the error of an evaluation: those of the scans, and those of a model."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -32,14 +32,15 @@ def not_operated_blocks(evaluation: Values) -> list[Note | Table]:
     whole = found["regions"]["whole"]
     return [
         Note(
-            f"Where nothing was operated on, the two scans differ by {whole['mean_mm']:.2f} mm on "
-            f"average ({whole['signed_mean_mm']:+.2f} mm signed; negative: the face before lies "
-            "behind the face after). That is registration, swelling or weight. No model can do "
-            "better, and smaller differences say nothing about a model."
+            f"Where nothing was operated on, the two scans differ by {whole['mean_mm']:.2f} mm "
+            f"on average ({whole['signed_mean_mm']:+.2f} mm signed; negative: the face before "
+            "lies behind the face after). This comes from registration, swelling or weight. No "
+            "model can do better, and smaller differences are not evidence about a model."
         ),
         statistics_table(
             found["regions"],
-            "Distance of the face before from the face after where nothing was operated on, mm.",
+            "Distance of the pre-operative from the post-operative face where nothing was "
+            "operated on, mm.",
         ),
     ]
 

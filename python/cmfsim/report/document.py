@@ -1,4 +1,4 @@
-"""What a report says, without its looks: sections of notes, tables and figures."""
+"""The content of a report without its layout: sections of notes, tables and figures."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -73,7 +73,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Alert:
-    """What a reader should know first: one line, with what it sums up folded below it.
+    """A message at the top of a report: one line, with the details collapsed below it.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What figures and methods are called in a report, with their units."""
+"""The labels of figures and methods in a report, with their units."""
 
 from collections.abc import Mapping
 
@@ -6,10 +6,10 @@ __all__ = ["MEASURES", "MESH", "MUSCLES", "labelled"]
 
 # How a distance between skins was measured, by the method of `compare_skins`.
 MEASURES: Mapping[str, str] = {
-    "landmarks": "from the point that a spline through the skin's landmarks leads to, as in the "
-    "paper",
-    "closest": "from the closest point, which does not see skin that slid along itself: smaller "
-    "than through landmarks",
+    "landmarks": "from the corresponding point given by a spline through the skin landmarks, as "
+    "in the paper",
+    "closest": "from the closest point, which ignores skin that slid along itself: smaller than "
+    "through landmarks",
 }
 
 # mm³ in a cm³, and one in a hundred.
@@ -29,8 +29,8 @@ MESH: Labels = {
     "min_dihedral": ("smallest dihedral angle, °", 1.0),
     "max_dihedral": ("largest dihedral angle, °", 1.0),
     "edge_ratio": ("longest over shortest edge of the worst tet", 1.0),
-    "dropped_parts": ("bodies too small to keep", 1),
-    "dropped_volume": ("volume of these, cm³", CUBIC),
+    "dropped_parts": ("removed bodies (too small)", 1),
+    "dropped_volume": ("volume of removed bodies, cm³", CUBIC),
     "dropped_tets": ("poor tets removed at the surface", 1),
 }
 MUSCLES: Labels = {
@@ -38,17 +38,17 @@ MUSCLES: Labels = {
     "smoothing": ("smoothing of the spline", 1.0),
     "fit": ("moved into the tissue", 1),
     "preset": ("constants of fat and muscle", 1),
-    "mixing": ("what is mixed in a tet", 1),
+    "mixing": ("quantity mixed in a tet", 1),
     "inside": ("inside test", 1),
     "muscles": ("muscles", 1),
     "muscle_volume": ("volume of all muscles in the tissue, cm³", CUBIC),
-    "muscle_tets": ("tets that hold muscle", 1),
-    "pairs": ("pairs of a tet and a muscle checked", 1),
+    "muscle_tets": ("tets that contain muscle", 1),
+    "pairs": ("pairs of tet and muscle checked", 1),
     "crossed": ("tets that a muscle's surface crosses", 1),
     "samples": ("points in each of these", 1),
     "samples_per_crossed_tet": ("points in each of these", 1),
-    "points": ("points in all", 1),
-    "seed": ("seed of the points", 1),
+    "points": ("points in total", 1),
+    "seed": ("random seed of the points", 1),
 }
 
 

@@ -1,4 +1,4 @@
-"""A report as one HTML page that needs nothing beside it: for browsers and for paper."""
+"""A report as one self-contained HTML page, for browsers and for print."""
 
 import base64
 from importlib.resources import files

@@ -1,4 +1,4 @@
-"""The report of a study: every case by every model, beside the paper's own patients."""
+"""The report of a study: every case by every model, compared with the paper's patients."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -45,7 +45,7 @@ def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document
         "models": ", ".join(models),
         "time": f"{study['seconds']:.0f} s",
     }
-    subtitle = "Errors are distances of the predicted skin from the skin after the operation, mm."
+    subtitle = "Errors are distances of the predicted skin from the post-operative skin, mm."
     title = f"{study['cohort']}: study"
     return Document(title, subtitle, facts, sections, alerts=_alerts(study["cases"]))
 
@@ -74,7 +74,7 @@ def table3_text(study: Values, table: ErrorTable) -> str:
     blocks += _tests(table, models)
     absent = [case["name"] for case in study["cases"] if case["name"] not in table.patients]
     if absent:
-        blocks.append(f"Failed, and in no figure of this table: {', '.join(absent)}.")
+        blocks.append(f"Failed, and not included in any figure of this table: {', '.join(absent)}.")
     paper = _paper_table(models)
     rows = [paper.columns, ("---", *["---:"] * len(models)), *paper.rows]
     blocks.append(f"## The paper's patients\n\n{paper.caption}")
@@ -94,7 +94,9 @@ def _measures(cases: Sequence[Values]) -> list[str]:
     if len(by_method) == 1:
         return [f"Measured {MEASURES[method]}." for method in by_method]
     found = [f"{', '.join(names)}: {MEASURES[method]}." for method, names in by_method.items()]
-    return [f"**Measured in two ways, so that averages mix them.** {' '.join(found)}"] * bool(found)
+    return [
+        f"**Distances were measured in two ways, so averages mix both.** {' '.join(found)}"
+    ] * bool(found)
 
 
 def _plain_line(text: str) -> str:
@@ -184,7 +186,7 @@ def _region_blocks(done: Sequence[Values], models: tuple[str, ...]) -> tuple[Not
             rows.append((case["name"], *(_gain(entry, still, name) for name in names)))
         caption = f"Model {model}: mean error, and in brackets its change against no change, mm."
         blocks.append(Table(("case", *names), tuple(rows), caption))
-    return tuple(blocks) or (Note("No case has finished."),)
+    return tuple(blocks) or (Note("No case is finished."),)
 
 
 def _gain(entry: Values, still: Values | None, region: str) -> str:

@@ -69,7 +69,7 @@ def _middles(
 
 
 def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[int, Finding | None]:
-    """How many tets rest inverted, and the warning that says so where there are any.
+    """The number of tets inverted at equilibrium, and a warning if there are any.
 
     Linear kinematics has no use for it: its tets keep their strain however they turn, and a
     negative volume is an error of the linear model rather than of the solution.
@@ -112,6 +112,7 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
         f"{ratios[worst]:.2g} of its volume",
         where=f"({x:.1f}, {y:.1f}, {z:.1f}) mm before the operation",
         why="tissue cannot turn inside out: forces and displacements around these tets are wrong",
-        fix="a smaller motion, or larger tets where bones squeeze a thin layer; instead of "
-        'kinematics = "corotational" also "hyperelastic", which resists inversion longer',
+        fix="use a smaller motion, or larger tets where bones squeeze a thin layer; if "
+        'kinematics is "corotational", also try "hyperelastic", which resists inversion '
+        "longer",
     )

@@ -54,7 +54,7 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     check_one_of("model", model, MODELS)
     if model.startswith("M") and patient.muscles is None:
         raise CaseInputError(
-            f"model {model} needs muscles, and {patient.name!r} was built without them: add "
+            f"model {model} needs muscles, but {patient.name!r} was built without them: add "
             "[muscles] to the case and skull landmarks"
         )
     scene = patient.scene
@@ -73,7 +73,7 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
 def predict_patient(
     patient: PatientModel, model: str = "M+S", *, solver: StaticSolver | None = None
 ) -> Prediction:
-    """The face that a model predicts for a patient who is built already.
+    """The face that a model predicts for a patient who is already built.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ def predict_patient(
     model : str
         "H", "M", "H+S" or "M+S".
     solver : StaticSolver, optional
-        Of `model_scene(patient, model)`, whatever its plan, where one is made already: a new plan
-        then takes no factorisation.
+        Of `model_scene(patient, model)`, with any plan, if it already exists: a new plan then needs
+        no factorisation.
 
     Returns
     -------
@@ -241,8 +241,8 @@ def _lip_findings(patient: PatientModel, model: str) -> list[dict[str, str]]:
         "lips-without-contact",
         f"the lips are separate, but model {model} has no contact between them",
         where="[lips]",
-        why="they follow their teeth and may pass through each other, which a prediction with the "
-        "lips in one piece cannot do",
+        why="each lip follows its teeth, so the lips may pass through each other, which is "
+        "impossible if they are one piece",
         fix=f"use model {model}+S, or set contact = false in [lips]",
     )
     return [told(found)]
@@ -255,7 +255,7 @@ def _left_out(patient: PatientModel, scene: Scene, model: str) -> list[str]:
         left.append("muscles: the model is homogeneous")
     elif patient.fraction is not None:
         share = float(np.mean(patient.fraction == 0.0))
-        left.append(f"muscle law: {100 * share:.0f} % of the tets hold no muscle, and are fat")
+        left.append(f"muscle law: {100 * share:.0f} % of the tets contain no muscle and are fat")
     if not any(np.size(segment.sliding) for segment in scene.segments.values()):
         left.append("contact: no node slides")
     still = [name for name, motion in scene.plan.items() if _stays(motion)]

@@ -1,4 +1,4 @@
-"""How a solved face changes with what is uncertain: derivatives by one linear solve each.
+"""Derivatives of a solved face with respect to uncertain parameters, by one linear solve each.
 
 Of a material constant p, K ∂u/∂p = −(∂K/∂p) u: the right-hand side is a difference of internal
 forces at the solved u, and the factor or preconditioner is that of the solution. Sliding contact is
@@ -88,7 +88,9 @@ def skin_rates(
     left_out: list[str] = []
     parts = scene_parts(patient, scene)
     if parts is None:
-        left_out.append("tissue: fat and muscle cannot be told apart in the scene's stiffness")
+        left_out.append(
+            "tissue: fat and muscle cannot be distinguished in the stiffness of the scene"
+        )
     else:
         for source in (s for s in TISSUE if s.name in parts.sources):
             u, forces = solution.all_displacements, solution.all_forces
@@ -108,13 +110,13 @@ def skin_rates(
 def _check_scene(scene: Scene) -> None:
     if scene.options.kinematics != "linear":
         raise CaseInputError(
-            f"a band is made for linear kinematics, and the case has {scene.options.kinematics}: "
+            f"a band requires linear kinematics, but the case has {scene.options.kinematics}: "
             'set kinematics = "linear" in [solver], or predict without a band'
         )
     if scene.touching or scene.obstacles:
         raise CaseInputError(
-            "a band is not made where lips are in contact, since what touches changes: set "
-            "contact = false in [lips], or predict without a band"
+            "a band cannot be computed if lips are in contact, because the nodes in contact "
+            "change: set contact = false in [lips], or predict without a band"
         )
 
 
@@ -150,7 +152,7 @@ def _plan_changes(
 ) -> dict[str, list[Floats]]:
     """Rates of the motion of each segment that is moved, (4, 4) each, in the order of `PLAN`."""
     if "achieved" in patient.summary:
-        left_out.append("execution of the plan: it was read from the bones after the operation")
+        left_out.append("execution of the plan: the plan was measured on the post-operative bones")
         return {}
     found = {}
     for name, motion in scene.plan.items():

@@ -45,7 +45,7 @@ def scene_solver(scene: Scene) -> StaticSolver:
     Raises
     ------
     MeshError, MaterialError, BoundaryError, ContactError, SolverError
-        (the input errors also `ValueError`) What the core finds wrong with the scene.
+        (the input errors also `ValueError`) A problem that the core finds in the scene.
 
     Examples
     --------
@@ -66,7 +66,7 @@ def scene_solver(scene: Scene) -> StaticSolver:
 
 
 def _boundary(scene: Scene) -> Boundary:
-    """What holds and moves the nodes of a scene."""
+    """The boundary conditions of a scene."""
     segments = scene.segments.items()
     sliding = {name: s.sliding for name, s in segments if np.size(s.sliding)}
     # A scene without one-sided contact does not pay for it.
@@ -126,20 +126,20 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
     ----------
     scene : Scene
     solver : StaticSolver, optional
-        Of this scene, whatever its plan, where `scene_solver` has made one already.
+        Of this scene, with any plan, if `scene_solver` has already made one.
 
     Returns
     -------
     SceneResult
-        Where large deformation leaves tets inverted, `summary["inverted_tets"]` counts them and
-        `summary["findings"]` says which is worst and what to do. In linear kinematics the count is
-        None: it would mean nothing there.
+        If large deformation leaves tets inverted, `summary["inverted_tets"]` counts them and
+        `summary["findings"]` states which is worst and what to do. In linear kinematics the count
+        is None, because it would have no meaning.
 
     Raises
     ------
     MeshError, MaterialError, BoundaryError, ContactError, SolverError
-        (the input errors also `ValueError`) What is wrong with the scene, or that the solution did
-        not converge and how far it came.
+        (the input errors also `ValueError`) The scene is invalid, or the solution did not converge;
+        the error states the figures reached.
 
     Examples
     --------
@@ -263,7 +263,7 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
             f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
             "balance",
             where="contact",
-            why="this exceeds the tolerance, though it is too small to see on a face",
+            why="this exceeds the tolerance, but is too small to be visible in the face",
             fix="allow more contact_iterations or a larger contact_tolerance, or smooth the "
             "surface",
         )
@@ -274,8 +274,9 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
             f"one-sided contact stopped after {solution.touching_rounds} rounds with tissue "
             f"{solution.penetration:.1e} mm deep in other tissue or bone",
             where="contact",
-            why="further rounds might have changed what touches",
-            fix="look at the lips in the result; a smaller motion or a smoother surface converges",
+            why="further rounds might change which nodes are in contact",
+            fix="check the lips in the result; a smaller motion or a smoother surface is more "
+            "likely to converge",
         )
         findings.append(told(found))
     return findings

@@ -76,8 +76,8 @@ def slip_finding(scene: Scene, displacements: ArrayLike) -> Finding | None:
         f"{count} sliding {'node' if count == 1 else 'nodes'} slipped further than bones moved, at "
         f"most {worst} before the operation",
         where="contact",
-        why="tissue has gone round an edge of the bone; the plan may have another equilibrium, in "
-        "which the face nearby differs",
+        why="tissue slipped round an edge of the bone; the plan may have another equilibrium, "
+        "in which the face nearby is different",
         fix="compare the face nearby with that of a slightly smaller motion, or end the sliding "
         "region before the edge ([node_kinds])",
     )

@@ -51,7 +51,7 @@ class CaseJob:
 
 @dataclass(frozen=True)
 class CaseOutcome:
-    """What became of one case.
+    """The outcome of one case.
 
     Attributes
     ----------
@@ -111,23 +111,24 @@ def run_study(
     fresh: bool = False,
     progress: Callable[[CaseOutcome], None] | None = None,
 ) -> StudyReport:
-    """Every case of a cohort, predicted by every model and compared with what came after.
+    """Every case of a cohort, predicted by every model and compared with the post-operative face.
 
-    Each case is worked on by a process of its own, so that one that crashes or fills the memory is
-    reported and does not stop the rest. A case that an earlier run finished is kept as long as its
-    inputs, its models and this version are the same.
+    Each case runs in its own process, so that a case that crashes or fills the memory is reported
+    and does not stop the others. A case that an earlier run finished is kept as long as its inputs,
+    its models and this version are the same.
 
     Parameters
     ----------
     cohort : Cohort
     workers : int, optional
-        Cases at a time on this machine; one per two cores if left out, since a case uses several.
+        Cases at a time on this machine; default: one per two cores, because a case uses several.
     scheduler : str, optional
-        Address of a Dask cluster that sees the same files; it then decides how many run at a time.
+        Address of a Dask cluster with access to the same files; it then decides how many run at a
+        time.
     fresh : bool
-        Whether finished cases are worked on again.
+        Whether finished cases are repeated.
     progress : callable, optional
-        Called with each outcome as it comes.
+        Called with each outcome as soon as it is known.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What a study writes: the tables and figures of Kim et al. (2010), its values, and its report."""
+"""Outputs of a study: tables and figures of Kim et al. (2010), values, and report."""
 
 import json
 import re
@@ -45,8 +45,8 @@ Errors = Mapping[str, Mapping[str, SkinErrors]]
 def study_table(report: StudyReport) -> ErrorTable:
     """The errors of every case (rows) by every model and "no change" (columns), by region.
 
-    Cases that failed are absent; of a case of which a model failed, the other models are there, and
-    averages leave it out.
+    Cases that failed are absent. If one model of a case failed, the other models are listed, and
+    averages exclude the case.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def study_table(report: StudyReport) -> ErrorTable:
     patients = [outcome for outcome in report.outcomes if outcome.evaluation]
     if not patients:
         raise CaseInputError(
-            f"{report.cohort.name}: no case was compared with the face after its operation"
+            f"{report.cohort.name}: no case was compared with its post-operative face"
         )
     for outcome in patients:
         found = {**outcome.evaluation["models"], NO_CHANGE: outcome.evaluation["no_change"]}
@@ -99,8 +99,8 @@ def write_study_report(report: StudyReport) -> list[str]:
     case, region and model), `table3.md` (the paper's Table 3, with the paper's own means),
     `figure9.png` (box plots of the distances by model and patient), `figure10.png` (distances as
     colours on the faces; further patients in `figure10-2.png`, …), `study.json` and `report.html`.
-    Where no case was compared there are the last two alone; where pictures cannot be drawn, or
-    Jinja2 is missing, a warning states so and the rest is written.
+    If no case was compared, only the last two are written. If pictures cannot be drawn, or Jinja2
+    is missing, the rest is written with a warning.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def write_study_report(report: StudyReport) -> list[str]:
     Raises
     ------
     CaseError
-        (also `ValueError`) A case's folder is no longer what the study left.
+        (also `ValueError`) The folder of a case has changed since the study.
     OSError
         The folder cannot be written to.
 

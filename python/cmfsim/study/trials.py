@@ -1,4 +1,4 @@
-"""How much a prediction depends on where the skull landmarks were placed (Kim et al. 2010, 3.3)."""
+"""The dependence of a prediction on the placement of skull landmarks (Kim et al. 2010, 3.3)."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -67,7 +67,7 @@ class LandmarkTrial:
 
 @dataclass(frozen=True, eq=False)
 class SensitivityReport:
-    """What the error of landmarks does to muscles and face.
+    """The effect of landmark errors on muscles and face.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class SensitivityReport:
     moved: np.ndarray = field(repr=False)
 
     def muscle_deviation(self, part: str = "") -> float:
-        """Mean over trials and the muscles whose name holds `part`, mm."""
+        """Mean over trials and the muscles whose name contains `part`, mm."""
         found = [d for t in self.trials for name, d in t.muscle_deviation.items() if part in name]
         if not found:
             raise CaseInputError(f"no muscle's name contains {part!r}")
@@ -119,7 +119,7 @@ def landmark_trials(
     std : float, mm
         Along each axis.
     seed : int
-        Trial i of a seed is the same however many there are.
+        Trial i of a seed does not depend on their number.
 
     Yields
     ------
@@ -152,15 +152,15 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     findings: Iterable[Finding] = (),
     on_findings: OnFindings | None = None,
 ) -> SensitivityReport:
-    """What the error of skull landmarks does to muscles and predicted face.
+    """The effect of errors of skull landmarks on muscles and predicted face.
 
-    The patient is built once; each trial carries the muscles anew, samples them and solves.
+    The patient is built once; each trial maps the muscles again, samples them and solves.
 
     Parameters
     ----------
     case : Case, or path of its file or folder
     trials : int, or sequence of mapping of str to (3,) float64, mm
-        Number of trials that are drawn, or the landmarks of each, as an operator placed them again.
+        Number of trials to draw, or the landmarks of each trial, as an operator placed them again.
     std : float, mm
         Of drawn trials, along each axis.
     seed : int
@@ -181,7 +181,7 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     CaseError
         (also `ValueError`) A homogeneous model, no trial.
     LandmarkError
-        (also `ValueError`) A trial that the template cannot be carried to.
+        (also `ValueError`) A trial to which the template cannot be mapped.
 
     Examples
     --------

@@ -36,7 +36,9 @@ def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
         closest, _, _ = Surface(bone.vertices, bone.triangles).closest(places)
         depth = np.minimum(depth, np.linalg.norm(closest - places, axis=1))
     if len(depth) and not np.isfinite(depth).all():
-        raise MeshInputError("the depth of the soft tissue needs at least one bone: there is none")
+        raise MeshInputError(
+            "the depth of the soft tissue needs at least one bone, but there is none"
+        )
     capped: Floats = np.minimum(depth, MOST_DEPTH)
     return capped
 

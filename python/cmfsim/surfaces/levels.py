@@ -58,7 +58,7 @@ _DECIMATING = _OneAtATime()
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """How the surface of a level is made.
+    """Options of the surface of a level.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ def surface_of_level(
     values = level.single
     low, high = block_of(values > 0.0)
     if not (high > low).all():
-        raise CaseInputError(f"{name!r} has no voxel inside: its surface would be empty")
+        raise CaseInputError(f"{name!r} has no voxel inside, so its surface would be empty")
     measure = third_party("skimage.measure", "surfaces of levels are made", "imaging")
     # Only the block that holds the piece, with a border of outside, so that the surface closes.
     low = np.maximum(low - 1, 0)
@@ -142,11 +142,11 @@ def detailed_surface(name: str, level: ImageData) -> SurfaceData | None:
 
 
 def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> SurfaceData:
-    """The surface that mucosa slides on: that of the bone without relief finer than tets resolve.
+    """The surface on which mucosa slides: the bone without relief finer than the tets.
 
     Tissue does not reach between teeth, and a node that slides over crowns and gaps flips between
-    their sides. So the signed distance from the bone is blurred (Gaussian) before its surface is
-    taken. Nodes keep their own distance from it where `gap` is "rest".
+    their sides. The signed distance from the bone is therefore blurred (Gaussian) before its
+    surface is extracted. Nodes keep their own distance from it if `gap` is "rest".
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     inside = segment.level.values > 0.0
     first, past = block_of(inside)
     if not (past > first).all():
-        raise CaseInputError(f"{segment.name!r} has no voxel inside: its surface would be empty")
+        raise CaseInputError(f"{segment.name!r} has no voxel inside, so its surface would be empty")
     # A border that the blur cannot reach across, so that the surface closes within the block.
     rim = np.ceil(BLUR_REACH * sigma).astype(int) + 2
     low, high = first - rim, past + rim

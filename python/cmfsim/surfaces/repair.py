@@ -121,11 +121,13 @@ def repair_surface(
     check_extent(vertices)
     vertices, triangles, n_welded = _welded(vertices, triangles, options.weld_distance)
     if n_welded:
-        note("surface-welded", f"{n_welded} vertices became one with others", "they hid edges")
+        note(
+            "surface-welded", f"{n_welded} vertices were merged with others", "they concealed edges"
+        )
     triangles, n_flat, n_again = _without_flat(vertices, triangles)
     if n_flat or n_again:
         what = f"{n_flat} triangles without area and {n_again} repeated ones are removed"
-        note("surface-cleaned", what, "they have no normal, or count their volume twice")
+        note("surface-cleaned", what, "they have no normal, or their volume counts twice")
     if not len(triangles):
         raise CaseInputError(f"{name}: no triangle with an area is left")
 
@@ -168,8 +170,8 @@ def _cap_finding(name: str, length: float, centre: Floats, bulge: float) -> Find
         "cap",
         where=f"{name} at ({place})",
         why="only a closed surface has an inside and an outside"
-        + ("" if flat else "; this cap is far from flat, so its shape is invented"),
-        fix="look at the cap; if it is wrong, close the surface yourself",
+        + ("" if flat else "; this cap is far from flat, so its shape is only a guess"),
+        fix="check the cap; if it is wrong, close the surface yourself",
     )
 
 

@@ -34,15 +34,15 @@ class Anatomy(Frozen):
     Attributes
     ----------
     skin : ImageData
-        Inside the outer skin, bones and hollows included; float32. Its size is clipped, so it is a
-        distance nowhere but near zero, and there only up to a factor.
+        Inside the outer skin, including bones and hollows; float32. Its values are clipped, so it
+        is a distance only near zero, and there only up to a factor.
     bones : mapping of str to ImageData
         Each bone with the hollows that it encloses (cranial cavity, sinuses, marrow): "cranium" and
-        "mandible", or "skull" where they were not parted.
+        "mandible", or "skull" if they were not separated.
     air : ImageData or None
         Hollows inside the skin that no bone encloses: airway, nasal and oral cavity.
     teeth : ImageData or None
-        Teeth and what lies with them, where they could be told from bone.
+        Teeth and adjacent material, if they could be distinguished from bone.
     findings : tuple of Finding
     surfaces : mapping of str to SurfaceData
         The surfaces that levels were made from ("skin" and bones), where surfaces were given.
@@ -67,7 +67,7 @@ class Anatomy(Frozen):
                 and np.array_equal(level.spacing, self.skin.spacing)
             )
             if not same:
-                raise CaseInputError(f"{name} lies on another grid than the skin")
+                raise CaseInputError(f"{name} is not on the same grid as the skin")
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
         object.__setattr__(self, "surfaces", MappingProxyType(dict(self.surfaces)))
 

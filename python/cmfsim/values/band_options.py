@@ -1,4 +1,4 @@
-"""What a band around a prediction is asked for."""
+"""The options of a band around a prediction."""
 
 import math
 from collections.abc import Sequence
@@ -12,12 +12,12 @@ __all__ = ["BandOptions"]
 
 @dataclass(frozen=True)
 class BandOptions:
-    """What a band is asked for.
+    """The options of a band.
 
     Attributes
     ----------
     coverage : float
-        Share of cases that are to lie within it, region by region: above 0, below 1.
+        Share of cases that should lie within it, region by region: above 0, below 1.
     calibration : Calibration or None
         None makes an uncalibrated band.
     group : str or None
@@ -38,7 +38,7 @@ class BandOptions:
             )
 
     def check(self, models: Sequence[str]) -> None:
-        """Refuses a calibration that is not of the models, or not for the coverage.
+        """Refuses a calibration that is not for these models or this coverage.
 
         Parameters
         ----------
@@ -55,11 +55,11 @@ class BandOptions:
         for model in models:
             if found.model != model:
                 raise CalibrationError(
-                    f"the calibration is of model {found.model}, and the prediction of {model}: "
-                    f"predict with --model {found.model}, or calibrate with {model}"
+                    f"the calibration is for model {found.model}, but the prediction uses "
+                    f"{model}: predict with --model {found.model}, or calibrate with {model}"
                 )
         if found.coverage is not None and not math.isclose(found.coverage, self.coverage):
             raise CalibrationError(
-                f"the calibration is for a coverage of {found.coverage:g}, and {self.coverage:g} "
-                "is asked for"
+                f"the calibration is for a coverage of {found.coverage:g}, but {self.coverage:g} "
+                "was requested"
             )

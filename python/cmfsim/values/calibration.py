@@ -29,7 +29,7 @@ def settings_digest(settings: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class BandFactor:
-    """What the standard deviation is multiplied by in one region, and what that is worth.
+    """The factor on the standard deviation in one region, and its reliability.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class BandFactor:
     rank : int
         The factor is the score of this rank, 1 the smallest.
     coverage : float
-        Asked for: 0.9 for 90 %.
+        Requested coverage: 0.9 for 90 %.
     interval : (float, float)
         5 % and 95 % quantile of the coverage that a calibration of this size reaches in further
         cases like those that it was made of.
@@ -74,7 +74,7 @@ class CalibrationCase:
     scores : mapping of str to float
         By region of the face: the largest |error| over the standard deviation, 0 or more.
     group : str
-        Cases that may be calibrated by themselves: a procedure, a centre, "virtual".
+        Name of cases that can be calibrated separately: a procedure, a centre, "virtual".
 
     Raises
     ------
@@ -101,7 +101,7 @@ class CalibrationCase:
             if not (math.isfinite(value) and value >= 0.0):
                 raise CalibrationError(
                     f"score of {region!r} in case {self.case!r} is {value!r}: a finite number "
-                    "from 0 on is needed; leave out regions that were not compared"
+                    "from 0 on is needed; omit regions that were not compared"
                 )
         object.__setattr__(self, "scores", MappingProxyType(dict(self.scores)))
 
@@ -118,7 +118,7 @@ class Calibration:
         What predictions and their standard deviations depend on besides the case: `band_settings`.
     cases : tuple of CalibrationCase
     note : str
-        What the cases are, such as that they are virtual patients.
+        Description of the cases, such as that they are virtual patients.
     coverage : float or None
         The only coverage that the file may be used for; None for any.
 
@@ -138,7 +138,7 @@ class Calibration:
     def __post_init__(self) -> None:
         check_one_of("model", self.model, MODELS)
         if not self.cases:
-            raise CalibrationError("a calibration needs at least one case: it has none")
+            raise CalibrationError("a calibration needs at least one case, but it has none")
         seen: set[str] = set()
         for case in self.cases:
             if case.case in seen:

@@ -155,7 +155,7 @@ class CaseLandmarks:
 
 @dataclass(frozen=True)
 class CaseMesh:
-    """How the soft tissue is meshed, or where its tets come from.
+    """Options of the mesh of the soft tissue, or the source of its tets.
 
     Attributes
     ----------
@@ -190,7 +190,7 @@ class CaseLips:
         "auto": from the gap or crease that the skin shows, else from landmarks; "landmarks"; or the
         file of a surface between the lips, its normals towards the upper lip.
     depth : float, mm
-        How far the seam goes on past the teeth, between their rows.
+        How far the seam continues past the teeth, between their rows.
     height : float, mm
         How far from the seam the lips reach.
     """
@@ -267,7 +267,7 @@ class CaseOsteotomy:
 
 @dataclass(frozen=True, eq=False)
 class CaseMotion(Frozen):
-    """How one segment moves: a matrix, a transform file, or a surface before and after.
+    """The motion of one segment: a matrix, a transform file, or a surface before and after.
 
     Attributes
     ----------
@@ -313,20 +313,20 @@ class CaseMotion(Frozen):
         words = ["typed in RAS"] if self.frame == "RAS" else []
         turns = self.matrix is not None and not np.array_equal(self.matrix[:3, :3], np.eye(3))
         if turns and self.centre is None:
-            words.append("turned about the origin of the coordinates: no centre is given")
+            words.append("rotated about the origin of the coordinates, because no centre is given")
         return "; ".join(words)
 
 
 @dataclass(frozen=True)
 class CaseMuscles:
-    """Where the muscles come from, and how the material of the tets is sampled from them.
+    """The source of the muscles, and the options of sampling the material of the tets from them.
 
     Attributes
     ----------
     template : Path or str
         The folder of a template, or the name of one that comes with the package.
     smoothing : float
-        Of the thin-plate spline that carries the template to the patient; 0 meets every landmark.
+        Of the thin-plate spline that maps the template to the patient; 0 matches every landmark.
     preset : str
         Constants of fat and muscle.
     mixing : str
@@ -358,7 +358,7 @@ class CaseMuscles:
 
 @dataclass(frozen=True)
 class CasePostoperative:
-    """What is known after the operation.
+    """The post-operative data.
 
     Attributes
     ----------
@@ -391,9 +391,9 @@ class CasePostoperative:
 
     def __post_init__(self) -> None:
         if self.image is not None and (self.skin is not None or self.bones):
-            raise CaseInputError("after the operation there are surfaces or an image, not both")
+            raise CaseInputError("post-operative data are either surfaces or an image, not both")
         if self.image is None and self.skin is None and not self.bones:
-            raise CaseInputError("after the operation there is a skin, an image, or a bone")
+            raise CaseInputError("post-operative data need a skin, an image or a bone")
         check_one_of("units", self.units, tuple(UNITS))
         if self.frame is not None:
             check_one_of("frame", self.frame, FRAMES)

@@ -58,7 +58,7 @@ NUMBERED = re.compile(r"_\d+$")
 
 @dataclass(frozen=True, eq=False)
 class ClinicalMotion:
-    """How one segment moves, in a surgeon's numbers.
+    """The motion of one segment in clinical terms.
 
     Attributes
     ----------
@@ -68,13 +68,13 @@ class ClinicalMotion:
     pitch, yaw, roll : float, degrees
         Positive: front up, front to the left, left side up.
     point : (3,) float64, mm, LPS, or None
-        The point before the motion; None where a motion without a turn has the same numbers
+        The point before the motion; None if a motion without rotation has the same numbers
         everywhere.
     place : str
-        What lies there, such as "upper incisors (supradentale)".
+        Name of the point, such as "upper incisors (supradentale)".
     residual : float or None, mm
-        Of a motion given vertex by vertex: what the nearest rigid motion, which the numbers
-        describe, leaves of it (RMS over the vertices). None for a rigid motion.
+        For a motion given vertex by vertex: its deviation from the nearest rigid motion, which the
+        numbers describe (RMS over the vertices). None for a rigid motion.
     source : str
         Where the motion comes from and how it was understood; may be empty.
     """
@@ -156,7 +156,7 @@ def clinical_motion(
     centre: ArrayLike | None = None,
     source: str = "",
 ) -> ClinicalMotion:
-    """The motion of a segment in a surgeon's numbers, measured at its teeth where these are known.
+    """The motion of a segment in clinical terms, measured at its teeth if these are known.
 
     The point is that of the segment's landmark (maxilla and midface: supradentale; mandible and
     mandible_body: infradentale, else pogonion; chin: pogonion, else menton; rami: gonion); without
@@ -172,7 +172,7 @@ def clinical_motion(
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks.
     vertices : (v, 3) float64, mm, optional
-        Of the segment's surface, before the motion; those of a MovedSurface if left out.
+        Of the segment's surface, before the motion; default: those of a MovedSurface.
     centre : (3,) float64, mm, optional
         Of the turn, where neither landmark nor surface is known.
     source : str
@@ -207,7 +207,7 @@ def clinical_motion(
     wx, wy, wz = (turn.angle * turn.axis).tolist()
     point, place = _reference(segment, landmarks or {}, points)
     if point is None and centre is not None:
-        point, place = np.asarray(centre, dtype=np.float64), "centre of the turn"
+        point, place = np.asarray(centre, dtype=np.float64), "centre of rotation"
     if point is None and turn.angle > NOTHING:
         point, place = np.zeros(3), "origin of the coordinates (no landmark or surface is known)"
     at = np.zeros(3) if point is None else point
@@ -238,7 +238,7 @@ def planned_motion(
     shift: ArrayLike = (0.0, 0.0, 0.0),
     turn: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Floats:
-    """The rigid motion with a surgeon's numbers at a point: the inverse of `clinical_motion`.
+    """The rigid motion with given clinical numbers at a point: the inverse of `clinical_motion`.
 
     Parameters
     ----------

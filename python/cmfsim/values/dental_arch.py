@@ -25,7 +25,7 @@ SHEET_DEPTH = 2.5
 
 @dataclass(frozen=True, eq=False)
 class DentalArch(Frozen):
-    """Where the teeth of one jaw stand.
+    """The position of the teeth of one jaw.
 
     Attributes
     ----------
@@ -67,8 +67,8 @@ class DentalArch(Frozen):
             raise CaseInputError(
                 f"{self.jaw} arch: its front {tip.round(1).tolist()} and its molars "
                 f"{left.round(1).tolist()} and {right.round(1).tolist()} mm do not span an arch: "
-                f"the front must lie ahead of the molars, and these apart, by {LEAST_ARCH:g} mm at "
-                "least; are landmarks swapped?"
+                f"the front must be at least {LEAST_ARCH:g} mm in front of the molars, and the "
+                "molars at least as far apart; check whether landmarks are swapped"
             )
 
     @property

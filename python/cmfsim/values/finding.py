@@ -13,7 +13,7 @@ SEVERITIES = ("error", "warning", "note")
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Something that a person should know before trusting a case.
+    """A fact to know before you trust a case.
 
     `Finding.error`, `Finding.warning` and `Finding.note` make one.
 
@@ -28,7 +28,7 @@ class Finding:
     where : str
         File, table, place in mm.
     why : str
-        What it does to the result.
+        Its effect on the result.
     fix : str
         What to do.
 
@@ -56,26 +56,26 @@ class Finding:
     def error(
         cls, code: str, what: str, *, where: str = "", why: str = "", fix: str = ""
     ) -> "Finding":
-        """A finding with which the work cannot go on."""
+        """A finding that ends the work."""
         return cls(severity="error", code=code, what=what, where=where, why=why, fix=fix)
 
     @classmethod
     def warning(
         cls, code: str, what: str, *, where: str = "", why: str = "", fix: str = ""
     ) -> "Finding":
-        """A finding after which the result may be wrong."""
+        """A finding because of which the result may be wrong."""
         return cls(severity="warning", code=code, what=what, where=where, why=why, fix=fix)
 
     @classmethod
     def note(
         cls, code: str, what: str, *, where: str = "", why: str = "", fix: str = ""
     ) -> "Finding":
-        """A finding that is good to know."""
+        """A finding for information."""
         return cls(severity="note", code=code, what=what, where=where, why=why, fix=fix)
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> "Finding":
-        """The finding that a file holds as plain values; other names in it are passed over.
+        """The finding stored in a file as plain values; other names in it are ignored.
 
         Files of earlier builds have `mend` for `fix`.
         """

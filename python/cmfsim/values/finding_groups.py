@@ -15,9 +15,9 @@ TITLES: Mapping[str, str] = {
     "muscle-inside-out": "{n} muscle surfaces were inside out and were flipped",
     "muscle-missed": "{n} muscles contain no sample of the tissue and do not affect it",
     "muscle-open": "{n} muscle surfaces are not closed",
-    "muscle-sheet": "{n} muscles are sheets, whose outline hardly shows their fibre direction",
+    "muscle-sheet": "{n} muscles are sheets, whose outline hardly determines their fibre direction",
     "muscle-volume-changed": "{n} muscles changed in volume as they were moved into the tissue",
-    "landmark-far": "{n} landmarks lie far from their surface",
+    "landmark-far": "{n} landmarks are far from their surface",
     "surface-closed": "{n} surfaces were open and were closed",
     "surface-open": "{n} surfaces are open",
 }

@@ -22,10 +22,10 @@ class LipRegion(Frozen):
     Attributes
     ----------
     triangles : (t, 3) uint32
-        Skin and red of the lip, the face that it turns to the other lip, and the one towards the
-        teeth: mesh nodes, outward, one connected patch from corner to corner of the mouth.
+        Skin and vermilion of the lip, the face towards the other lip, and the face towards the
+        teeth: mesh nodes, outward, one connected patch from one corner of the mouth to the other.
     nodes : (n,) uint32
-        Free nodes of the triangles that the other lip has not, ascending.
+        Free nodes of the triangles that do not belong to the other lip, ascending.
     released : mapping of str to (k,) uint32
         Those of the nodes that lie on a segment and would slide on it, by segment: they may lift
         off.

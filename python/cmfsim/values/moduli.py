@@ -105,7 +105,7 @@ class FatModuli:
             return cls(**{name: array.item() for name, array in values.items()})
         raise MaterialInputError(
             f"fat is of kind {fat.kind!r}: the fat between muscles must be isotropic, with one "
-            "young (MPa) and one poisson, or that of a preset"
+            "young (MPa) and one poisson, or must be that of a preset"
         )
 
 
@@ -171,7 +171,7 @@ class MuscleModuli:
 
 @dataclass(frozen=True)
 class TissueModuli:
-    """What differs from a preset's constants: fat, all muscles, single muscles.
+    """Moduli that differ from a preset: of fat, all muscles, or single muscles.
 
     Attributes
     ----------
@@ -179,12 +179,12 @@ class TissueModuli:
     muscle : MuscleModuli
         Of every muscle.
     muscles : mapping of str to MuscleModuli
-        Of single muscles, by name such as "masseter_L"; before those of `muscle`.
+        Of single muscles, by name such as "masseter_L"; they take precedence over `muscle`.
 
     Notes
     -----
-    Under prescribed displacements a linear model depends on ratios of moduli alone: all of them
-    scaled by one factor change no displacement.
+    Under prescribed displacements, a linear model depends only on ratios of moduli: scaling all of
+    them by one factor changes no displacement.
 
     Examples
     --------
@@ -269,7 +269,7 @@ def _check_definite(name: str, moduli: MuscleModuli) -> None:
         Tissue.transversely_isotropic(*moduli.constants(), [1.0, 0.0, 0.0])
     except MaterialError as error:
         raise MaterialInputError(
-            f"moduli of {name} have no positive definite stiffness: {error}; take young_along and "
-            f"young_across within {YOUNG_RANGE[0]:g} to {YOUNG_RANGE[1]:g} MPa, closer to each "
+            f"moduli of {name} have no positive definite stiffness: {error}; choose young_along "
+            f"and young_across from {YOUNG_RANGE[0]:g} to {YOUNG_RANGE[1]:g} MPa, closer to each "
             "other, and poisson from 0 to 0.49"
         ) from error

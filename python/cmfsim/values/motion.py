@@ -14,7 +14,7 @@ __all__ = ["RigidMotion", "decompose_motion", "rigid_matrix", "rigid_motion"]
 
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
-    """A rigid motion in a planner's numbers: x ↦ R (x − centre) + centre + translation.
+    """A rigid motion as used in plans: x ↦ R (x − centre) + centre + translation.
 
     Attributes
     ----------
@@ -79,7 +79,9 @@ def rigid_motion(
     # The largest component first: a length below 1e-154 would underflow when squared.
     largest = float(np.abs(k).max())
     if largest == 0.0:
-        raise BoundaryInputError("axis is (0, 0, 0): give the direction of the axis, any length")
+        raise BoundaryInputError(
+            "axis is (0, 0, 0): give the direction of the axis; any length above 0 is allowed"
+        )
     k = k / largest
     k = k / math.sqrt(float(k @ k))
     sine, cosine = _sine_cosine(theta)
@@ -102,10 +104,10 @@ def decompose_motion(matrix: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> 
     Parameters
     ----------
     matrix : (4, 4) float64, mm
-        A rotation with a translation; no scale, shear or mirror. What `rigid_matrix` makes of it is
+        A rotation with a translation; no scale, shear or mirror. The result of `rigid_matrix` is
         decomposed.
     centre : (3,) float64, mm
-        The point about which the turn is meant. It decides the translation, not the angle.
+        The centre of the rotation. It affects the translation, not the angle.
 
     Returns
     -------

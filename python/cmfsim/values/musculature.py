@@ -36,15 +36,15 @@ class MuscleSurface(Frozen):
     side : str
         "L", "R" (the patient's) or "both".
     surface : SurfaceData
-        Closed, with outward normals, as well as the atlas has it.
+        Closed, with outward normals, as far as the atlas allows.
     kind : str
         "strap", "fan", "ring" or "sheet".
     boxes : int or None
-        Number of oriented boxes that its fibre directions are taken from, 1 to 64; None lets the
-        shape decide.
+        Number of oriented boxes from which its fibre directions are computed, 1 to 64; None: from
+        the shape.
     course : tuple of (n, 3) float64, mm
-        Fibre lines from origin to insertion, where the template's author knows them; they come
-        before boxes.
+        Fibre lines from origin to insertion, if the template's author knows them; they take
+        precedence over boxes.
 
     Raises
     ------
@@ -105,7 +105,7 @@ class Musculature:
     muscles : tuple of MuscleSurface
         Names differ.
     findings : tuple of Finding
-        What was noticed while they were made: folds, residuals, open surfaces.
+        Findings of their creation: folds, residuals, open surfaces.
 
     Raises
     ------

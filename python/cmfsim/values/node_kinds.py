@@ -20,7 +20,7 @@ NODE_KINDS = ("free", "fixed", "joined", "sliding")
 
 @dataclass(frozen=True, eq=False)
 class NodeKinds(Frozen):
-    """What each node of a mesh does (paper 2.5, Figure 4).
+    """The kind of each node of a mesh (paper 2.5, Figure 4).
 
     Attributes
     ----------

@@ -31,7 +31,7 @@ __all__ = ["PatientModel"]
 
 @dataclass(frozen=True, eq=False)
 class PatientModel(Frozen):
-    """A patient's soft tissue with everything that holds and moves it.
+    """A patient's soft tissue with everything that constrains and moves it.
 
     Attributes
     ----------
@@ -44,12 +44,12 @@ class PatientModel(Frozen):
     skin_triangles : (s, 3) uint32
         Those of them that are the patient's skin.
     segments : tuple of BoneSegment
-        All pieces of bone, those that stay included.
+        All pieces of bone, including those that do not move.
     anatomy : Anatomy
     fat : TissueData
         The tissue of a homogeneous model; `scene.tissue` where there are no muscles.
     muscles : Musculature or None
-        In the patient's place; None where the case has none.
+        In the patient's frame; None if the case has none.
     fraction : (m,) float64 or None
         Share of muscle in each tet.
     fibre : (m, 3) float64 or None
@@ -57,8 +57,8 @@ class PatientModel(Frozen):
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull" and "skin", where given or found (`landmarks_are_found`).
     lifted : LiftedTissue or None
-        What is lifted off the cranium above a Le Fort I cut: `scene.fixed` has of it what the plan
-        presses against the bone.
+        Nodes lifted off the cranium above a Le Fort I cut; `scene.fixed` includes those that the
+        plan presses against the bone.
     lips : mapping of str to LipRegion
         "upper" and "lower", where the mesh was separated between them.
     findings : tuple of Finding
@@ -66,7 +66,7 @@ class PatientModel(Frozen):
     summary : mapping
         Counts, quality, timings, versions, hashes of the inputs: plain values, ready for JSON.
     detailed_skin : callable or None
-        Makes the skin of `face` where no surface of it was given.
+        Makes the skin of `face` if no surface of it was given.
     """
 
     name: str
@@ -144,8 +144,8 @@ class PatientModel(Frozen):
     def face(self) -> SurfaceData | None:
         """The skin of the whole head in full detail, as it was given or as the image shows it.
 
-        Tets are larger than what one sees of lips and lids. None where scikit-image is missing.
-        What an image shows is made when it is first asked for: solving does not need it.
+        Tets are larger than visible details of lips and lids. None if scikit-image is missing. The
+        skin of an image is extracted on first use, because solving does not need it.
         """
         given = self.anatomy.surfaces.get("skin")
         if given is not None or self.detailed_skin is None:

@@ -1,4 +1,4 @@
-"""What a model predicts for a patient: the value that evaluation and report are made from."""
+"""The prediction of a model for a patient, on which evaluation and report are based."""
 
 from __future__ import annotations
 
@@ -82,12 +82,12 @@ class Prediction(Frozen):
         What was solved.
     result : SceneResult
     summary : mapping
-        Counts, timings, versions, hashes, and what was left out because the scene did not need it:
-        plain values, ready for JSON.
+        Counts, timings, versions, hashes, and the stages that were skipped because the scene did
+        not need them: plain values, ready for JSON.
     predicted_by : callable, optional
-        What predicts a patient's face by a model, as this prediction was made.
+        The function that made this prediction from a patient and a model.
     band : SkinBand or None
-        How far to trust the skin, where that was asked for (`predict_with_band`).
+        How far to trust the skin, if requested (`predict_with_band`).
     """
 
     model: str
@@ -157,7 +157,7 @@ class Prediction(Frozen):
         ------
         CaseError
             (also `ValueError`) A segment that the patient does not have; a prediction that was put
-            together by hand, of which nothing says how it was made.
+            together by hand and does not record how it was made.
         BoundaryError, ContactError, SolverError
             As `solve_scene`.
 
@@ -175,7 +175,7 @@ class Prediction(Frozen):
 
     @property
     def face_before(self) -> SurfaceData:
-        """The patient's face in full detail, as given or segmented; else as the mesh has it."""
+        """The patient's face in full detail, as given or segmented; otherwise as in the mesh."""
         return self.patient.face or self.skin_before
 
     @cached_property
@@ -189,8 +189,8 @@ class Prediction(Frozen):
     def bones(self) -> dict[str, tuple[SurfaceData, Floats]]:
         """Each bone segment with its vertices after the operation, (v, 3) mm, by name.
 
-        A segment whose motion is known vertex by vertex has the surface that it is known on; one
-        whose joined nodes alone have motions stays where it was.
+        A segment whose motion is known vertex by vertex has the surface on which it is known; a
+        segment of which only the joined nodes have motions stays where it was.
         """
         found = {}
         for segment in self.patient.segments:
@@ -211,6 +211,6 @@ class Prediction(Frozen):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What every stage noticed, the solution included."""
+        """The findings of every stage, including the solution."""
         solved = self.result.summary.get("findings", ())
         return (*self.patient.findings, *(Finding.from_values(entry) for entry in solved))

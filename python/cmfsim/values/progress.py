@@ -8,5 +8,5 @@ Progress = Callable[[str], None]
 
 
 def no_progress(stage: str) -> None:
-    """Reports nothing: what stages call where nobody asked for their progress."""
+    """Reports nothing: the default that stages call if no progress is requested."""
     del stage

@@ -1,4 +1,4 @@
-"""What is left of a mesh or surface once triangles or tets are dropped: nodes numbered again."""
+"""Meshes and surfaces after triangles or tets are dropped: the remaining nodes are renumbered."""
 
 from typing import Any
 

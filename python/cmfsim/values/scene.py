@@ -61,7 +61,7 @@ class SegmentData(Frozen):
         Contact surface (teeth, mucosa) at rest; it moves with the segment.
     gap : (s,) float64, mm, or float, or "rest"
         Distance that each sliding node keeps from the surface, negative behind it; "rest" keeps its
-        place over the surface: the offset from it in the undeformed tissue, carried by the segment.
+        offset from the surface in the undeformed tissue, carried by the segment.
 
     Examples
     --------
@@ -248,7 +248,7 @@ class Scene(Frozen):
         for name, segment in self.segments.items():
             if name not in plan:
                 raise CaseInputError(
-                    f"plan lacks segment {name!r}: give the identity matrix if it stays"
+                    f"plan lacks segment {name!r}: give the identity matrix if it does not move"
                 )
             motion = plan[name]
             if isinstance(motion, MovedSurface):
@@ -277,7 +277,7 @@ class Scene(Frozen):
         return len(self.tets)
 
     def header(self) -> dict[str, Any]:
-        """Names, kinds and options of the scene: what of it is not an array, ready for JSON."""
+        """Names, kinds and options of the scene: everything except arrays, ready for JSON."""
         segments = []
         for name, segment in self.segments.items():
             entry: dict[str, Any] = {"name": name}
@@ -362,7 +362,7 @@ class Scene(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class SceneResult(Frozen):
-    """The answer to a scene, with what is needed to draw it and to trace it back.
+    """The solution of a scene, with the data needed to draw it and to trace its origin.
 
     Attributes
     ----------

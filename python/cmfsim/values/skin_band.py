@@ -1,4 +1,4 @@
-"""How far to trust a predicted skin: a band around it, calibrated or not."""
+"""A band around a predicted skin, calibrated or not, which shows how far to trust it."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class SkinBand(Frozen):
     factors : mapping of str to BandFactor
         By region; empty without a calibration.
     plain_factor : float
-        What `sd` is multiplied by without a calibration: that of a normal distribution, at one
-        point. Nothing shows that it holds the share that was asked for.
+        The factor on `sd` without a calibration: that of a normal distribution, at one point. It is
+        not verified that it gives the requested coverage.
     settings : mapping of str to plain values
         What the band depends on besides the case: `band_settings`.
     about : mapping of str to plain values
@@ -56,7 +56,7 @@ class SkinBand(Frozen):
 
     @property
     def calibrated(self) -> bool:
-        """Whether the half width is one that cases with a known outcome support."""
+        """Whether the half width is supported by cases with a known outcome."""
         return bool(self.factors)
 
     @property
@@ -68,9 +68,9 @@ class SkinBand(Frozen):
     def half_width(self) -> Any:
         """Half the width of the band at each vertex, (k,) numpy masked array, mm.
 
-        A vertex has the factor of its region, of the face where it lies in none, and is masked
-        outside of the face: there no calibration case says anything. Without a calibration it is
-        the same multiple of `sd` everywhere.
+        A vertex has the factor of its region, or that of the face if it is in no region. Outside
+        the face it is masked, because no calibration case has data there. Without a calibration,
+        the half width is the same multiple of `sd` everywhere.
         """
         if not self.calibrated:
             return np.ma.array(self.plain_factor * self.sd, mask=np.zeros(len(self.sd), dtype=bool))

@@ -17,7 +17,7 @@ CONTACTS = ("bilateral", "unilateral")
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """How a scene is solved; the defaults are those of `MassTensors` and `StaticSolver`.
+    """Options of solving a scene; the defaults are those of `MassTensors` and `StaticSolver`.
 
     Attributes
     ----------
@@ -29,8 +29,8 @@ class SolverOptions:
         Estimated error of the iterative methods, over the length of the motion.
     max_iterations : int or None
     contact_tolerance : float, mm
-        Largest distance of a held node from its contact surface; a tenth of it is the way that the
-        force along the surface may still move any node by itself.
+        Largest distance of a node in contact from its contact surface; the force along the surface
+        may still move any single node by at most a tenth of it.
     contact_iterations : int
         Newton steps of the contact solver.
     memory_limit : float or None, MB
@@ -79,7 +79,7 @@ class SolverOptions:
     def header(self) -> dict[str, Any]:
         """The options as a scene file holds them: element and kinematics where unusual.
 
-        So a scene that asks for neither has the content, and the hash, that it has always had.
+        A scene with neither therefore keeps its content and its hash.
         """
         usual = {"element": "p1", "kinematics": "linear"}
         return {k: v for k, v in self.as_dict().items() if usual.get(k) != v}

@@ -65,7 +65,7 @@ class MovedSurface(Frozen):
     ----------
     surface : SurfaceData
     moved_vertices : (v, 3) float64, mm
-        Where each vertex of `surface` goes.
+        Position of each vertex of `surface` after the motion.
 
     Examples
     --------

@@ -27,7 +27,7 @@ def is_template_name(name: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TemplateData(Frozen):
-    """What a template holds, with its names checked.
+    """The contents of a template, with its names checked.
 
     `MuscleTemplate` is what works with it, and describes the attributes.
     """
@@ -57,13 +57,13 @@ class TemplateData(Frozen):
         for muscle in muscles:
             if not is_template_name(muscle.name):
                 raise CaseInputError(
-                    f"muscle name is {muscle.name!r}: letters, digits, '_', '-' and '+', "
-                    "64 at most, for it becomes a file name"
+                    f"muscle name is {muscle.name!r}: letters, digits, '_', '-' and '+', 64 at "
+                    "most, because it becomes a file name"
                 )
             other = taken.setdefault(muscle.name.lower(), muscle.name)
             if other != muscle.name:
                 raise CaseInputError(
-                    f"muscles {other!r} and {muscle.name!r} differ in capitals alone, which some "
+                    f"muscles {other!r} and {muscle.name!r} differ only in capitals, which some "
                     "file systems do not distinguish"
                 )
         object.__setattr__(self, "muscles", muscles)

@@ -41,7 +41,7 @@ MIXINGS = ("moduli", "stiffness")
 
 @dataclass(frozen=True, eq=False)
 class TissueData(Frozen):
-    """What the tets are made of, as the arrays that `cmfsim.Tissue` takes.
+    """The material of the tets, as the arrays that `cmfsim.Tissue` takes.
 
     Every array holds one value per tet, or a single one for all tets.
 

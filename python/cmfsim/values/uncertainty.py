@@ -1,7 +1,7 @@
-"""What a prediction is uncertain about: each source with its prior, and where that comes from.
+"""The sources of uncertainty of a prediction, each with its prior and its origin.
 
 A prior is a standard deviation. Moduli have it on their logarithm, since they are positive and
-spread over orders of magnitude; the rest is linear. "assumed" says that no publication was found
+spread over orders of magnitude; the rest is linear. "assumed" means that no publication was found
 that gives the figure.
 """
 
@@ -80,16 +80,16 @@ ADDED = (
 # What no derivative gives, and what stands for it.
 NOT_COVERED = (
     (
-        "bilateral or unilateral contact, and the extent of the sliding region: discrete choices; "
-        "predict again with the other one to see its effect"
+        "bilateral or unilateral contact, and the extent of the sliding region: these are "
+        "discrete choices; predict again with the other one to see its effect"
     ),
     (
-        "errors of single landmarks: cmfsim sensitivity draws them; the muscle fraction and "
-        "direction stand for them here"
+        "errors of single landmarks: cmfsim sensitivity draws them; here, the muscle fraction "
+        "and direction represent them"
     ),
     (
-        "segmentation threshold of bone, contact of the lips, and how the form of the model errs "
-        "more in one place than in another: only a calibration shows their effect"
+        "segmentation threshold of bone, contact of the lips, and errors of the model's form "
+        "that are larger in one place than in another: only a calibration shows their effect"
     ),
 )
 

@@ -1,4 +1,4 @@
-"""Where a person's true muscles lie in a mesh, and how their fibres run there."""
+"""A person's true muscles in a mesh, and their fibres."""
 
 from collections.abc import Mapping
 from dataclasses import replace

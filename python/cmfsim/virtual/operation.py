@@ -44,7 +44,7 @@ REACH, SPACING, ROOM = 12.0, 1.5, 8.0
 
 @dataclass(frozen=True, eq=False)
 class Operation:
-    """How the bones act on the tissue.
+    """The action of the bones on the tissue.
 
     Attributes
     ----------

@@ -68,7 +68,7 @@ def virtual_patients(
     spacing: float = 2.0,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """The case files of virtual patients, each in a folder of its own with the truth.
+    """The case files of virtual patients, each in its own folder with the truth.
 
     Patients who exist already with the same settings are kept. `cohort.toml` in the folder lists
     the complete ones, for `cmfsim study`.

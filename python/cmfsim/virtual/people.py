@@ -235,5 +235,7 @@ def patient_named(number: int) -> VirtualPatient:
         (also `ValueError`) A number other than 1 to 6.
     """
     if number not in PATIENTS:
-        raise CaseInputError(f"patient is {number!r}: {', '.join(map(str, PATIENTS))} are there")
+        raise CaseInputError(
+            f"patient is {number!r}: {', '.join(map(str, PATIENTS))} are available"
+        )
     return PATIENTS[number]

@@ -176,7 +176,7 @@ def _plan(
 
 
 def _departures(draws: _Draws, plan: Mapping[str, Relocation]) -> dict[str, Relocation]:
-    """How the operation departs from the plan.
+    """The deviation of the operation from the plan.
 
     If both jaws are operated, they depart together, since a splint holds them in occlusion.
     """

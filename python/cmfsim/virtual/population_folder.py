@@ -43,7 +43,7 @@ GRID, SKIN_SPACING = 0.25, 0.375
 
 @dataclass(frozen=True)
 class PatientOutcome:
-    """What became of a patient, and how many of the population are done.
+    """The outcome of a patient, and the number of finished patients.
 
     Attributes
     ----------
@@ -110,9 +110,10 @@ def virtual_population(
     spacing : float, mm
         Of the CTs.
     workers : int
-        Patients at a time, each in a process of its own with one thread.
+        Patients at a time, each in its own process with one thread.
     scheduler : str, optional
-        Address of a Dask cluster that sees the same folder; it then decides how many at a time.
+        Address of a Dask cluster with access to the same folder; it then decides how many run at a
+        time.
     progress : callable, optional
         Called with the outcome of each patient.
 
@@ -124,8 +125,8 @@ def virtual_population(
     Raises
     ------
     CaseError
-        (also `ValueError`) A count, seed, number of workers or length that cannot be; a folder that
-        holds a population of another seed or resolution; a worker that died.
+        (also `ValueError`) An invalid count, seed, number of workers or length; a folder that
+        contains a population of another seed or resolution; a worker that died.
     OSError
         The folder cannot be written to.
 

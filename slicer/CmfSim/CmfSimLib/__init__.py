@@ -1,1 +1,1 @@
-"""What the module does, without Slicer: nothing here imports slicer, qt or ctk."""
+"""The work of the module, without Slicer: nothing here imports slicer, qt or ctk."""

@@ -41,7 +41,7 @@ class Segment:
 
 @dataclass
 class Choice:
-    """What was chosen in the module: a CT, or a skin with bones; landmarks; how to solve."""
+    """The choice in the module: a CT, or a skin with bones; landmarks; how to solve."""
 
     volume: Path | None = None
     skin: Path | None = None
@@ -53,19 +53,21 @@ class Choice:
 
 
 class ChoiceError(ValueError):
-    """What is missing, as a sentence for the person in front of the module."""
+    """What is missing, as a sentence for the user of the module."""
 
 
 def check(choice):
-    """Raises ChoiceError for a choice that makes no case."""
+    """Raises ChoiceError for a choice that does not define a case."""
     names = [segment.name for segment in choice.segments]
     for name in names:
         if not name or not all(c.isalnum() or c in "_-+" for c in name):
-            raise ChoiceError(f"{name!r} is no name of a bone: letters, digits, '_', '-' and '+'.")
+            raise ChoiceError(
+                f"{name!r} is not a valid bone name: use letters, digits, '_', '-' and '+'."
+            )
         if names.count(name) > 1:
-            raise ChoiceError(f"Two bones are called {name}: each needs a name of its own.")
+            raise ChoiceError(f"Two bones are called {name}: each needs its own name.")
     if choice.model not in MODELS:
-        raise ChoiceError(f"The model is one of {', '.join(MODELS)}.")
+        raise ChoiceError(f"The model must be one of {', '.join(MODELS)}.")
     if choice.volume is not None:
         unknown = [name for name in names if name not in BONES]
         if unknown:
@@ -78,7 +80,7 @@ def check(choice):
     elif not any(segment.file for segment in choice.segments):
         raise ChoiceError("Choose at least one model of a bone, such as the cranium.")
     if not any(is_moved(segment) for segment in choice.segments):
-        raise ChoiceError("No segment moves: apply a linear transform to one, as the plan.")
+        raise ChoiceError("No segment moves: apply a linear transform to at least one.")
     if choice.model.startswith("M") and choice.skull_landmarks is None:
         raise ChoiceError(
             "Muscles are placed from skull landmarks: choose a point list, or model H or H+S."
@@ -86,7 +88,7 @@ def check(choice):
 
 
 def is_moved(segment):
-    """Whether a segment's transform is none of identity."""
+    """Whether a segment's transform is not the identity."""
     matrix = segment.matrix_ras
     if matrix is None:
         return False
@@ -138,7 +140,7 @@ def write_case(folder, choice):
 
 
 def face_of(bundle, folder):
-    """The path of the predicted face, taken out of a bundle that cmfsim wrote."""
+    """The path of the predicted face, extracted from a bundle that cmfsim wrote."""
     target = Path(folder) / PurePosixPath(FACE).name
     with zipfile.ZipFile(bundle) as archive:
         names = [name for name in archive.namelist() if name.endswith(FACE)]

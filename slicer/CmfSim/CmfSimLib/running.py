@@ -1,4 +1,4 @@
-"""cmfsim in a process of its own: its words, its progress, and its end."""
+"""cmfsim in a separate process: its arguments, its progress, and its end."""
 
 import json
 import subprocess
@@ -27,14 +27,14 @@ PREFIX = "cmfsim: "
 
 @dataclass
 class Line:
-    """A line that cmfsim printed: what it does, and how far it is (0 to 1) where that is known."""
+    """A line that cmfsim printed: the stage, and the progress (0 to 1) if it is known."""
 
     text: str
     share: float | None = None
 
 
 def command(case, model, *, python=None):
-    """The words that predict a case and write a bundle for Slicer."""
+    """The arguments that predict a case and write a bundle for Slicer."""
     return [
         python or sys.executable,
         "-m",
@@ -50,21 +50,21 @@ def command(case, model, *, python=None):
 
 
 def words_of(answer):
-    """What went wrong, in words, from what a failed prediction printed."""
+    """The error in words, from the output of a failed prediction."""
     errors = [f for f in answer.get("findings", []) if f["severity"] == "error"]
     found = [f"{finding['what']}. {finding['fix']}" for finding in errors]
     return "\n".join(found) or answer.get("error", {}).get("text", "stopped")
 
 
 def progress_of(line):
-    """What a line of cmfsim says."""
+    """The meaning of a line printed by cmfsim."""
     text = line.strip().removeprefix(PREFIX)
     share = next((part for start, part in STAGES if text.startswith(start)), None)
     return Line(text, share)
 
 
 class Run:
-    """A running prediction, asked from a timer: `poll` never waits."""
+    """A running prediction, polled by a timer: `poll` never waits."""
 
     def __init__(self, words):
         # Both streams go to files: a pipe that nobody reads would stop the process.
@@ -76,7 +76,7 @@ class Run:
         )
 
     def poll(self):
-        """The lines that are new."""
+        """The new lines."""
         self._err.seek(self._read)
         data = self._err.read()
         whole = data.rpartition(b"\n")[0]
@@ -89,19 +89,19 @@ class Run:
         return self._process.poll()
 
     def stop(self):
-        """Ends the process; what it wrote before stays as it was."""
+        """Ends the process; earlier results stay unchanged."""
         if self._process.poll() is None:
             self._process.terminate()
             self._process.wait(timeout=30)
 
     def close(self):
-        """Ends the process if it runs, and gives back what it holds."""
+        """Ends the process if it runs, and releases its resources."""
         self.stop()
         self._out.close()
         self._err.close()
 
     def answer(self):
-        """What the process printed as JSON; its error in words where it failed."""
+        """The JSON output of the process; its error in words if it failed."""
         self._out.seek(0)
         lines = self._out.read().decode("utf-8", "replace").strip().splitlines()
         try:

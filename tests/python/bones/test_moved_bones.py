@@ -159,7 +159,7 @@ SPOILT = {
         (lambda v, t: (v[:-1], t[(t < len(v) - 1).all(axis=1)]), "314 triangles after"),
         (lambda v, t: (v, t[::-1]), "numbers them differently"),
     ],
-    "moved-scrambled": [(shuffled, "the edges of mandible point in other directions")],
+    "moved-scrambled": [(shuffled, "the edges of mandible have other directions")],
     "moved-scaled": [
         (lambda v, t: (v / 1000.0, t), "0.001 times as large"),
         (lambda v, t: (v * 1.1, t), "1.1 times as large"),
@@ -169,7 +169,7 @@ SPOILT = {
     "moved-still": [(None, "mandible moves by 0 mm at most")],
     "plan-far": [
         (lambda v, t: (v + [0.0, 80.0, 0.0], t), "register the post-operative scan"),
-        (lambda v, t: (v * [-1.0, -1.0, 1.0], t), "one file is in LPS, the other in RAS"),
+        (lambda v, t: (v * [-1.0, -1.0, 1.0], t), "one file is in LPS and the other in RAS"),
     ],
     "plan-through-skin": [
         (lambda v, t: (v - [0.0, 40.0, 0.0], t), "moved through the undeformed skin")
@@ -360,7 +360,7 @@ def test_a_trimmed_bone_of_a_case_is_reported_and_its_tissue_follows_the_bone(tm
 @pytest.mark.parametrize(
     ("ratio", "severity", "words"),
     [
-        (0.955, "warning", "0.955 times as large after as before"),
+        (0.955, "warning", "0.955 times as large after the operation as before"),
         (1.1, "warning", "not close to the ratio of any two units"),
         (10.0, "error", "mm read as cm"),
         (25.4, "error", "mm read as inch"),

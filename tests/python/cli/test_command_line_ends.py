@@ -185,7 +185,7 @@ def test_missing_packages_are_one_line_before_any_work(command, case, monkeypatc
     monkeypatch.setattr("cmfsim.cli.study_commands.checked", stop)
     with pytest.raises(KeyboardInterrupt):
         main_without_handlers(command, case)
-    assert "done without: pyvista" in capsys.readouterr().err
+    assert "skipped: pyvista" in capsys.readouterr().err
 
 
 def stop(*_, **__):
@@ -224,7 +224,7 @@ def test_numbers_in_mm_that_are_called_metres_are_said_to_be_mm(tmp_path):
     path = write_head(tmp_path, 'units = "mm"', 'units = "m"')
     found = [f for f in cmfsim.diagnose(path) if f.code == "surface-units"]
     assert len(found) == 1
-    assert "look like mm, and are read as m" in found[0].what
+    assert "look like mm but are read as m" in found[0].what
     assert 'units = "mm"' in found[0].fix
     assert "um" not in found[0].what.split()
 

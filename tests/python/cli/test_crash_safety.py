@@ -238,7 +238,7 @@ def test_a_disk_that_is_read_only_is_said_before_the_work(small_disk, case, caps
         for words in ([], ["--no-doctor"]):
             assert main([name, str(case), *words, "-o", str(small_disk / "out")]) == 1
             err = capsys.readouterr().err
-            assert f"{small_disk}: the output cannot be written there" in err
+            assert f"{small_disk}: the output folder is not writable" in err
             assert "checking the case" not in err
             assert "reading" not in err
 

@@ -128,7 +128,7 @@ def test_wishes_that_are_none_are_refused_before_any_work(case, tmp_path, capsys
     strange = tmp_path / "face.txt"
     strange.write_text("nothing", encoding="utf-8")
     for words, said in (
-        ([str(strange)], "a wished face ends in"),
+        ([str(strange)], "a file with a desired face ends in"),
         ([str(tmp_path / "absent.stl")], "absent.stl"),
     ):
         assert main(["plan", str(case), "--towards", *words, *MODEL]) == 2

@@ -189,7 +189,7 @@ def test_mappings_are_matched_by_name_and_the_result_ignores_their_order():
         ({"method": "nearest"}, cmfsim.CaseError, "use one of landmarks, closest"),
         ({"method": "landmarks"}, cmfsim.LandmarkError, "there are none"),
         ({"mask": [True]}, cmfsim.CaseError, r"mask has shape \(1,\)"),
-        ({"mask": []}, cmfsim.CaseError, "mask holds no vertex"),
+        ({"mask": []}, cmfsim.CaseError, "mask contains no vertex"),
         ({"mask": [10_000]}, cmfsim.CaseError, r"mask\[0\] is 10000"),
         ({"mask": "face"}, cmfsim.LandmarkError, "give all landmarks"),
         ({"regions": {"nose": [9999]}}, cmfsim.CaseError, r"region 'nose'\[0\] is 9999"),
@@ -429,7 +429,7 @@ def test_regions_follow_the_head_and_mirror_with_it():
     ("change", "pattern"),
     [
         (lambda m: m.pop("nasion"), "lack nasion"),
-        (lambda m: m.update(alare_L=m["alare_R"], alare_R=m["alare_L"]), "exchange their names"),
+        (lambda m: m.update(alare_L=m["alare_R"], alare_R=m["alare_L"]), "swap their names"),
         (lambda m: m.update(nasion=m["pogonion"] - [0, 0, 5]), "nasion lies below"),
         (lambda m: m.update(pronasale=m["pronasale"] + [0, 90, 0]), "behind the eyes"),
         (lambda m: m.update(nasion=[1, 2]), r"landmark nasion has shape \(2,\)"),
@@ -519,7 +519,7 @@ def test_one_change_of_thickness_is_recovered_among_outliers():
 
 
 def test_a_face_in_another_frame_is_no_change_of_thickness():
-    with pytest.raises(cmfsim.CaseError, match="swelling does not explain that"):
+    with pytest.raises(cmfsim.CaseError, match="swelling does not explain this"):
         cmfsim.fitted_thickness(np.full(30, -9.0), np.full(30, 6.0))
     with pytest.raises(cmfsim.CaseError, match="2 signed distances and 1 depths"):
         cmfsim.fitted_thickness([1.0, 2.0], [1.0])

@@ -159,7 +159,7 @@ def test_an_image_may_stand_in_place_of_surfaces(tmp_path):
         ("rescale = [0, -1024]", "slope must be above 0"),
         ("rescale = [1, 1e9]", "intercept within"),
         ("metal_threshold = 5000", "metal_threshold"),
-        ("metal_threshold = 200\nbone_threshold = 250", "must be below"),
+        ("metal_threshold = 200\nbone_threshold = 250", "the former must be smaller"),
     ],
 )
 def test_what_an_image_s_table_cannot_mean_is_refused(tmp_path, line, words):

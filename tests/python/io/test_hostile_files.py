@@ -123,7 +123,10 @@ def test_members_that_nobody_asks_for_are_not_unpacked(scene):
 def test_a_scene_takes_no_array_that_is_none_of_its_own(name, scene):
     """`loads` with one letter changed would be no loads at all."""
     path = rewritten(scene, {f"{name}.npy": packed(np.zeros(3))})
-    refused(lambda: cmfsim.read_scene(path), f"has the array '{name}', which is none of this scen")
+    refused(
+        lambda: cmfsim.read_scene(path),
+        f"has the array '{name}', which does not belong to this scen",
+    )
 
 
 @pytest.mark.parametrize(
@@ -328,7 +331,10 @@ def test_no_reader_waits_for_a_pipe(scene, tmp_path):
 
 def test_no_reader_fails_on_a_strange_name(scene, tmp_path):
     for suffix, read in readers(scene).items():
-        refused(lambda read=read, suffix=suffix: read("a\0b" + suffix), "no file has that name")
+        refused(
+            lambda read=read, suffix=suffix: read("a\0b" + suffix),
+            "which no file name can have|not a valid file name",
+        )
         refused(lambda read=read, suffix=suffix: read("a" * 999 + suffix), "cannot be opened")
         (tmp_path / f"folder{suffix}").mkdir()
         refused(lambda r=read, s=suffix: r(tmp_path / f"folder{s}"), "is a folder")

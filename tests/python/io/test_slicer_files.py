@@ -158,7 +158,7 @@ LINEAR = '<LinearTransform id="t1" name="A" matrixTransformToParent="{}"/>'
             LINEAR.format("nan 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1"),
             "cannot be used as a rigid motion",
         ),
-        ('<BSplineTransform id="t1" name="A"></BSplineTransform>', "is it linear"),
+        ('<BSplineTransform id="t1" name="A"></BSplineTransform>', "check that it is linear"),
         (
             '<LinearTransform id="t1" name="A" references="storage:s2;"/>'
             + storage("gone.h5", 2, "Transform"),
@@ -195,7 +195,7 @@ EMPTY = f"{HEAD}<MRML></MRML>"
         ({"a/Data/x.stl": "x"}, "0 scenes"),
         ({"a/s.mrml": EMPTY, "a/S.MRML": EMPTY}, "twice"),
         ({"a": "x", "a/s.mrml": EMPTY}, "as a file and as a folder"),
-        ({"b/" + 300 * "x": "x", "a/s.mrml": EMPTY}, "not unpacked"),
+        ({"b/" + 300 * "x": "x", "a/s.mrml": EMPTY}, "nothing is unpacked"),
         ({"a/s.mrml": EMPTY, "a/zeros": bytes(600 * 2**20)}, "unpacks to"),
     ],
 )

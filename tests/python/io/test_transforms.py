@@ -255,7 +255,7 @@ ROWS = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
             HEAD + 2 * "Transform: VersorTransform_double_3_3\nParameters: 0 0 0\n",
             "line 5: the file holds 2 transforms",
         ),
-        ("a.tfm", HEAD + "Parameters: 0 0 0\n", "line 3: Parameters stands before"),
+        ("a.tfm", HEAD + "Parameters: 0 0 0\n", "line 3: Parameters comes before"),
         (
             "a.tfm",
             HEAD + "Transform: VersorTransform_double_3_3\nParameters: 1 1 0\n",
@@ -304,7 +304,7 @@ def test_binary_and_absent_files_and_wrong_frames_are_named(tmp_path):
         cmfsim.read_transform(tmp_path / "c.tfm", direction="to-parent", frame="RAS")
     with pytest.raises(cmfsim.CaseError, match="always LPS"):
         cmfsim.write_transform(tmp_path / "c.tfm", np.eye(4), direction="to-parent", frame="RAS")
-    with pytest.raises(cmfsim.CaseError, match='state direction = "from-parent" for 3D Slicer'):
+    with pytest.raises(cmfsim.CaseError, match='give direction = "from-parent" for 3D Slicer'):
         cmfsim.write_transform(tmp_path / "c.tfm", np.eye(4))
     with pytest.raises(cmfsim.CaseError, match="frame is 'LAS'"):
         cmfsim.read_transform(tmp_path / "c.tfm", frame="LAS")

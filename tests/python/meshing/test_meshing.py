@@ -86,7 +86,7 @@ def test_two_bodies_stay_two_and_both_are_there():
     assert made.report.dropped_parts == 1
     assert 250.0 < made.report.dropped_volume < 600.0
     assert [f.code for f in made.findings] == ["mesh-specks-dropped"]
-    assert "left out      1 parts" in made.report.as_text()
+    assert "removed       1 parts" in made.report.as_text()
 
 
 def test_a_sheet_thinner_than_the_edge_is_kept_by_refinement():
@@ -374,13 +374,13 @@ def test_bone_outside_the_skin_is_a_finding_with_its_place():
 def test_wrong_units_frames_and_sides_are_named():
     skin, bones = head()
     huge = cmfsim.SurfaceData(np.asarray(skin.vertices) * 1000.0, skin.triangles)
-    with pytest.raises(cmfsim.MeshError, match="are the surfaces in mm"):
+    with pytest.raises(cmfsim.MeshError, match="check that the surfaces are in mm"):
         cmfsim.anatomy_from_surfaces(huge, bones)
     tiny = cmfsim.SurfaceData(np.asarray(skin.vertices) / 1000.0, skin.triangles)
     with pytest.raises(cmfsim.MeshError):
         cmfsim.anatomy_from_surfaces(tiny, bones)
     inward = cmfsim.SurfaceData(skin.vertices, np.asarray(skin.triangles)[:, ::-1])
-    with pytest.raises(cmfsim.MeshError, match="skin encloses nothing"):
+    with pytest.raises(cmfsim.MeshError, match="skin encloses no volume"):
         cmfsim.anatomy_from_surfaces(inward, bones, spacing=4.0)
     jaw = bones["mandible"]
     far = cmfsim.SurfaceData(np.asarray(jaw.vertices) * [-1, -1, 1], jaw.triangles[:, ::-1])

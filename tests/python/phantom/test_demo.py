@@ -31,7 +31,7 @@ def folder(tmp_path_factory):
 
 def test_the_demo_reports_every_model(folder):
     page = (folder / "out/report.html").read_text(encoding="utf-8")
-    assert "No patient: a synthetic head" in page
+    assert "Not a patient, but a synthetic head" in page
     for model in ("H", "M", "M+S"):
         summary = json.loads((folder / "out" / model / "prediction.json").read_text("utf-8"))
         assert summary["model"] == model
@@ -157,14 +157,14 @@ def test_view_says_what_it_cannot_show(folder, tmp_path, capsys, monkeypatch):
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     for what, said in [
         (tmp_path / "none", "no such file"),
-        (tmp_path, "nothing of cmfsim"),
+        (tmp_path, "nothing to display"),
         (tmp_path / "a.txt", r"\.stl"),
         (tmp_path / "other.npz", "neither a scene nor a result"),
     ]:
         assert main(["view", str(what)]) == 2
         assert re.search(said, capsys.readouterr().err), what
     assert main(["view", str(folder), "--model", "H+S"]) == 2
-    assert "holds models H, M, M+S" in capsys.readouterr().err
+    assert "contains the models H, M, M+S" in capsys.readouterr().err
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     if os.name == "posix" and os.uname().sysname == "Linux":

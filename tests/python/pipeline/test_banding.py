@@ -115,9 +115,9 @@ def test_a_calibrated_band_has_the_factor_of_its_region(patient, plain, tmp_path
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
-        ({"model": "M"}, {}, "is of model M, and the prediction of M\\+S"),
+        ({"model": "M"}, {}, "is for model M, but the prediction uses M\\+S"),
         ({"settings": {"contact": "unilateral"}}, {}, "contact is 'unilateral' there"),
-        ({"coverage": 0.8}, {}, "is for a coverage of 0.8, and 0.9 is asked for"),
+        ({"coverage": 0.8}, {}, "is for a coverage of 0.8, but 0.9 was requested"),
         ({}, {"coverage": 0.97}, "at least 33 calibration cases, and there are 19"),
         ({}, {"group": "g7"}, "has no group 'g7'; it has: 'g0', 'g1'"),
         ({}, {"group": "g1", "coverage": 0.95}, "region face: .* at least 19"),
@@ -158,7 +158,7 @@ def test_the_command_line_refuses_a_band_before_any_work(made, plain, tmp_path, 
     assert "coverage is 90" in capsys.readouterr().err
     cmfsim.write_calibration(path, calibration_for(plain))
     assert main(["predict", case, "--calibration", str(path), "--model", "H", "-q"]) == 2
-    assert "calibration is of model M+S" in capsys.readouterr().err
+    assert "calibration is for model M+S" in capsys.readouterr().err
     assert not made.case.output.exists()
 
 
@@ -173,8 +173,8 @@ def test_the_command_line_states_a_band_and_what_it_is_worth(
     command = ["predict", str(made.case.file), "-o", str(output), "--no-report", "--no-doctor"]
     assert main([*command, "--calibration", str(path), "-q"]) == 0
     text = capsys.readouterr().out
-    assert "90 % by region, calibrated by calibration.json (made up)" in text
-    assert "n = 19, holds 77 to 98 % of further cases" in text
+    assert "90 % by region, calibrated with calibration.json (made up)" in text
+    assert "n = 19, covers 77 to 98 % of further cases" in text
     assert read_prediction(output)["band"]["state"] == "calibrated"
     assert main([*command, "--band", "--json", "-q"]) == 0
     answer = json.loads(capsys.readouterr().out)

@@ -498,7 +498,7 @@ def test_an_output_that_cannot_be_is_found_before_the_work(ellipsoids, monkeypat
     monkeypatch.setattr("cmfsim.io.folders.tempfile.mkdtemp", refuse)
     code, _, err = run(*words, ellipsoids.parent / "closed")
     assert code == 1
-    assert "cannot be written there" in err
+    assert "the output folder is not writable" in err
 
 
 def test_a_folder_in_the_place_of_a_file_is_named(ready, ellipsoids, before):

@@ -164,7 +164,7 @@ def test_an_unstated_frame_is_read_off_what_states_its_own(head):
     init_case(head)
     case = cmfsim.Case.load(head)
     assert case.surfaces.frame == "RAS"
-    assert "read as RAS they lie where" in text_of(head)
+    assert "read as RAS they are where" in text_of(head)
     skin = cmfsim.read_surface(case.surfaces.skin, frame=case.surfaces.frame)
     assert np.asarray(skin.vertices)[:, 1].mean() == pytest.approx(-100.0, abs=1.0)
 

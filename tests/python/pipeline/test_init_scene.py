@@ -95,7 +95,7 @@ def test_a_registration_above_a_segment_is_a_question(tmp_path):
     named = transform("Registration 1", shift(0, 4, 1))
     write_scene(tmp_path, *HEAD, named, model("Mandible", "mandible.ply", "Registration 1"))
     init_case(tmp_path)
-    assert "sounds like a registration" in refusal(tmp_path)
+    assert "looks like the name of a registration" in refusal(tmp_path)
     assert "4.0 mm forwards" in refusal(tmp_path)
 
 

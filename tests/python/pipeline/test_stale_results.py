@@ -114,7 +114,7 @@ def test_the_errors_of_the_old_plan_go_with_a_new_prediction(tmp_path, capsys):
     assert not names & {"metrics.json", "metrics.csv", "errors.png", "error-H.png"}
     page = (out / "report.html").read_text("utf-8")
     assert "mean error of the face" not in page
-    assert "after the operation, mm" not in page
+    assert "post-operative face, mm" not in page
 
 
 def test_a_comparison_of_the_same_plan_stays(tmp_path, prediction, evaluation):

@@ -145,7 +145,10 @@ def test_the_command_corrects_the_page_and_states_it(folder, planning, capsys):
     assert f"by {len(correction.plans)} other plans: {correction.before.max():.2f} mm" in text
     usual = np.percentile(correction.left_out, 90)
     left_out = correction.left_out.max()
-    assert f"{left_out:.2f} mm where each was left out (nine of ten: {usual:.2f}" in text
+    assert (
+        f"{left_out:.2f} mm when each is predicted from the others (nine of ten: {usual:.2f}"
+        in text
+    )
 
 
 def test_corrections_are_the_same_each_time(bare, planning):
@@ -347,7 +350,7 @@ def test_a_skin_too_fine_for_a_page_is_refused_and_a_fine_face_simplified(
     away = float(re.search(r"at most ([0-9.]+) mm away", text)[1])
     assert away < 2.0
     monkeypatch.setattr(fine, "MOST_NODES", 1000)
-    with pytest.raises(cmfsim.CaseError, match="give a larger edge_length"):
+    with pytest.raises(cmfsim.CaseError, match="use a larger edge_length"):
         cmfsim.page_content(planning, reference, errors)
 
 
@@ -615,7 +618,7 @@ def test_the_error_is_stated_and_warned_of_beyond_what_was_tried(opened, errors,
     ) in state.inner_text()
     type_number(opened, "forwards", -28)
     until(opened, "document.querySelector('#error-state.warning')")
-    assert "farther than any plan that was tried" in state.inner_text()
+    assert "farther than any plan that was tested" in state.inner_text()
 
 
 def test_teeth_that_pass_through_each_other_are_warned_of(opened, planning):

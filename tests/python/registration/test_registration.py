@@ -478,11 +478,11 @@ def test_leave_one_out_refuses_what_it_cannot_judge():
     source, target = random_landmarks(6)
     with pytest.raises(cmfsim.LandmarkError, match="5 are needed"):
         cmfsim.leave_one_out(source[:4], target[:4])
-    with pytest.raises(cmfsim.LandmarkError, match="give one to each"):
+    with pytest.raises(cmfsim.LandmarkError, match="give each landmark its own name"):
         cmfsim.leave_one_out(source, target, ["a"] * 6)
     flat = source.copy()
     flat[1:, 2] = 1500.0
-    with pytest.raises(cmfsim.LandmarkError, match="without 0 the other 5 landmarks lie in one"):
+    with pytest.raises(cmfsim.LandmarkError, match="without 0 the other 5 landmarks are in one"):
         cmfsim.leave_one_out(flat, target)
 
 

@@ -177,7 +177,7 @@ def test_table_3_rounds_the_same_figures_and_averages_patients_alike(folder, row
         mean = np.mean([float(whole[p, model]["mean_mm"]) for p in ("P1", "P2")])
         assert cell == f"{mean:.2f}"
     assert "**in silico**" in ours
-    assert "Failed, and in no figure of this table: gone." in ours
+    assert "Failed, and not included in any figure of this table: gone." in ours
     # A name is a name: its asterisks are no markup.
     assert "two \\*heads\\*" in ours
     for model in MODELS:
@@ -188,7 +188,7 @@ def test_table_3_rounds_the_same_figures_and_averages_patients_alike(folder, row
 def test_distances_measured_in_two_ways_are_not_passed_off_as_one(folder):
     """A patient without landmarks has smaller distances, to closest points."""
     text = (folder / "study" / "table3.md").read_text(encoding="utf-8")
-    assert "Measured from the point that a spline through the skin's landmarks leads to" in text
+    assert "Measured from the corresponding point given by a spline" in text
     assert "two ways" not in text
     first, second, gone = cmfsim.run_study(cmfsim.Cohort.load(folder), workers=1).outcomes
     other = json.loads(json.dumps(second.evaluation))
@@ -196,10 +196,10 @@ def test_distances_measured_in_two_ways_are_not_passed_off_as_one(folder):
     mixed = replace(second, evaluation=other)
     report = cmfsim.StudyReport(cmfsim.Cohort.load(folder), (first, mixed, gone), 1.0)
     told = table3_text(report.as_dict(), cmfsim.study_table(report))
-    assert "**Measured in two ways, so that averages mix them.**" in told
+    assert "**Distances were measured in two ways, so averages mix both.**" in told
     assert "P2: from the closest point" in told
     page = render_page(study_document(report.as_dict()))
-    assert "Measured in two ways" in page
+    assert "measured in two ways" in page
 
 
 def test_figures_show_every_patient_and_model(folder):
@@ -274,7 +274,7 @@ def test_a_study_in_which_all_failed_has_no_table(folder, tmp_path):
     )
     cohort = replace(cohort, file=tmp_path / "cohort.toml")
     report = cmfsim.run_study(cohort, workers=1)
-    with pytest.raises(cmfsim.CaseError, match="no case was compared with the face after"):
+    with pytest.raises(cmfsim.CaseError, match="no case was compared with its post-operative"):
         cmfsim.study_table(report)
     assert cmfsim.write_study_report(report) == ["study.json", "report.html"]
 

@@ -207,7 +207,7 @@ def test_a_sign_a_frame_and_a_forgotten_centre_are_seen_in_the_words(tmp_path):
     forwards = np.sin(np.radians(1)) * z + (1 - np.cos(np.radians(1))) * y
     assert words_of_it.startswith(f"{forwards:.1f} mm forwards")
     assert forwards > 25
-    assert source == "turned about the origin of the coordinates: no centre is given"
+    assert source == "rotated about the origin of the coordinates, because no centre is given"
 
 
 def test_a_plan_without_a_frame_beside_surfaces_in_ras_is_said(tmp_path):

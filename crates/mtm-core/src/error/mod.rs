@@ -138,7 +138,7 @@ pub enum MtmError {
     },
     /// A node belongs to no tet.
     #[error(
-        "node {node} belongs to no tet ({count} such nodes): drop unused nodes before building the mesh"
+        "node {node} belongs to no tet ({count} such nodes): remove unused nodes before building the mesh"
     )]
     UnusedNode {
         /// The first such node.
@@ -234,7 +234,7 @@ pub enum MtmError {
     },
     /// Part of the body can move without deforming.
     #[error(
-        "{what} is not held: {modes} ({nodes} nodes, for example node {node}); fix or join at least three of its nodes that are not in line, or remove it"
+        "{what} is not constrained: {modes} ({nodes} nodes, for example node {node}); fix or join at least three of its nodes that are not in line, or remove it"
     )]
     Unconstrained {
         /// The part of the body, in words.
@@ -289,7 +289,7 @@ pub enum MtmError {
         advice: &'static str,
     },
     /// The computation does not fit in memory.
-    #[error("{what} needs about {needed_mb} MB, {}: {advice}", .limit_mb.map_or("which the system does not give".into(), |mb| format!("and {mb} MB are allowed")))]
+    #[error("{what} needs about {needed_mb} MB, {}: {advice}", .limit_mb.map_or("which the system refuses".into(), |mb| format!("but {mb} MB are allowed")))]
     OutOfMemory {
         /// The step.
         what: &'static str,
@@ -302,14 +302,14 @@ pub enum MtmError {
     },
     /// A forked process could not start any threads.
     #[error(
-        "no threads could be started ({reason}): allow this process more, or set RAYON_NUM_THREADS to fewer"
+        "no threads could be started ({reason}): allow this process more threads, or set RAYON_NUM_THREADS to fewer"
     )]
     NoThreads {
         /// The error reported by the system.
         reason: String,
     },
     /// Fewer points than a registration needs.
-    #[error("{what} needs {needed} {shape} at least, and there are {found}")]
+    #[error("{what} needs at least {needed} {shape}, but there are {found}")]
     TooFewPoints {
         /// What needs them.
         what: &'static str,
@@ -336,7 +336,7 @@ pub enum MtmError {
     },
     /// The points of a registration do not span the space that it needs.
     #[error(
-        "{what} lie in one {shape}: {thickness:.3e} mm across for an extent of {size:.3e} mm, where more than {limit:.0e} of it is needed; add a point away from it"
+        "{what} lie in one {shape}: {thickness:.3e} mm across for an extent of {size:.3e} mm, of which more than {limit:.0e} is needed; add a point away from it"
     )]
     FlatPoints {
         /// The points.
@@ -370,7 +370,7 @@ pub enum MtmError {
     },
     /// Iterative closest points were still moving at the last step.
     #[error(
-        "icp did not converge: in step {iterations} the points still moved by {motion:.3e} mm where {tolerance:.3e} mm counts as rest, rms distance {:.4e} mm after {:.4e} mm at first; begin nearer (initial), leave out pairs that have no partner (trim, max_distance), or allow more steps", .history.last().copied().unwrap_or(f64::NAN), .history.first().copied().unwrap_or(f64::NAN)
+        "icp did not converge: in step {iterations} the points still moved by {motion:.3e} mm ({tolerance:.3e} mm or less is needed), rms distance {:.4e} mm after {:.4e} mm at first; start closer (initial), exclude points without a partner (trim, max_distance), or allow more steps", .history.last().copied().unwrap_or(f64::NAN), .history.first().copied().unwrap_or(f64::NAN)
     )]
     IcpNotConverged {
         /// Steps done.

@@ -17,9 +17,9 @@ impl std::fmt::Display for Shortfall {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { quantity, value, limit, unit } = self;
         if value.is_finite() {
-            write!(f, "{quantity} is {value:.3e}{unit} where {limit:.3e}{unit} was asked for")
+            write!(f, "{quantity} is {value:.3e}{unit}, but {limit:.3e}{unit} was requested")
         } else {
-            write!(f, "{quantity} could not be computed, and {limit:.3e}{unit} was asked for")
+            write!(f, "{quantity} could not be computed ({limit:.3e}{unit} was requested)")
         }
     }
 }

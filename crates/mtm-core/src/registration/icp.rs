@@ -252,7 +252,7 @@ impl Pairs {
                 what: "the motion of the moving points",
                 reason: format!(
                     "{kept} of {} pairs are left by trimming, distance, angle and border; allow more of \
-                     them, or begin nearer (initial)",
+                     them, or start closer (initial)",
                     moving.len()
                 ),
             });

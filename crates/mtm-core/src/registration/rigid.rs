@@ -120,7 +120,7 @@ pub(crate) fn fit_pairs(
     if spread == 0.0 {
         return Err(MtmError::NotDetermined {
             what: "the rotation between the two sets",
-            reason: "all points of one set lie at one place; are all pairs with the same point?"
+            reason: "all points of one set coincide; check whether all pairs share a point"
                 .to_owned(),
         });
     }

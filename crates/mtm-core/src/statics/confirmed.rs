@@ -114,7 +114,7 @@ fn not_confirmed(trial: &Trial, options: &PcgOptions, relative: f64) -> MtmError
         method: "pcg",
         iterations: trial.iterations,
         shortfall: Shortfall {
-            quantity: "the error with which a known solution came back",
+            quantity: "the error in recovering a known solution",
             value: trial.error,
             limit: options.slack / TRIAL_SAFETY * relative,
             unit: " of the displacements",

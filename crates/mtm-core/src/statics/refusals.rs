@@ -17,7 +17,7 @@ impl StaticSolver {
             return Err(MtmError::UnknownName {
                 what: kinematics,
                 found: self.kinematics().name().into(),
-                known: "linear (no linear map gives the others; use solve)",
+                known: "linear (the others are no linear map; use solve)",
                 kind: ErrorKind::Solver,
             });
         }
@@ -25,7 +25,7 @@ impl StaticSolver {
             return Err(MtmError::UnknownName {
                 what: boundary,
                 found: "touching pairs".into(),
-                known: "one without (what touches changes with the plan; use solve)",
+                known: "one without (contacts change with the plan; use solve)",
                 kind: ErrorKind::Solver,
             });
         }

@@ -41,7 +41,8 @@ def lip_regions(
         Boundary of the separated mesh, outward.
     kinds : NodeKinds
         Before nodes of the lips are released. Joined and fixed nodes may be corners of a lip's
-        triangles, as at the edges of teeth, which would else cut it in two, but are no nodes of it.
+        triangles, as at the edges of teeth, which would otherwise cut it in two, but are not nodes
+        of it.
     seam : SurfaceData
         Open, with normals towards the upper lip; from in front of the skin to behind the teeth.
     height : float, mm

@@ -1,4 +1,4 @@
-"""Where the lips meet: the sheet along which the tissue of a closed mouth is separated."""
+"""The seam between the lips: the sheet along which the tissue of a closed mouth is separated."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -37,13 +37,13 @@ class LipSeam:
     ----------
     surface : SurfaceData or None
         An open sheet from corner to corner of the mouth, from in front of the skin to a little past
-        the teeth; its normals look towards the upper lip. None where nothing shows where it is.
+        the teeth; its normals point towards the upper lip. None if it could not be located.
     source : str
         "gap" (the image shows the lips apart), "crease" (of the skin), "landmarks", "file", or
         "none".
     summary : mapping
-        What build.json states: source, width of the mouth, thickness of the lips, height of the gap
-        between them, and distances of the skin landmarks from the seam; mm.
+        The values for build.json: source, width of the mouth, thickness of the lips, height of the
+        gap between them, and distances of the skin landmarks from the seam; mm.
     findings : tuple of Finding
     """
 
@@ -100,7 +100,7 @@ def lip_seam(
     as_number("depth of the lip seam", depth)
     marks = _lip_marks(landmarks or {})
     if not {"upper", "lower"} <= set(arches):
-        return _not_found("neither landmarks nor teeth show where the dental arches are")
+        return _not_found("neither landmarks nor teeth locate the dental arches")
     frame = mouth_frame(arches)
     profiles = skin_profiles(anatomy, frame)
     shown = crease_line(profiles, frame) if way == "auto" else None
@@ -112,7 +112,7 @@ def lip_seam(
         lacks = (
             f"skin landmarks {', '.join(missing)} are missing"
             if missing
-            else "the order of the lip landmarks does not fit a mouth"
+            else "the order of the lip landmarks is not that of a mouth"
         )
         return _not_found(" and ".join(filter(None, (shows, lacks))))
     sheet = lip_sheet(anatomy, frame, profiles, line, depth)
@@ -205,7 +205,7 @@ def _far(distances: Mapping[str, float]) -> list[Finding]:
             f"skin landmark {name} lies {away:.1f} mm from the seam between the lips that the skin "
             f"shows ({TRUSTED:g} mm at most are expected)",
             where="lips",
-            why="one of the two is wrong, and the mouth may be cut in the wrong place",
+            why="one of the two is wrong, so the mouth may be cut in the wrong place",
             fix="check the landmark, and the seam in node_kinds.png; give seam in [lips]",
         )
         for name, away in distances.items()
@@ -244,7 +244,7 @@ def _told(source: str, way: str) -> list[Finding]:
             "the skin shows no gap or crease between the lips: the seam was placed from the skin "
             "landmarks of the mouth",
             where="lips",
-            why="it is accurate only to some millimetres",
+            why="its position is accurate only to some millimetres",
             fix="check it in node_kinds.png, or give seam in [lips]",
         )
     ]
@@ -255,7 +255,7 @@ def _not_found(why: str) -> LipSeam:
         "lip-seam-not-found",
         f"the lips were not separated: {why}",
         where="lips",
-        why="the upper and lower lip stay joined, and pull on each other where the jaws move apart",
+        why="the upper and lower lip stay joined, and pull on each other when the jaws move apart",
         fix="place the skin landmarks cheilion_L, cheilion_R, labiale_superius and "
         "labiale_inferius and the skull landmarks of both arches, or give a surface between the "
         "lips as seam in [lips]",

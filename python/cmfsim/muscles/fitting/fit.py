@@ -324,12 +324,12 @@ def _findings(done: Mapping[str, FittedMuscle]) -> Iterator[Finding]:
     furthest = max(done, key=lambda name: done[name].largest_move)
     yield Finding.note(
         "muscles-fitted",
-        f"muscles were moved into the tissue: {before:.0%} of their volume lay in bone, in air or "
-        f"outside the skin, now {after:.0%}; {furthest} moved most, by up to "
-        f"{done[furthest].largest_move:.1f} mm",
+        f"muscles were moved into the tissue: {before:.0%} of their volume was in bone, in air "
+        f"or outside the skin, now {after:.0%}; the muscle that moved most is {furthest}, by up "
+        f"to {done[furthest].largest_move:.1f} mm",
         where="muscles",
-        why="landmarks lie on the skull, so they do not show how thick the tissue is",
-        fix="nothing; fit = false in [muscles] keeps them where landmarks put them",
+        why="landmarks are on the skull, so they do not show how thick the tissue is",
+        fix="nothing to do; fit = false in [muscles] keeps muscles where the landmarks place them",
     )
     for name, muscle in done.items():
         if muscle.outside_after > STILL_OUTSIDE:
@@ -339,7 +339,7 @@ def _findings(done: Mapping[str, FittedMuscle]) -> Iterator[Finding]:
                 f"{muscle.outside_before:.0%} before it was moved",
                 where=name,
                 why="the tissue is thinner there than the muscle; that part has no tets",
-                fix="look at it; landmarks near it may be misplaced",
+                fix="check this muscle; landmarks near it may be misplaced",
             )
         if abs(muscle.volume_change) > VOLUME_CHANGE:
             yield Finding.note(
@@ -348,5 +348,5 @@ def _findings(done: Mapping[str, FittedMuscle]) -> Iterator[Finding]:
                 "the tissue",
                 where=name,
                 why="the tissue is thinner there than the muscle, or thicker",
-                fix="look at it; landmarks near it may be misplaced",
+                fix="check this muscle; landmarks near it may be misplaced",
             )

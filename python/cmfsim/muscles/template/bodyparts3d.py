@@ -1,7 +1,7 @@
 """A muscle template from BodyParts3D, release 3.0: a real head's muscles, bones and teeth.
 
 BodyParts3D (Mitsuhashi et al. 2009) is licensed under CC BY-SA 2.1 JP. Its files are not part of
-this package; `WHERE` says where a user downloads them.
+this package; `WHERE` states where to download them.
 """
 
 import hashlib
@@ -57,8 +57,8 @@ _EXCHANGED_NAMES = Finding.note(
     "the parts called superficial lie behind and inside those called deep: the atlas seems to have "
     "exchanged them",
     where="masseter_superficial, masseter_deep (FMA49001 to FMA49005)",
-    why="only the names are affected: each keeps its own place and direction",
-    fix="keep it in mind where a name is read as anatomy",
+    why="only the names are affected: each part keeps its position and direction",
+    fix="remember this when you interpret the names anatomically",
 )
 
 
@@ -86,11 +86,11 @@ def import_bodyparts3d(
     verify: bool = True,
     progress: Progress | None = None,
 ) -> MuscleTemplate:
-    """The template that the OBJ files of BodyParts3D 3.0 make: 65 muscles, bones and teeth.
+    """The template from the OBJ files of BodyParts3D 3.0: 65 muscles, bones and teeth.
 
-    Vertices in the same place are made one, debris is dropped, gaps are closed, and a muscle that
-    has lost a part on one side is mirrored from the other; each is a finding. Nothing is
-    downloaded: get the files from the repository that `WHERE` in this file names.
+    Coincident vertices are merged, debris is dropped, gaps are closed, and a muscle that lacks a
+    part on one side is mirrored from the other; each repair is a finding. Nothing is downloaded:
+    get the files from the repository that `WHERE` in this file names.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def import_bodyparts3d(
     verify : bool
         Whether files must have the known SHA-256 hashes; otherwise differences are warnings.
     progress : callable, optional
-        Is told what is read.
+        Called with the name of each file that is read.
 
     Returns
     -------
@@ -188,8 +188,10 @@ def _verified(folder: Path, *, must_be_known: bool) -> list[Finding]:
     what = f"{len(other)} of {len(HASHES)} files do not have the known SHA-256 hashes: {named}"
     fix = f"download them again from {WHERE}"
     if must_be_known:
-        raise CaseInputError(f"{folder.name}: {what}; {fix}, or import with verification off")
-    why = "another release has other coordinates, and files may have been damaged"
+        raise CaseInputError(
+            f"{folder.name}: {what}; {fix}, or import without verification (--any-files)"
+        )
+    why = "other releases have different coordinates, and files may have been damaged"
     return [Finding.warning("bodyparts3d-other-file", what, where=folder.name, why=why, fix=fix)]
 
 
@@ -210,7 +212,7 @@ def _part(folder: Path, concept: str) -> _Part:
                 where=concept,
                 why="generalised winding numbers bridge small gaps; the edge of the muscle is "
                 "blurred",
-                fix="look at the muscle; repair it by hand if it matters",
+                fix="check the muscle; repair it by hand if it is important",
             ),
         )
     return _Part(concept, raw, surface, repaired.volume, is_sound, findings)
@@ -237,7 +239,7 @@ def _both_sides(
         f"mirrored from the {sides[0]} one ({good.concept}: {good.volume:.0f} mm³)",
         where=f"{pair.name}_{'R' if left_is_better else 'L'}",
         why="part of it is missing from its file",
-        fix="look at the muscle; nothing to do",
+        fix="nothing to do; check the muscle",
     )
     surfaces = (good.surface, mirrored) if left_is_better else (mirrored, good.surface)
     return surfaces, [finding]

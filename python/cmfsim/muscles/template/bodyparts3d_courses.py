@@ -1,4 +1,4 @@
-"""How the fibres of the atlas's flat muscles run, where their outline does not tell it.
+"""Fibre lines of the atlas's flat muscles, whose outline does not determine them.
 
 Origins and insertions are those of anatomy textbooks: temporalis converges on the coronoid process,
 buccinator runs forwards to the corner of the mouth, platysma up from the clavicle to the jaw,

@@ -1,4 +1,4 @@
-"""What is wrong with a muscle template: files, surfaces, sides, landmarks, each with its fix."""
+"""Problems of a muscle template: files, surfaces, sides, landmarks, each with its fix."""
 
 import os
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ MOST_NAMES = 6
 
 
 def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Finding, ...]:
-    """Everything that is wrong with a template, each with its place, reason and fix.
+    """All problems of a template, each with its place, reason and fix.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Fin
     Returns
     -------
     tuple of Finding
-        Errors keep it from being used; warnings make its muscles doubtful.
+        Errors prevent its use; warnings make its muscles doubtful.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Fin
 
 
 def check_contents(template: TemplateData) -> tuple[Finding, ...]:
-    """What is wrong with the contents of a template, after what was noticed while it was read."""
+    """Problems of the contents of a template, after the findings of its reading."""
     skull = _searchable(template.skull)
     return (
         *template.findings,
@@ -129,7 +129,7 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             f"{len(missing)} of the {len(SKULL_LANDMARKS)} usual landmarks are missing: "
             f"{_listed(missing)}",
             where=template.name,
-            why="near them the muscles follow landmarks that lie further away",
+            why="near them, muscles follow landmarks that are further away",
             fix="place them on the skull reference",
         )
     undefined = [name for name in extra if name not in template.definitions]
@@ -137,11 +137,11 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
         yield Finding(
             severity="warning" if undefined else "note",
             code="template-landmarks-extra",
-            what=f"{len(extra)} landmarks have names of this template's own: {_listed(extra)}"
+            what=f"{len(extra)} landmarks have names defined by this template: {_listed(extra)}"
             + (f"; without a definition: {_listed(undefined)}" if undefined else ""),
             where=template.name,
-            why="only patients with landmarks of the same names can use them",
-            fix="describe where they lie under [landmarks.definitions], or use the usual names",
+            why="they can be used only for patients with landmarks of the same names",
+            fix="describe their positions under [landmarks.definitions], or use the usual names",
         )
     points = np.array(list(template.landmarks.values()))
     pairs = _coincident(points)
@@ -150,12 +150,12 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             "template-landmarks-coincide",
             f"{names[one]} and {names[other]} lie in the same place",
             where=template.name,
-            why="no map can take one place to two",
+            why="no map can send one point to two places",
             fix="place one of them again",
         )
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) < 4 or spread[-1] <= PLANE_SHARE * spread[0]:
-        found = f"there are {len(points)}" if len(points) < 4 else "all lie in one plane"
+        found = f"there are {len(points)}" if len(points) < 4 else "all are in one plane"
         yield Finding.error(
             "template-landmarks-flat",
             f"four landmarks that do not lie in a plane are needed: {found}",
@@ -179,7 +179,7 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
         everything = len(swapped) == len(pairs)
         yield Finding.error(
             "template-landmarks-swapped",
-            "left and right are exchanged in "
+            "left and right are swapped in "
             + ("every pair" if everything else f"{len(swapped)} pairs")
             + f": {_listed(swapped)}",
             where=template.name,
@@ -198,7 +198,7 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
                 f"{name} lies {distance:.1f} mm from the skull reference (at most "
                 f"{LANDMARK_DISTANCE:g})",
                 where=template.name,
-                why="muscles would follow it to a place without bone",
+                why="muscles would be pulled to a place without bone",
                 fix="place it on the bone, in the frame and units of the skull reference",
             )
 
@@ -238,7 +238,7 @@ def _check_partners(template: TemplateData) -> Iterator[Finding]:
                     f"there is no {partner}",
                     where=muscle.name,
                     why="a muscle on one side only pulls the face to that side",
-                    fix="add it, mirrored if need be",
+                    fix="add it, mirrored if necessary",
                 )
             elif muscle.side == "L" and kinds[partner] != muscle.kind:
                 yield Finding.warning(
@@ -261,8 +261,8 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
             f"its distance from the skull is never below {nearest:.0f} mm (at most "
             f"{MUSCLE_DISTANCE:g})",
             where=muscle.name,
-            why="it lies in another frame or unit than the skull, or is not a muscle of the face",
-            fix="bring both into one frame",
+            why="it has another frame or unit than the skull, or is not a muscle of the face",
+            fix="convert both to one frame",
         )
     yield from _check_course(muscle)
 
@@ -274,7 +274,7 @@ def _check_muscle_surface(muscle: MuscleSurface) -> Iterator[Finding]:
             "template-inside-out",
             f"it encloses {report.volume:.0f} mm³: normals point inwards",
             where=muscle.name,
-            why="inside and outside are exchanged",
+            why="inside and outside are swapped",
             fix="flip its triangles (cmfsim.repair_surface)",
         )
     if not report.is_closed:
@@ -283,7 +283,7 @@ def _check_muscle_surface(muscle: MuscleSurface) -> Iterator[Finding]:
             "template-open",
             f"{len(report.borders)} borders, {length:.1f} mm long",
             where=muscle.name,
-            why="near a gap the winding number fades from 1 to 0 instead of falling",
+            why="near a gap, the winding number changes gradually from 1 to 0 instead of abruptly",
             fix="close it (cmfsim.repair_surface)",
         )
     if len(report.non_manifold) or report.inconsistent:
@@ -302,7 +302,7 @@ def _check_muscle_surface(muscle: MuscleSurface) -> Iterator[Finding]:
             where=muscle.name,
             why="winding numbers above ½ count as inside, so only folds of the surface are "
             "affected",
-            fix="nothing, if the muscle looks right",
+            fix="nothing to do if the muscle looks right",
         )
 
 
@@ -337,6 +337,6 @@ def _check_sides(template: TemplateData) -> Iterator[Finding]:
                 "template-muscles-swapped",
                 f"it lies {-across:.0f} mm to the right of {partner}",
                 where=muscle.name,
-                why="left and right are exchanged",
+                why="left and right are swapped",
                 fix="swap the names, or correct the frame: x grows to the patient's left",
             )

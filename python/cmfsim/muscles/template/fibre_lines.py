@@ -1,8 +1,8 @@
 """Fibre lines of flat muscles, drawn by anatomy's rule on the surface that an atlas has of them.
 
-The outline of a sheet does not tell where its fibres run; its attachments do. Lines are straight in
-the view along the sheet's thin axis, where anatomy describes them, and follow the middle of the
-muscle in depth.
+The outline of a sheet does not determine its fibres; its attachments do. Lines are straight in the
+view along the sheet's thin axis, where anatomy describes them, and follow the middle of the muscle
+in depth.
 """
 
 import numpy as np
@@ -157,7 +157,7 @@ def _kept(found: list[Floats]) -> tuple[Floats, ...]:
     lines = tuple(line for line in found if len(line) >= LEAST_POINTS)
     if len(lines) < 2:
         raise MeshInputError(
-            f"{len(lines)} fibre lines meet two faces of the muscle: two are needed; is it "
-            "closed, and the normal that of the sheet?"
+            f"{len(lines)} fibre lines meet two faces of the muscle: two are needed; check that "
+            "it is closed, and that the normal is that of the sheet"
         )
     return lines

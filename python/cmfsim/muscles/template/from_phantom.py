@@ -37,7 +37,7 @@ def phantom_template(
     Parameters
     ----------
     head : PhantomHead, optional
-        The ordinary head, if left out.
+        Default: the ordinary head.
     name : str
     progress : callable, optional
         Is told what is made.

@@ -35,9 +35,9 @@ FEW_LANDMARKS = 6
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MorphedMusculature(Musculature):
-    """The muscles of a template in a patient, with the map that took them there.
+    """The muscles of a template in a patient, with the map from template to patient.
 
-    It is a `Musculature`: what takes muscles takes it as it is.
+    It is a `Musculature` and can be used wherever muscles are expected.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class MorphedMusculature(Musculature):
     findings : tuple of Finding
         Landmarks that only one side has, one that disagrees with the others, folds.
     template : TemplateData
-        What was carried.
+        The template that was mapped.
     warp : ThinPlateSpline
         From the template to the patient; `warp(points)`.
     skull : SurfaceData
@@ -56,13 +56,13 @@ class MorphedMusculature(Musculature):
     residuals : mapping of str to float, mm
         Distance of each warped landmark from the patient's: rounding without smoothing.
     leave_one_out : LandmarkAgreement or None
-        How far each landmark lies from where the others would put it; None where too few
-        landmarks are left to tell.
+        Distance of each landmark from where the others would place it; None if too few landmarks
+        are left.
     missing : tuple of str
         The template's landmarks that the patient lacks.
     folds : mapping of str to int
-        Vertices of each muscle at which the map turns space inside out; muscles without are left
-        out.
+        Vertices of each muscle at which the map turns space inside out; muscles without such
+        vertices are omitted.
     is_fitted : bool
         Whether `fit_muscles` moved the muscles into the tissue after that.
 
@@ -92,7 +92,7 @@ class MorphedMusculature(Musculature):
         name: str | None = None,
         report: Mapping[str, Any] | None = None,
     ) -> None:
-        """Writes the muscles as a template of their own: a folder, or one `.npz` archive.
+        """Writes the muscles as a new template: a folder, or one `.npz` archive.
 
         `MuscleTemplate.load` reads them back; licence and attribution stay the template's.
 
@@ -100,9 +100,9 @@ class MorphedMusculature(Musculature):
         ----------
         path : path
         name : str, optional
-            That of the template, if left out.
+            Default: that of the template.
         report : mapping, optional
-            Plain values that are written beside it as `report.json`, such as `summary()`.
+            Plain values that are written next to it as `report.json`, such as `summary()`.
         """
         write_template(path, self.as_template(name=name), report)
 
@@ -126,7 +126,7 @@ class MorphedMusculature(Musculature):
         )
 
     def summary(self) -> dict[str, Any]:
-        """What the landmarks say, as plain values: for `report.json`."""
+        """The figures of the landmarks as plain values, for `report.json`."""
         left_out = self.leave_one_out
         return {
             "template": self.template.name,
@@ -212,21 +212,22 @@ def missing_landmarks(
             f"{len(missing)} of the template's {len(template.landmarks)} landmarks are missing: "
             f"{listed}; muscles are placed by the other {len(used)}",
             where=where,
-            why=f"fewer than {FEW_LANDMARKS} scale and turn the muscles, but do not shape them"
+            why=f"fewer than {FEW_LANDMARKS} landmarks scale and rotate the muscles, but do not "
+            "fit their shape"
             if few
-            else "muscles near them follow their neighbours; with six landmarks in all, well "
-            "spread, the predicted skin changes by about 0.3 mm",
-            fix="place them, or take a homogeneous model",
+            else "muscles near the missing landmarks follow their neighbours; with only six "
+            "landmarks, well spread, the predicted skin changes by about 0.3 mm",
+            fix="place them, or use a homogeneous model",
         ),
     )
 
 
 def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[Finding]]:
-    """How well the landmarks agree, and which stand out; None where they are too few to tell."""
+    """The agreement of the landmarks, and the outliers; None if there are too few landmarks."""
     try:
         left_out = leave_one_out(matched.source, matched.target, matched.names)
     except LandmarkError as error:
-        what = f"no landmark can be judged by the others: {error}"
+        what = f"landmarks cannot be compared with one another: {error}"
         why = "a misplaced landmark would go unnoticed"
         finding = Finding.note(
             "template-landmarks-few", what, where="landmarks", why=why, fix="place more"
@@ -241,8 +242,8 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
         "template-landmarks-disagree",
         f"{len(away)} landmarks are far from where the others place them: {listed}",
         where="landmarks",
-        why="each pulls the muscles near it along, and makes its neighbours look misplaced",
-        fix="look at the first in both heads; place it again, or leave it out, and morph again",
+        why="each pulls nearby muscles along, and makes its neighbours look misplaced",
+        fix="check the first one in both heads; place it again or omit it, and morph again",
     )
     return left_out, [finding]
 
@@ -282,5 +283,5 @@ def _fold_finding(folds: Mapping[str, int], worst: tuple[float, str, Floats]) ->
         f"severely in {name} (Jacobian {smallest:.2g})",
         where=f"template, at ({where}) mm",
         why="muscles overlap themselves there, and their fibres point in wrong directions",
-        fix="look at the landmarks near there, or smooth the map",
+        fix="check the landmarks nearby, or smooth the map",
     )

@@ -18,7 +18,7 @@ __all__ = ["MuscleTemplate"]
 
 
 class MuscleTemplate(TemplateData):
-    """Facial muscles of one head, to be carried to others by landmarks (Kim et al. 2010, 2.2).
+    """Facial muscles of one head, to be mapped to others by landmarks (Kim et al. 2010, 2.2).
 
     Attributes
     ----------
@@ -27,15 +27,15 @@ class MuscleTemplate(TemplateData):
     skull : SurfaceData
         The bones that the muscles lie on, LPS mm.
     landmarks : mapping of str to (3,) float64, mm
-        On that skull; `cmfsim.SKULL_LANDMARKS` has the usual 32 names and where they lie.
+        On that skull; `cmfsim.SKULL_LANDMARKS` has the usual 32 names and their positions in words.
     licence, attribution, source : str
-        Under which terms it may be used, whom to name, where it comes from.
+        Terms of use, attribution and origin.
     definitions : mapping of str to str
         Where each landmark lies, in words.
     concepts : mapping of str to tuple of str
         Names of muscles in an outside vocabulary, such as their FMA ids.
     findings : tuple of Finding
-        What was noticed while it was made or read.
+        Findings of its creation or reading.
 
     Raises
     ------
@@ -96,9 +96,9 @@ class MuscleTemplate(TemplateData):
         Parameters
         ----------
         path : path
-            A folder that is there is replaced whole if it holds a template and nothing else.
+            An existing folder is replaced as a whole if it contains a template and nothing else.
         report : mapping, optional
-            Plain values that are written beside it as `report.json`.
+            Plain values that are written next to it as `report.json`.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class MuscleTemplate(TemplateData):
         write_template(path, self, report)
 
     def check(self) -> tuple[Finding, ...]:
-        """What is wrong with the template, each with its place and fix; see `check_template`."""
+        """All problems of the template, each with its place and fix; see `check_template`."""
         return check_contents(self)
 
     def morph(
@@ -127,10 +127,11 @@ class MuscleTemplate(TemplateData):
         ----------
         landmarks : mapping of str to (3,) float64, mm, or path
             The patient's, by the template's names, or a `.mrk.json` or `.fcsv` file of them. Four
-            that do not lie in a plane are enough; names that only one side has are left out, and
-            findings say so.
+            that are not in one plane are enough; names that only one side has are ignored, with
+            findings.
         smoothing : float, mm
-            0 meets every landmark; more trades distance at the landmarks for a smoother map.
+            0 matches every landmark exactly; larger values give a smoother map that misses the
+            landmarks by more.
 
         Returns
         -------

@@ -42,19 +42,19 @@ MOST_TRIANGLES = 1_000_000
 
 MARK = "# cmfsim demo: written by this command, and overwritten by it."
 NOTE = (
-    "No patient: a synthetic head (class III) and an operation of ordinary size. Skin, bones and "
-    "airway come straight from the formulas that define the head, so nothing was scanned or "
-    "segmented (cmfsim phantom writes a head with its CT). Landmarks are found automatically, more "
-    "exactly than on real heads. The tets are coarse, for speed."
+    "Not a patient, but a synthetic head (class III) and an operation of ordinary size. Skin, "
+    "bones and airway are computed from the formulas that define the head, so nothing was scanned "
+    "or segmented (cmfsim phantom writes a head with its CT). Landmarks are found automatically, "
+    "more accurately than on real heads. The tets are coarse, for speed."
 )
 IN_SILICO = (
-    " The face after the operation is computed as well, by other equations on a finer mesh with "
-    "other muscles (in silico): errors show how the models differ from it, not how accurate they "
+    " The post-operative face is computed as well, by other equations on a finer mesh with "
+    "other muscles (in silico). Errors show how the models differ from it, not how accurate they "
     "are on patients."
 )
 CASE = """\
 {mark}
-# Change the plan, and: cmfsim {command} case.toml
+# Change the plan, then run: cmfsim {command} case.toml
 format = "cmfsim-case"
 version = 1
 name = "demo"
@@ -67,7 +67,7 @@ skin = "skin.ply"
 cranium = "cranium.ply"
 mandible = "mandible.ply"
 
-# No [landmarks]: they are found automatically. Look at them: cmfsim landmarks case.toml
+# No [landmarks]: they are found automatically. To check them: cmfsim landmarks case.toml
 [[osteotomies]]
 procedure = "le_fort_1"
 

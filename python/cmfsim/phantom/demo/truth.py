@@ -1,6 +1,6 @@
 """The face of the embedded case after its operation, as the package holds it.
 
-`truth.npz` beside this file holds `vertices` (v, 3) float, mm, LPS; `triangles` (t, 3) integer,
+`truth.npz` next to this file contains `vertices` (v, 3) float, mm, LPS; `triangles` (t, 3) integer,
 outward; `landmark_names` (k,) text and `landmarks` (k, 3) float, mm; and `parameters`, a JSON text
 whose `head` names the `HeadParameters` that the face belongs to. `scripts/make_demo_truth.py`
 computes it, in silico.

@@ -1,4 +1,4 @@
-"""What is checked of a case while it is built, since the doctor could not know it before."""
+"""Checks of a case during the build, which the doctor cannot make before."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -109,13 +109,15 @@ def untouched(
             "(segment-touches-no-tissue)"
         )
         where = case.where(f"plan.{name}")
-        fix = "check the cut that makes it, bone_distance in [node_kinds], and the posterior plane"
+        fix = (
+            "check the cut that creates it, bone_distance in [node_kinds], and the posterior plane"
+        )
         if name in case.plan or name in cut_segments(case) or beside:
             raise CaseInputError(f"{where}: {what}: the face would not follow it; {fix}")
         findings.append(
             Finding.warning(
                 "segment-touches-no-tissue",
-                f"{what}; it lies beyond the meshed tissue, and the case does not mention it",
+                f"{what}; it is outside the meshed tissue, and the case does not mention it",
                 where=where,
                 why="its motion does not reach the face",
                 fix="if it belongs to the face, widen [region]",

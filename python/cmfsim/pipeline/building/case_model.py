@@ -63,9 +63,9 @@ def build_case(
     progress : callable, optional
         Called with the name of each stage as it begins.
     check : bool
-        Whether the doctor looks at the case first; an error that it finds ends the work.
+        Whether the doctor checks the case first; an error that it finds ends the work.
     findings : iterable of Finding
-        What is known of the case already; the model keeps it.
+        Findings on the case so far; the model keeps them.
     on_findings : callable, optional
         Called with new findings at the end of each stage.
 
@@ -76,8 +76,8 @@ def build_case(
     Raises
     ------
     CmfsimError
-        (also `ValueError` where the input is at fault) What a stage cannot work with. Files that an
-        earlier run left are then as they were.
+        (also `ValueError` if the input is at fault) A stage cannot continue. Files of an earlier
+        run are then unchanged.
     OSError
         The output folder cannot be written to.
 
@@ -121,9 +121,10 @@ def build_model(
     findings : iterable of Finding
         As for `build_case`.
     anatomy : Anatomy, optional
-        The head, where it is known; the image or surfaces of the case are then not read.
+        The head, if it is already known; the image or surfaces of the case are then not read.
     after : Postoperative, optional
-        What `read_postoperative` gives, where it is known already; an achieved plan is read off it.
+        The result of `read_postoperative`, if it is already known; an achieved plan is measured on
+        it.
     on_findings : callable, optional
         Called with new findings at the end of each stage.
 
@@ -134,7 +135,7 @@ def build_model(
     Raises
     ------
     CmfsimError
-        (also `ValueError` where the input is at fault) What a stage cannot work with.
+        (also `ValueError` if the input is at fault) A stage cannot continue.
 
     Examples
     --------

@@ -22,7 +22,7 @@ def without_clefts(
     moved: Collection[str],
     width: float,
 ) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
-    """The mesh without what lies in the clefts beside segments that move, and a finding for it.
+    """The mesh without the tets in the clefts next to moving segments, and a finding about them.
 
     Parameters
     ----------
@@ -44,11 +44,12 @@ def without_clefts(
     volume = float(mesh.volumes[inside].sum())
     finding = Finding.note(
         "clefts-left-out",
-        f"{int(inside.sum())} tets of {volume:.0f} mm³ in all lie in the clefts between segments "
-        f"and were left out: their distances from two segments add up to less than {width:g} mm",
+        f"{int(inside.sum())} tets of {volume:.0f} mm³ in total are in the clefts between "
+        "segments and were removed: their distances from two segments add up to less than "
+        f"{width:g} mm",
         where=f"segments {', '.join(sorted(moved))}",
-        why="there is air between the tooth rows, and at a cut the tissue is lifted off the bone: "
-        "tets stretched across would be inverted and hold the bones back",
+        why="there is air between the tooth rows, and at a cut the tissue is lifted off the "
+        "bone; tets stretched across would be inverted and hold the bones back",
         fix="set cleft in [mesh] to another width, or to 0 to keep all tissue",
     )
     return left, kinds.of_nodes(used), (finding,)

@@ -1,4 +1,4 @@
-"""What tissue slides on in a case: the sheet of each arch, or the blurred bone."""
+"""The surfaces on which tissue slides in a case: the sheet of each arch, or the blurred bone."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -179,11 +179,11 @@ def _mostly(inside: NDArray[np.bool_], bone: NDArray[Any]) -> bool:
 def _bears_both(name: str) -> Finding:
     return Finding.note(
         "contact-sheet-both-arches",
-        f"{name!r} bears the upper and the lower teeth: tissue slides on the smoothed bone, "
-        "because one sheet cannot extend past the edges of both",
+        f"{name!r} carries the upper and the lower teeth: tissue slides on the smoothed bone, "
+        "because a single contact sheet cannot extend past the edges of both",
         where=f"segment {name}",
-        why="lips and cheeks move with both jaws, which move as one",
-        fix="separate the jaws in the image or surfaces if one of them moves alone",
+        why="lips and cheeks move with both jaws, which move together",
+        fix="separate the jaws in the image or surfaces if only one of them moves",
     )
 
 
@@ -191,11 +191,11 @@ def _sharp(jaw: str, name: str, sheet: ContactSheet, edge_length: float) -> Find
     return Finding.warning(
         "contact-sheet-sharp",
         f"the contact sheet of the {jaw} arch has a radius of curvature of {sheet.radius:.1f} mm "
-        f"where tissue slides; {RADIUS_IN_EDGES * edge_length:g} mm, half an edge of the tets, are "
-        "needed for them to follow it",
+        f"where tissue slides; {RADIUS_IN_EDGES * edge_length:g} mm, half an edge of the tets, "
+        "are needed so that the tets can follow it",
         where=f"segment {name}",
         why="sliding may need many iterations there, or not converge",
-        fix="look at the bone at this arch; take a smaller edge_length in [mesh]",
+        fix="check the bone at this arch, or use a smaller edge_length in [mesh]",
     )
 
 

@@ -1,4 +1,4 @@
-"""Where the tissue ends near what moves: at planes that fix it, and at borders of the image."""
+"""Ends of the tissue near moving bone: at planes that fix it, and at borders of the image."""
 
 from collections.abc import Collection, Iterator, Sequence
 
@@ -85,7 +85,7 @@ def _near_ends(
                 where=f"{segment.name} at z = {place:.1f} mm",
                 why=f"tissue {side} it cannot follow: the face there moves too little, or not at "
                 "all" + (", because the image ends there" if cut else ""),
-                fix=f"{how}, or leave that part of the face out of the evaluation",
+                fix=f"{how}, or exclude that part of the face from the evaluation",
             )
 
 
@@ -112,9 +112,9 @@ def _loose_ends(
                 f"the tissue ends on the {name} border of the image over {area:.0f} mm², and "
                 "nothing is fixed there",
                 where=f"{name} border, {'xyz'[axis]} = {end[axis]:.1f} mm",
-                why="the missing tissue would hold the face back: near that border it moves too "
-                "far",
-                fix="use an image that holds the whole face"
+                why="the missing tissue would hold the face back, so the face moves too far "
+                "near that border",
+                fix="use an image that shows the whole face"
                 + (
                     ", or bring the posterior plane inside it (posterior_depth in [region])"
                     if name == "back"

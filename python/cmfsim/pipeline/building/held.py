@@ -1,4 +1,4 @@
-"""Which bodies of a mesh are held, and the mesh without those that are not."""
+"""The constrained bodies of a mesh, and the mesh without the others."""
 
 import numpy as np
 
@@ -40,8 +40,8 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
         return mesh, kinds, ()
     if loose.all():
         raise MeshInputError(
-            "the tissue is not attached anywhere: no node lies on the posterior plane or on a "
-            "bone; check that bones and skin are in one frame, and the posterior plane"
+            "the tissue is not attached anywhere: no node is on the posterior plane or on a "
+            "bone; check that bones and skin are in one frame, and check the posterior plane"
         )
     dropped = loose[body]
     used, left = used_nodes(tets[~dropped])
@@ -52,14 +52,12 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     finding = Finding(
         severity="note" if speck else "warning",
         code="tissue-not-held",
-        what=f"{int(loose.sum())} bodies of tissue of {volume:.3g} mm³ in all touch no bone and "
-        "were "
-        "left out",
+        what=f"{int(loose.sum())} bodies of tissue of {volume:.3g} mm³ in total touch no bone "
+        "and were removed",
         where=f"mesh, about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        why="nothing determines where they would move",
-        fix="nothing: they are specks outside the face"
+        why="nothing determines their motion",
+        fix="nothing to do: they are specks outside the face"
         if speck
-        else "check skin and bone near there; a larger bone threshold or closing may have cut "
-        "them off",
+        else "check skin and bone nearby; a larger bone threshold or closing may have cut them off",
     )
     return kept, kinds.of_nodes(used), (finding,)

@@ -1,4 +1,4 @@
-"""What the files of a case hold: anatomy, landmarks, motions, and the hashes of them all."""
+"""The contents of the files of a case: anatomy, landmarks, motions, and their hashes."""
 
 from __future__ import annotations
 
@@ -284,7 +284,7 @@ def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) 
             continue
         if path.samefile(written):
             raise CaseInputError(
-                f"{path}: the results would replace this input; give another output folder"
+                f"{path}: the results would replace this input; choose another output folder"
             )
 
 

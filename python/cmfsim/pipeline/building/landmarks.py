@@ -43,10 +43,10 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bo
             [
                 Finding.warning(
                     "landmarks-not-found",
-                    f"no landmarks are given, and none were found automatically: {error}",
+                    f"the case names no landmarks, and none were found automatically: {error}",
                     where="landmarks",
-                    why="the region is placed by the head's depth, and contact of the teeth from "
-                    "the image alone",
+                    why="the region is placed by the depth of the head, and the contact of the "
+                    "teeth from the image alone",
                     fix="place the landmarks by hand and name the files under [landmarks]",
                 )
             ]
@@ -55,10 +55,11 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bo
     found = head.landmarks
     if found.impossible_jaw and case.image is not None:
         raise LandmarkInputError(
-            f"{case.where('image.file')}: the jaws in the image could not be separated: what was "
-            f"taken for the mandible is not one: {found.impossible_jaw}. Place the landmarks of "
-            "the skull by hand (menton, gonion, supradentale, infradentale, occlusal_line, ...) "
-            "and name the file under [landmarks], or give surfaces of both bones"
+            f"{case.where('image.file')}: the jaws in the image could not be separated, because "
+            f"the part taken for the mandible is not one: {found.impossible_jaw}. Place the "
+            "landmarks of the skull by hand (menton, gonion, supradentale, infradentale, "
+            "occlusal_line, ...) and name the file under [landmarks], or give surfaces of both "
+            "bones"
         )
     if head.anatomy is not anatomy:
         stages.drop({BY_SHAPE})

@@ -104,10 +104,11 @@ def separated_at_seam(
             raise
         finding = Finding.note(
             "lips-apart",
-            "the image shows the lips apart as far as the teeth: there was no tissue to separate",
+            "the lips are apart in the image as far back as the teeth, so there was no tissue "
+            "to separate",
             where="lips",
-            why="contact still keeps them apart",
-            fix="none is needed",
+            why="contact between them is still active",
+            fix="nothing to do",
         )
         return mesh, kinds, (finding,)
     return held_part(separated.mesh, _with_new_nodes(mesh, kinds, separated.parents))

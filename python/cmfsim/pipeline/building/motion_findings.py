@@ -54,8 +54,8 @@ def motion_findings(
             "motion-slip",
             f"the vertices of {name} slid along its surface by {found.slip:.1f} mm (median)",
             where=where,
-            why="its shape after is its shape before, moved: the slip is of the mesh that was "
-            "fitted, not of the bone, and is taken off",
+            why="its shape did not change, so the slip is that of the fitted mesh, not of the "
+            "bone, and is subtracted",
             fix="nothing to do",
         )
 
@@ -73,18 +73,19 @@ def _size_findings(
     if skull is not None and _is_scaled(skull):
         shift = (skull.scale - 1.0) * (fit.image - skull.image)
         common = (
-            f"; the skull is {skull.scale:.3g} times as large as well, and if the whole scan is, "
-            f"({', '.join(f'{x:+.1f}' for x in shift)}) mm of the motion are not the bone's"
+            f"; the skull is {skull.scale:.3g} times as large as well; if this applies to the "
+            f"whole scan, ({', '.join(f'{x:+.1f}' for x in shift)}) mm of the motion are not "
+            "motion of the bone"
         )
     yield Finding(
         severity="warning" if is_sure and change > SCALED else "note",
         code="moved-scaled",
-        what=f"{name} is {fit.scale:.3g} times as large after as before (95 % interval {low:.3f} "
-        f"to {high:.3f}, by its shape)",
+        what=f"{name} is {fit.scale:.3g} times as large after the operation as before (95 % "
+        f"interval {low:.3f} to {high:.3f}, by its shape)",
         where=where,
-        why="bone does not grow in an operation, so that the scans are calibrated or segmented "
-        f"differently by {change:.1%}; the motion is that of the middle of the bone, without the "
-        f"change of size{common}",
+        why="bone does not grow during an operation, so the scans are calibrated or segmented "
+        f"differently by {change:.1%}; the motion is that of the middle of the bone, without "
+        f"the change of size{common}",
         fix="check the voxel sizes of both scans and the thresholds of both segmentations, and "
         "measure again",
     )
@@ -98,82 +99,87 @@ def _is_scaled(fit: ShapeFit) -> bool:
 def _open_finding(name: str, where: str, way: OpenDirection, method: str) -> Finding:
     """A motion of the bone that its shape hardly shows."""
     axis = ", ".join(f"{x:+.2f}" for x in way.axis)
-    words = f"a turn about the axis ({axis})" if way.is_turn else f"a shift along ({axis})"
+    words = (
+        f"a rotation about the axis ({axis})" if way.is_turn else (f"a translation along ({axis})")
+    )
     left = (
-        "what the vertices say, slip along the bone included"
+        "that of the vertices, including their slip along the bone"
         if method == "shape"
-        else "where the search began: that part of it may not have been found at all"
+        else "the starting value of the search, so this part of the motion may be wrong"
     )
     return Finding.warning(
         "motion-open",
-        f"the shape of {name} hardly shows {words}: eigenvalue ratio {way.ratio:.3f}, "
+        f"the shape of {name} hardly determines {words}: eigenvalue ratio {way.ratio:.3f}, "
         f"{OPEN:g} is needed",
         where=where,
         why=f"its motion in that direction is {left}",
-        fix="give a larger or less symmetric part of the bone, teeth included, or the motion as "
-        "numbers in [plan]",
+        fix="give a larger or less symmetric part of the bone that includes teeth, or give the "
+        "motion as numbers in [plan]",
     )
 
 
 def _bent_finding(name: str, where: str, fit: ShapeFit | None) -> Finding:
     """A bone that is followed vertex by vertex, as no rigid motion lays it on the bone after."""
     left = (
-        "no rigid motion lays it on the bone after"
+        "no rigid motion fits it to the post-operative bone"
         if fit is None
-        else "its best rigid motion, with the size that fits best, leaves "
-        f"{np.quantile(fit.off, 0.95):.1f} mm (95th percentile)"
+        else f"its best rigid motion, at the best size, leaves {np.quantile(fit.off, 0.95):.1f} "
+        "mm (95th percentile)"
     )
     return Finding.warning(
         "motion-bent",
-        f"{name} has another shape after the operation: {left}",
+        f"{name} has a different shape after the operation: {left}",
         where=where,
-        why="bone does not bend in an operation; each vertex is followed, and if the mesh slid "
-        "along the bone, that counts as motion",
-        fix="if a piece was cut, make it a segment of its own in [[osteotomies]]; else check both "
-        "segmentations, and look at the picture of the plan",
+        why="bone does not bend during an operation; each vertex is followed, so if the mesh "
+        "slid along the bone, the slip counts as motion",
+        fix="if a piece was cut, make it a separate segment in [[osteotomies]]; otherwise check "
+        "both segmentations and the picture of the plan",
     )
 
 
 def removed_finding(name: str, where: str, patch: RemovedBone, severity: str) -> Finding:
     """A patch of bone that is not there after the operation."""
     at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
-    used = "its vertices are not used" if severity == "warning" else "it had no say in the motion"
+    used = (
+        "its vertices are not used" if severity == "warning" else ("it was not used for the motion")
+    )
     return Finding(
         severity=severity,
         code="bone-removed",
-        what=f"{patch.area:.0f} mm² of {name} about ({at}) mm are no longer there after the "
-        f"operation, by up to {patch.depth:.1f} mm: taken as removed bone, not as motion",
+        what=f"{patch.area:.0f} mm² of {name} about ({at}) mm are missing after the operation, "
+        f"by up to {patch.depth:.1f} mm: this counts as removed bone, not as motion",
         where=where,
-        why="bone that is ground away does not pull the tissue over it: that tissue follows the "
+        why="bone that is ground away does not pull the tissue over it; that tissue follows the "
         f"rest of the segment; {used}",
-        fix="look at the bone there; if it was pushed in (fracture, impaction), give that part as "
-        "a bone of its own",
+        fix="check the bone there; if it was pushed in (fracture, impaction), define that part "
+        "as a separate bone",
     )
 
 
 def _stray_finding(name: str, where: str, patch: StrayPatch, *, is_still: bool) -> Finding:
-    """A piece of a segment that its motion does not lay on the bone after the operation."""
+    """The warning about a piece of a segment that is off the post-operative bone."""
     at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
     piece = f"{patch.area / 100.0:.1f} cm² of {name} about ({at}) mm"
     if patch.has_bone:
         what = (
-            f"{piece} lie off the bone after the operation, by {patch.distance:.1f} mm (median): "
-            "bone is there, displaced: it moved otherwise than the segment, or what is left of it "
-            "lies deeper"
+            f"{piece} are off the post-operative bone, by {patch.distance:.1f} mm (median), but "
+            "bone is nearby: this piece moved differently from the segment, or its remaining "
+            "surface is deeper"
         )
         fix = (
-            "if that piece was cut (genioplasty, split maxilla), make it a segment of its own in "
-            "[[osteotomies]]; else check whether bone was removed there"
+            "if that piece was cut (genioplasty, split maxilla), make it a separate segment in "
+            "[[osteotomies]]; otherwise check whether bone was removed there"
         )
     else:
         what = (
-            f"{piece} have no bone after the operation within {REACH:g} mm that faces alike "
+            f"{piece} have no post-operative bone within {REACH:g} mm that faces the same way "
             f"({patch.distance:.1f} mm to the nearest, median): removed, outside the scan, or "
             "moved further"
         )
         fix = (
-            "check whether bone was removed there and whether the scan after shows that place; if "
-            "the piece was cut and moved, make it a segment of its own in [[osteotomies]]"
+            "check whether bone was removed there and whether the post-operative scan shows "
+            "that place; if the piece was cut and moved, make it a separate segment in "
+            "[[osteotomies]]"
         )
     # A smaller scan after the operation cuts off the skull nearly always, which moves nothing.
     return Finding(
@@ -181,7 +187,7 @@ def _stray_finding(name: str, where: str, patch: StrayPatch, *, is_still: bool) 
         code="achieved-piece-off",
         what=what,
         where=where,
-        why="the piece had no say in the motion, and moves with the rest of the segment all the "
-        "same: the face over it may be wrong by that distance",
+        why="the piece was not used for the motion but moves with the rest of the segment, so "
+        "the face over it may be wrong by that distance",
         fix=fix,
     )

@@ -1,4 +1,4 @@
-"""How the bone segments of a case move: as its plan says, and parted where a motion is torn."""
+"""The motions of the bone segments of a case; a segment is cut where its motion is torn."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def _by_shape(
 def _achieved_bones(
     case: Case, segments: tuple[BoneSegment, ...], after: Postoperative
 ) -> PlannedBones:
-    """The segments with the motions that the bones after the operation tell (paper 3, Figure 5).
+    """The segments with the motions measured on the post-operative bones (paper 3, Figure 5).
 
     A bone with the same triangles after says where each vertex went, less what vertices slid along
     it; any other segment is laid on the bone of its name, or on all of them.
@@ -300,10 +300,10 @@ def _parted(
             "motion-torn",
             f"{segment.name} moved as {len(made)} pieces: {', '.join(p.name for p in made)}",
             where=case.where(plan_key(case, segment.name)),
-            why="between them neighbouring vertices moved apart by millimetres, so that the bone "
-            "was "
-            "cut there: no tissue is joined to the gap, and each piece has its contact surface",
-            fix="look at the picture of the plan; nothing to do",
+            why="neighbouring vertices moved apart by millimetres between them, so the bone was "
+            "cut there: no tissue is joined to the gap, and each piece has its own contact "
+            "surface",
+            fix="nothing to do; check the picture of the plan",
         )
     )
     return [(piece, named[piece.name]) for piece in made]
@@ -334,8 +334,8 @@ def _quiet(
                 "motion-noisy",
                 f"the vertices of {name} moved with {noise:.2f} mm of noise, which is averaged out",
                 where=case.where(plan_key(case, bone)),
-                why="bone does not bend from one vertex to the next; tissue would be crumpled on "
-                "it",
+                why="bone does not bend from one vertex to the next, and the noise would "
+                "crumple the tissue on it",
                 fix="nothing to do",
             )
         )

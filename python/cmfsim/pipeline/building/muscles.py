@@ -53,7 +53,7 @@ def placed_muscles(
     if not skull:
         raise LandmarkInputError(
             f"{name}: muscles are placed from skull landmarks, and the case has none: add "
-            "[landmarks] skull, or take a homogeneous model"
+            "[landmarks] skull, or use a homogeneous model"
         )
     begun = time.perf_counter()
     muscles = MuscleTemplate.load(given.template).morph(skull, smoothing=given.smoothing)
@@ -83,10 +83,10 @@ def with_muscles(
     landmarks : mapping of str to (3,) float64, mm, optional
         Instead of the patient's own skull landmarks, as for a trial of their error.
     mesh : TetMesh, optional
-        That of the patient's scene, where the caller has it already.
+        That of the patient's scene, if the caller already has it.
     placed : callable, optional
-        Gives the muscles in the head, where the caller has them placed beside other work: only the
-        wait for them counts in the timings.
+        Returns the muscles in the head, if the caller places them in parallel with other work; only
+        the time spent waiting for them counts in the timings.
 
     Returns
     -------
@@ -97,9 +97,9 @@ def with_muscles(
     LandmarkError
         (also `ValueError`) The patient has no skull landmarks, or they do not fit the template's.
     CaseError
-        (also `ValueError`) There is no such template; the patient's fat is not one fat.
+        (also `ValueError`) There is no such template; the patient's fat is not uniform.
     MaterialError
-        (also `ValueError`) Moduli for a muscle that the template has not.
+        (also `ValueError`) Moduli for a muscle that the template does not have.
 
     Examples
     --------

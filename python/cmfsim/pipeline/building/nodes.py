@@ -1,4 +1,4 @@
-"""What each node of the soft tissue does, and which tets are left."""
+"""The kind of each node of the soft tissue, and the remaining tets."""
 
 from cmfsim.meshing import report_of_part
 from cmfsim.node_kinds import DentalArches, KindOptions, classify_nodes, lifted_tissue

@@ -1,4 +1,4 @@
-"""What one stage of building a model hands to the next."""
+"""The values that one stage of building a model passes to the next."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What is known after the operation, brought into the frame of the data before it."""
+"""Post-operative data, registered to the frame of the pre-operative data."""
 
 import logging
 from collections.abc import Mapping
@@ -28,11 +28,11 @@ __all__ = ["REFERENCES", "Postoperative", "read_postoperative"]
 
 _log = logging.getLogger(__name__)
 
-# Bones that surgery of the jaws leaves alone, by which scans are laid on one another.
+# Bones that jaw surgery does not change, by which scans are registered.
 REFERENCES = ("cranium", "skull")
 # Share of a skull's vertices that have no say in laying it on the one after: jaw, plates, cuts.
 TRIM = 0.3
-# A skull that lies further than this from the one after, mm rms, is not laid on it.
+# A skull that is further than this from the one after, mm rms, is not registered to it.
 LARGEST_RMS = 1.5
 MOST_STEPS = 300
 
@@ -64,7 +64,7 @@ class Postoperative:
 def read_postoperative(case: Case) -> Postoperative:
     """Face and bones after the operation, as the case has them.
 
-    What is not aligned yet is laid on the data before by the skull above the jaws.
+    Data that are not aligned yet are registered to the data before by the skull above the jaws.
 
     Raises
     ------
@@ -76,7 +76,8 @@ def read_postoperative(case: Case) -> Postoperative:
     given = case.postoperative
     if given is None:
         raise CaseInputError(
-            f"{case.file.name}: there is nothing to compare with: add [postoperative] skin or image"
+            f"{case.file.name}: the case has nothing to compare with: add [postoperative] skin "
+            "or image"
         )
     findings: list[Finding] = []
     landmarks: dict[str, Floats] = {}
@@ -130,16 +131,16 @@ def _laid_on(case: Case, bones: Mapping[str, SurfaceData]) -> Floats:
     fit = icp(after, still, initial=start, trim=TRIM, max_iterations=MOST_STEPS)
     if fit.rms > LARGEST_RMS:
         raise RegistrationError(
-            f"{name} after the operation lies {fit.rms:.1f} mm rms from that before it, where it "
-            f"fits best (allowed {LARGEST_RMS:g} mm): align the surfaces yourself, by the skull "
-            "above the jaws, and write aligned = true"
+            f"{name} after the operation is {fit.rms:.1f} mm rms from that before it at the best "
+            f"fit (allowed {LARGEST_RMS:g} mm): align the surfaces yourself by the skull above "
+            "the jaws, and write aligned = true"
         )
     _log.info("%s after the operation aligned with the one before: %.2f mm rms", name, fit.rms)
     return fit.matrix
 
 
 def _trimmed_fit(moving: Floats, fixed: Floats) -> Floats:
-    """The rigid motion of most vertices onto their own, those that moved otherwise left out."""
+    """The rigid motion of most vertices onto their counterparts, ignoring the others."""
     kept = np.ones(len(moving), dtype=bool)
     for _ in range(MOST_STEPS):
         fit = rigid_fit(moving[kept], fixed[kept])

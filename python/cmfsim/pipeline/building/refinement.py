@@ -1,4 +1,4 @@
-"""How often the edge of a mesh is halved: where tissue is thin, and at the mouth."""
+"""Refinement of a mesh: where tissue is thin, and at the mouth."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""How a case is built: what a caller asks for, and the stages as they pass."""
+"""The options of a build, and its stages as they run."""
 
 import time
 from collections.abc import Collection, Iterable
@@ -14,14 +14,14 @@ __all__ = ["BuildOptions", "Stages"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BuildOptions:
-    """What the functions that build a case take beside it.
+    """The options of the functions that build a case.
 
     Attributes
     ----------
     progress : callable or None
         Called with the name of each stage as it begins.
     check : bool
-        Whether the doctor looks at the case first; an error that it finds ends the work.
+        Whether the doctor checks the case first; an error that it finds ends the work.
     findings : iterable of Finding
         What is known of the case already; the model keeps it.
     anatomy : Anatomy or None

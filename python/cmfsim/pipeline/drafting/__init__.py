@@ -29,16 +29,16 @@ def init_case(
     force: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> CaseDraft:
-    """Writes a `case.toml` for what lies in a folder, and states what each file was taken for.
+    """Writes a `case.toml` for the files in a folder, and states what each file was taken for.
 
     Parameters
     ----------
     path : path
         A folder, or a scene of 3D Slicer (`.mrml`, `.mrb`): its folder becomes the case's.
     force : bool
-        Whether a case file that is there is replaced.
+        Whether an existing case file is replaced.
     progress : callable
-        Called with what is being done.
+        Called with the name of each stage.
 
     Returns
     -------
@@ -47,9 +47,9 @@ def init_case(
     Raises
     ------
     FileNotFoundError
-        There is nothing of this name.
+        The path does not exist.
     CaseError
-        (also `ValueError`) A case file is there; nothing in the folder makes a case; several
+        (also `ValueError`) A case file exists already; the folder has no usable files; several
         scenes; a scene that is damaged, or whose transforms are not rigid.
 
     Examples
@@ -91,8 +91,8 @@ def _drafted(
         reasons += [f"{image.label}: {image.error}" for image in found.images if image.error]
         more = f" ({'; '.join(reasons[:5])})" if reasons else ""
         raise CaseInputError(
-            f"{folder}: holds neither a CT nor surfaces that can be read{more}. Looked for: DICOM, "
-            "NRRD, NIfTI, MetaImage, STL, PLY, OBJ, VTP, VTK, .seg.nrrd, .mrml and .mrb"
+            f"{folder}: contains neither a CT nor surfaces that can be read{more}. Looked for: "
+            "DICOM, NRRD, NIfTI, MetaImage, STL, PLY, OBJ, VTP, VTK, .seg.nrrd, .mrml and .mrb"
         )
-    progress("deciding what each file is")
+    progress("identifying the files")
     return draft_case(found, unpacked, folder.resolve().name or "case")

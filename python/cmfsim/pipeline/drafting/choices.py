@@ -1,4 +1,4 @@
-"""Which image is the CT before the operation, and which landmarks are on skull and skin."""
+"""The choice of the pre-operative CT, and of the landmarks of skull and skin."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -194,7 +194,7 @@ def _taken(find: LandmarkFind, kind: str) -> Taken:
     count = len(set(find.read.points) & set(known))
     why = f"{count} of its {len(find.read.points)} labels are those of {kind} landmarks"
     if kind == "after":
-        why = f"skin landmarks, and its name says after the operation ({count} labels)"
+        why = f"skin landmarks, and its name says it is from after the operation ({count} labels)"
     frame = find.read.frame if find.read.stated else ""
     name = "skin landmarks after the operation" if kind == "after" else f"{kind} landmarks"
     return Taken(
@@ -222,6 +222,6 @@ def _choose_frame(marks: Marks, box: Floats | None) -> None:
         marks.frame = "LPS" if fits["LPS"] else "RAS"
         return
     marks.questions["frame"] = (
-        f"{names}: states no frame, and lies in the head's box either way: which is it?",
+        f"{names}: states no frame, and is inside the head's box either way: which frame is it?",
         ('"LPS": x to the patient\'s left, y to the back', '"RAS": x to the right, y to the front'),
     )

@@ -34,7 +34,7 @@ EXAMPLE = """# No plan was found. To move a segment, state how it moves, such as
 
 @dataclass
 class CaseDraft:
-    """A case file that was not written yet.
+    """A case file that has not been written yet.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class CaseDraft:
     questions : list of str
         What a person has to decide before the case can be used.
     files : dict of str to callable
-        What has to be written beside it, by path; each is called with the path.
+        Functions that write further files, by path; each is called with the path.
     """
 
     text: str = ""
@@ -110,7 +110,7 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
     achieved = not draft.plan.motions and _has_after(draft)
     if achieved:
         text.value(
-            "plan", '"achieved"', "read from the bones after the operation: no plan is given"
+            "plan", '"achieved"', "measured on the post-operative bones, because no plan is given"
         )
     _write_head(draft)
     _write_landmarks(draft)
@@ -222,7 +222,7 @@ def _write_image(draft: _Draft) -> None:
 
 
 def _image_path(draft: _Draft) -> str:
-    """The path of the CT; that of a bundle is copied beside the case."""
+    """The path of the CT; that of a bundle is copied next to the case."""
     image = draft.images.ct
     if image is None:  # asked before
         raise AssertionError
@@ -334,7 +334,9 @@ def _write_landmarks(draft: _Draft) -> None:
     if "frame" in marks.questions:
         text.ask("frame", *marks.questions["frame"])
     elif marks.frame is not None:
-        text.value("frame", quoted(marks.frame), "read so they lie in the head, and not otherwise")
+        text.value(
+            "frame", quoted(marks.frame), "read this way they are in the head, otherwise not"
+        )
 
 
 def _shows_skull(draft: _Draft) -> bool:
@@ -373,7 +375,7 @@ def _write_plan(draft: _Draft) -> None:
         text.table("[osteotomies]")
         text.value("procedure", quoted(procedure), f"the plan moves {name}, which it cuts")
         if draft.found.scene:
-            text.comment("It cuts by landmarks, and not where the scene's pieces were cut.")
+            text.comment("It cuts by landmarks, not where the scene's pieces were cut.")
     if not plan.motions:
         text.lines += ["", *EXAMPLE.splitlines()]
     for name, motion in plan.motions.items():
@@ -404,7 +406,7 @@ def _write_muscles(draft: _Draft) -> None:
         text.comment("Muscles are placed from landmarks of the skull: name their file, and add")
         text.comment("an empty [muscles]. Landmarks are found only where none are given.")
         return
-    text.table("muscles", "the package's own template, carried over by the skull landmarks")
+    text.table("muscles", "the built-in template, placed by the skull landmarks")
 
 
 def _write_place_after(draft: _Draft) -> None:
@@ -420,10 +422,10 @@ def _write_place_after(draft: _Draft) -> None:
         other = "LPS" if frame == "RAS" else "RAS"
         frame = other if _distance_after(draft, other) < APART else frame
     if silent and anatomy.asks("frame") is None and frame is not None:
-        text.value("frame", quoted(frame), "so that they lie where the skin before lies")
+        text.value("frame", quoted(frame), "so that they are where the skin was before")
     away = _distance_after(draft, frame or "LPS")
     if not np.isfinite(away):
-        text.value("aligned", "true", "it lies where the head was before: if not, write false")
+        text.value("aligned", "true", "it is where the head was before; if not, write false")
         return
     why = f"the middles of the skins before and after are {away:.0f} mm apart"
     text.value("aligned", "true" if away < APART else "false", why)

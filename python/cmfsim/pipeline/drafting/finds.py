@@ -1,4 +1,4 @@
-"""What lies in a folder: surfaces, images, landmarks and transforms, each read and measured."""
+"""The contents of a folder: surfaces, images, landmarks and transforms, each read and measured."""
 
 import os
 from collections.abc import Iterator
@@ -144,7 +144,7 @@ class LandmarkFind:
 
 @dataclass(frozen=True, eq=False)
 class TransformFind:
-    """A transform file that stands alone: what it moves, its name says."""
+    """A separate transform file; its name identifies what it moves."""
 
     label: str
     role: NameRole

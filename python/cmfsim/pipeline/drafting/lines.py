@@ -13,17 +13,17 @@ WIDTH = 100
 
 @dataclass(frozen=True)
 class Taken:
-    """What a file, or a node of a scene, was taken for.
+    """How a file, or a node of a scene, was interpreted.
 
     Attributes
     ----------
     label : str
         Its path, or its scene and node.
     taken_for : str
-        Such as "skin" or "motion of maxilla"; "not used"; empty where that is the question.
+        Such as "skin" or "motion of maxilla"; "not used"; empty if this is undecided.
     why : str
     unit, frame : str
-        Where they have a meaning.
+        If they apply.
     question : bool
         Whether a person has to decide something about it.
     """

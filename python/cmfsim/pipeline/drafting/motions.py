@@ -1,4 +1,4 @@
-"""Which segment moves how: the plan of a case, from a scene's transforms or from files."""
+"""The motions of the segments: the plan of a case, from a scene's transforms or from files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -165,13 +165,15 @@ def _unusual(name: str, find: SurfaceFind, words: str) -> tuple[str, tuple[str, 
     if name == "cranium":
         return "the scene moves the cranium relative to the skin: is that planned?", (
             f"it {words}",
-            "remove this table if it stays, or rename it and write the matrix below",
+            "remove this table if the cranium stays, or rename it and write the matrix below",
         )
     words_of = [link for link in find.chain if any(w in link.lower() for w in ("regist", "align"))]
     if words_of:
-        return f"{words_of[0]!r} sounds like a registration, not like a plan: which is it?", (
+        return (
+            f"{words_of[0]!r} looks like the name of a registration, not of a plan: which is it?"
+        ), (
             f"as a plan it {words}",
-            "remove this table if it stays, or write the matrix below instead",
+            "remove this table if the segment does not move, or write the matrix below instead",
         )
     return "", ()
 
@@ -179,10 +181,12 @@ def _unusual(name: str, find: SurfaceFind, words: str) -> tuple[str, tuple[str, 
 def _add_loose(plan: Plan, motion: LooseMotion) -> None:
     name = motion.role.part
     if name not in MOVING or name in plan.motions or motion.role.registers:
-        plan.others.append(OtherFind(motion.label, "the scene applies this transform to nothing"))
+        plan.others.append(
+            OtherFind(motion.label, "the scene does not apply this transform to any model")
+        )
         return
     words = plan.words(name, motion.matrix)
-    question = f"{motion.label} is applied to nothing: was it hardened, or is it the plan?"
+    question = f"{motion.label} is not applied to any model: was it hardened, or is it the plan?"
     choices = (
         f"as the plan it {words}: write the matrix below instead of this line;",
         "if it was hardened, the surface has moved already: undo that in Slicer, and init again",
@@ -194,7 +198,7 @@ def _add_loose(plan: Plan, motion: LooseMotion) -> None:
 
 
 def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool) -> None:
-    """Adds the motions in transform files, by the segment that the file's name says.
+    """Adds the motions in transform files, by the segment in the file's name.
 
     Parameters
     ----------
@@ -209,7 +213,7 @@ def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool)
         if part in MOVING and not find.role.registers:
             by_part.setdefault(part, []).append(find)
         elif find.role.registers:
-            why = "its name says a registration, not a plan"
+            why = "its name suggests a registration, not a plan"
             plan.taken.append(Taken(find.label, "not used", why))
         else:
             _ask_segment(plan, find)
@@ -233,7 +237,7 @@ def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool)
 
 def _ask_segment(plan: Plan, find: TransformFind) -> None:
     """Asks what a transform moves whose name does not say it."""
-    text = f"{find.label}: its name says no segment. Which one does it move?"
+    text = f"{find.label}: its name does not identify a segment. Which one does it move?"
     choices = (
         f"{quoted(find.label)}, and rename this table to [plan.NAME] of one of",
         f"{', '.join(MOVING)}; or remove the table",

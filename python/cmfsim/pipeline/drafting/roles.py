@@ -1,4 +1,4 @@
-"""What a file or a node of a scene is called, and which part of a head that is."""
+"""The part of a head that the name of a file or of a scene's node refers to."""
 
 import itertools
 import re
@@ -44,7 +44,7 @@ WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zà-ÿ]+|\d+")
 
 @dataclass(frozen=True)
 class NameRole:
-    """What a name says.
+    """The meaning of a name.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class NameRole:
 
 
 def name_role(name: str) -> NameRole:
-    """What a file's name without its ending, or the name of a node, says.
+    """The meaning of a file's name without its ending, or of the name of a node.
 
     Examples
     --------
@@ -117,6 +117,6 @@ def _part(words: set[str]) -> tuple[str, str]:
 
 
 def safe_key(name: str) -> str:
-    """A name that can stand in a case file as a bone's: letters, digits, '_', '-' and '+'."""
+    """A name that is valid for a bone in a case file: letters, digits, '_', '-' and '+'."""
     key = "".join(c if c.isalnum() or c in "_-+" else "_" for c in name)[:60].strip("_")
     return key or "part"

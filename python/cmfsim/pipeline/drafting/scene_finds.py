@@ -1,4 +1,4 @@
-"""What a scene of 3D Slicer holds, each thing with what its transforms apply to it."""
+"""The contents of a 3D Slicer scene, each with the effect of its transforms."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path

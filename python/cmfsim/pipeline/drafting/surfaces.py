@@ -1,4 +1,4 @@
-"""Which surfaces a case is made of, their unit and their frame, with the reasons."""
+"""The surfaces of a case, their unit and their frame, with the reasons."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,7 +32,7 @@ PIECES_OF = {
 
 @dataclass(frozen=True)
 class Question:
-    """What a person has to decide about a key.
+    """A decision about a key that a person has to make.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ def _by_part(anatomy: Anatomy, found: Iterable[SurfaceFind]) -> dict[str, list[S
     parts: dict[str, list[SurfaceFind]] = {}
     for find in found:
         if find.role.part == "other":
-            why = f"its name says {find.role.word!r}, which is not a bone of a case"
+            why = f"its name contains {find.role.word!r}, which is not a bone of a case"
             anatomy.taken.append(Taken(find.label, "not used", why))
         else:
             parts.setdefault(find.role.part, []).append(find)
@@ -179,7 +179,9 @@ def _choose_bones(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None
         parts["cranium"] = whole
         whole = []
     for find in whole:
-        why = "the bones are given one by one; by its name it is all of them in one"
+        why = (
+            "the bones are given separately; according to its name, this file contains all of them"
+        )
         anatomy.taken.append(Taken(find.label, "not used", why))
     for part in ("cranium", *MOVING):
         named = _moved_alone(anatomy, parts.get(part, []))
@@ -343,7 +345,7 @@ def _shown_frame(
         }
         if fits["LPS"] != fits["RAS"]:
             frame = "LPS" if fits["LPS"] else "RAS"
-            return frame, f"read as {frame} they lie where {name} lies, and otherwise elsewhere"
+            return frame, f"read as {frame} they are where {name} is, otherwise elsewhere"
     cranium = anatomy.bones.get("cranium")
     for name in ("mandible", "mandible_body", "maxilla", "chin"):
         jaw = anatomy.bones.get(name)
@@ -355,7 +357,7 @@ def _shown_frame(
                     f"read as {frame} {name} lies {abs(ahead):.0f} mm in front of the cranium's "
                     "middle, and otherwise behind it"
                 )
-    return None, "nothing that lies in them shows it"
+    return None, "nothing in the files shows it"
 
 
 def _middle(find: SurfaceFind) -> Floats:
@@ -390,15 +392,15 @@ def _report(anatomy: Anatomy) -> None:
             continue
         frame = find.stated or anatomy.frame or "LPS"
         unit = "" if anatomy.asks("units") else anatomy.units
-        why = f"its name says {find.role.word!r}; {_shape(find, unit)}"
+        why = f"its name contains {find.role.word!r}; {_shape(find, unit)}"
         if find.role.part == "bone":
-            why += "; a jaw that is part of it cannot move by itself"
+            why += "; a jaw that is part of it cannot move separately"
         asked = anatomy.asks("frame") is not None and find.stated is None
         anatomy.taken.append(Taken(find.label, part, why, unit, "" if asked else frame))
     after = {"skin": anatomy.after_skin, **anatomy.after_bones}
     for part, find in after.items():
         if find is not None:
-            why = f"its name says {find.role.word or 'after'!r}, after the operation"
+            why = f"its name contains {find.role.word or 'after'!r}, after the operation"
             anatomy.taken.append(
                 Taken(find.label, f"{part} after the operation", why, "mm", find.stated or "LPS")
             )

@@ -136,7 +136,7 @@ def face_sites(patient: PatientModel) -> FaceSites:
         absent[UPPER_INCISOR] = str(error)
     for name in needed:
         if name not in skin and name not in bone:
-            absent.setdefault(name, "the case gives no such skin landmark")
+            absent.setdefault(name, "the case has no such skin landmark")
     return FaceSites(skin, bone, absent, tuple(found))
 
 
@@ -176,7 +176,7 @@ def measure_face(prediction: Prediction, sites: FaceSites | None = None) -> dict
 def _at(profile: Floats, known: Mapping[str, Floats], name: str) -> int:
     """The point of the profile nearest to a landmark."""
     if name not in known:
-        raise LandmarkInputError(f"it is located from {name}, which the case does not have")
+        raise LandmarkInputError(f"it is located by means of {name}, which the case does not have")
     return int(np.argmin(np.linalg.norm(profile - known[name], axis=1)))
 
 
@@ -283,11 +283,11 @@ def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     throat = throat[throat[:, 2] >= throat[0, 2] - THROAT_BELOW]
     if throat[0, 2] - throat[:, 2].min() < LEAST_THROAT:
         raise LandmarkInputError(
-            f"the skin is not shown {LEAST_THROAT:g} mm below menton, down the neck"
+            f"the image does not show the skin {LEAST_THROAT:g} mm below menton, down the neck"
         )
     corner = _deepest(throat)
     if not 0 < corner < len(throat) - 1:
-        raise LandmarkInputError("chin and neck have no angle between them")
+        raise LandmarkInputError("there is no angle between chin and neck")
     angle: Floats = throat[corner]
     return angle
 
@@ -309,7 +309,7 @@ def _upper_incisor(patient: PatientModel) -> BoneSite:
     """The edge of the upper central incisors: the lowest point of the bone below supradentale."""
     skull = patient.landmarks.get("skull", {})
     if "supradentale" not in skull:
-        raise LandmarkInputError("the case gives no skull landmark supradentale")
+        raise LandmarkInputError("the case has no skull landmark supradentale")
     root = skull["supradentale"]
     bearer = _upper_bearer(patient.segments)
     vertices = bearer.surface.vertices
@@ -332,4 +332,4 @@ def _upper_bearer(segments: tuple[BoneSegment, ...]) -> BoneSegment:
     for name in UPPER_BEARERS:
         if name in by_name:
             return by_name[name]
-    raise LandmarkInputError("no segment bears the upper teeth")
+    raise LandmarkInputError("no segment carries the upper teeth")

@@ -250,7 +250,7 @@ class _Space:
         self.reference = reference
         self.free = [name for name in dict.fromkeys(named) if name not in search.follows]
         if not self.free:
-            raise CaseInputError("every segment follows another: nothing is free to move")
+            raise CaseInputError("every segment follows another, so nothing is free to move")
         skull = planning.patient.landmarks.get("skull", {})
         surfaces = {s.name: s.surface.vertices for s in planning.patient.segments}
         self.skull, self.surfaces = skull, surfaces

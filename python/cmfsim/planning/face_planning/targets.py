@@ -87,7 +87,9 @@ class PointTarget:
             ways = as_rows("target directions", directions, 3)
             sizes = np.linalg.norm(ways, axis=1, keepdims=True)
             if len(ways) != len(places) or not (sizes > 0.0).all():
-                raise CaseInputError("target directions: one that is not zero for each point")
+                raise CaseInputError(
+                    "target directions must be given for each point and must not be zero"
+                )
             ways = ways / sizes
         object.__setattr__(self, "points", places)
         object.__setattr__(self, "goals", wished)
@@ -233,7 +235,7 @@ def _points_wish(planning: PlanningModel, target: PointTarget) -> Wish:
     if not (share > 0.0).all():
         place = points[int(np.argmin(share))].round(1).tolist()
         raise CaseInputError(
-            f"target point {place} mm lies outside the tissue of the model: no plan moves it"
+            f"target point {place} mm is outside the tissue of the model, so no plan moves it"
         )
 
     def rows(places: Floats, _: Motions) -> Floats:
@@ -278,7 +280,7 @@ def _surface_wish(planning: PlanningModel, target: SurfaceTarget) -> Wish:
     kept = points[_has_partner(surface, _border_points(target.surface), points)]
     if not len(kept):
         raise CaseInputError(
-            f"the desired surface lies more than {MOST_APART:g} mm from the face: both must be in "
+            f"the desired surface is more than {MOST_APART:g} mm from the face: both must be in "
             "the frame of the case"
         )
 

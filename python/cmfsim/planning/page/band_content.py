@@ -1,4 +1,4 @@
-"""What a planning page holds of a band, as plain values and arrays."""
+"""The data of a band in a planning page, as plain values and arrays."""
 
 from typing import Any
 

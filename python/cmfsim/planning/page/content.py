@@ -57,7 +57,7 @@ class PageContent:
     arrays : mapping of str to array
         float32, float16 and uint32.
     findings : tuple of Finding
-        What was simplified or left out.
+        Findings on what was simplified or omitted.
     """
 
     values: Mapping[str, Any]
@@ -93,8 +93,8 @@ def page_content(
     Raises
     ------
     CaseError
-        (also `ValueError`) More nodes on the skin than a page can hold; fast-simplification is
-        missing where a surface has to be simplified.
+        (also `ValueError`) More nodes on the skin than a page can have; fast-simplification is
+        missing and a surface has to be simplified.
 
     Examples
     --------
@@ -109,7 +109,7 @@ def page_content(
     count = len(skin.vertices)
     if count > MOST_NODES:
         raise CaseInputError(
-            f"the skin has {count} nodes, a page holds at most {MOST_NODES}: give a larger "
+            f"the skin has {count} nodes, but a page can have at most {MOST_NODES}: use a larger "
             "edge_length in [mesh], or --edge-length"
         )
     face = _fewer("face", patient.face or skin, FACE_TRIANGLES, findings)
@@ -181,8 +181,8 @@ def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) 
             f"{name} has {count} triangles; the page draws it with "
             f"{len(fewer.triangles)}, at most {away:.2f} mm away",
             where=name,
-            why="a page with all of them is slow to open and to send",
-            fix="none needed: predictions use all of them",
+            why="a page with all triangles is slow to open and to send",
+            fix="nothing to do: predictions use all triangles",
         )
     )
     return fewer
@@ -302,12 +302,14 @@ def _measured(planning: PlanningModel, sites: FaceSites) -> dict[str, Any]:
     found = ", ".join(name.replace("_", " ") for name in sites.found)
     notes = [
         (
-            "Heights are along S of the data, not in natural head position. Sites move "
+            "Heights are measured along S of the data, not in natural head position. Sites move "
             "with the tissue; they are not located again on the moved face."
         )
     ]
     if found:
-        notes.append(f"Located on the profile and the bone, not given in the case: {found}.")
+        notes.append(
+            f"Located on the profile and the bone because the case does not give them: {found}."
+        )
     return {
         "skin_sites": [{"name": name} for name in sites.skin],
         "bone_sites": [

@@ -33,8 +33,9 @@ STATE = re.compile(rb'<meta name="cmfsim-made-for" content="([0-9a-f]{64})">')
 # The state stands before the style and scripts.
 HEAD_BYTES = 2048
 EXACT_NOTE = (
-    "Away from the case's own plan, contact of soft tissue with teeth and gums is extrapolated, "
-    "not solved again. Save the plan next to the case file and run:"
+    "Away from the case's own plan, the contact of soft tissue with teeth and gums is "
+    "extrapolated, not solved again. For the exact face, save the plan next to the case file "
+    "and run:"
 )
 
 
@@ -49,8 +50,8 @@ def page_text(
     case_file : str
         The name of the case file in the command that solves a plan exactly.
     is_served : bool
-        Whether the page asks the program that served it for exact solutions; else it connects to
-        nothing.
+        Whether the page requests exact solutions from the program that serves it; otherwise it
+        makes no connection.
 
     Returns
     -------
@@ -94,7 +95,8 @@ def page_text(
         "disclaimer": DISCLAIMER,
         "footer": html.escape(
             f"Made by cmfsim {version} for case {case} in the state "
-            f"{str(content.values['built_for'])[:12]}. Nothing is loaded from elsewhere or sent."
+            f"{str(content.values['built_for'])[:12]}. The page loads nothing from elsewhere and "
+            "sends nothing."
         ),
         "style": style,
         "script": script,
@@ -109,7 +111,7 @@ def page_text(
 def write_planning_page(
     path: str | os.PathLike[str], content: PageContent, *, case_file: str = "case.toml"
 ) -> int:
-    """Writes a planning page, replacing an older one in one step; its size in bytes.
+    """The size in bytes of a planning page, written to a file in one step.
 
     Raises
     ------

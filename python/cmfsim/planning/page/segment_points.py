@@ -1,4 +1,4 @@
-"""Where surgeons measure how a segment moves: incisors, canines, molars, pogonion, menton."""
+"""Points at which the motion of a segment is measured: incisors, canines, molars, chin."""
 
 import re
 from collections.abc import Mapping

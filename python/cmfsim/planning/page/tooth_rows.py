@@ -86,7 +86,7 @@ def tooth_rows(patient: PatientModel) -> ToothRows:
     """
     arches = dental_arches(patient.anatomy, patient.segments, patient.landmarks.get("skull"))
     if "lower" not in arches.by_jaw:
-        raise CaseInputError("neither skull landmarks nor the image show where the teeth stand")
+        raise CaseInputError("neither skull landmarks nor the image locate the teeth")
     upper = _bearer(patient.segments, UPPER_BEARERS, "upper")
     lower = _bearer(patient.segments, LOWER_BEARERS, "lower")
     points = _row(lower, arches.by_jaw["lower"])

@@ -22,7 +22,7 @@ __all__ = ["CORRECTIONS", "corrected_planning"]
 
 # Plans that are solved for a correction.
 CORRECTIONS = 96
-# Fewer solved plans tell nothing about those between them.
+# With fewer solved plans, interpolation between them is meaningless.
 LEAST_PLANS = 8
 # Solutions at once: each takes memory for its own vectors.
 MOST_AT_ONCE = 4
@@ -37,18 +37,18 @@ def corrected_planning(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> PlanningModel:
-    """The planning model with its operator corrected by exact solutions, where that pays.
+    """The planning model with its operator corrected by exact solutions, if this lowers the error.
 
-    Plans are drawn as `expected_error` draws them, but others, and all from the whole range. What
-    the operator misses there is interpolated between them (`PlanCorrection`). The correction is
-    left out where it does not lower the error at plans that it was not fitted to.
+    Plans are drawn as in `expected_error`, but they are different plans and all from the whole
+    range. The error of the operator is interpolated between them (`PlanCorrection`). The correction
+    is not used if it does not lower the error at plans to which it was not fitted.
 
     Parameters
     ----------
     planning : PlanningModel
     plans : int
-        How many are solved exactly. Below 8 they tell nothing about the plans between them, and
-        nothing is corrected; 0 solves none.
+        Number of plans solved exactly. Fewer than 8 are not enough to interpolate, and nothing is
+        corrected; 0 solves none.
     shift : float, mm
     turn : float, degrees
         The range of the plans: along each axis, and about any axis.
@@ -59,7 +59,8 @@ def corrected_planning(
     Returns
     -------
     PlanningModel
-        The same model, unless tissue slides, enough plans could be solved, and correcting pays.
+        The same model, unless tissue slides, enough plans could be solved, and the correction
+        helps.
 
     Raises
     ------
@@ -87,7 +88,7 @@ def corrected_planning(
     places, distances, errors = [], [], []
     for number, exact in enumerate(_solved(bare, drawn)):
         if progress is not None:
-            progress(f"solving plans nearby to correct the operator ({number + 1} of {plans})")
+            progress(f"solving nearby plans to correct the operator ({number + 1} of {plans})")
         if exact is not None:
             places.append(numbers.of(drawn[number]))
             distances.append(plan_distance(bare, drawn[number]))

@@ -122,11 +122,11 @@ class PlanCorrection:
         return left
 
     def displacements(self, plan: Mapping[str, ArrayLike]) -> Floats:
-        """What is added to the operator's displacements under a plan, (k, 3) mm."""
+        """The correction of the operator's displacements under a plan, (k, 3) mm."""
         return self.shapes @ self.amounts(plan)
 
     def at(self, nodes: NDArray[np.integer]) -> "PlanCorrection":
-        """The correction of some of the nodes, by their places in the operator."""
+        """The correction restricted to some nodes, by their positions in the operator."""
         return replace(self, shapes=self.shapes[nodes])
 
 

@@ -1,4 +1,4 @@
-"""How far the plan operator deviates from exact solutions, away from its reference plan."""
+"""The deviation of the plan operator from exact solutions, away from its reference plan."""
 
 import time
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ USUAL = 90.0
 
 @dataclass(frozen=True, eq=False)
 class PlanTrial:
-    """One plan, by the product and solved exactly.
+    """One plan, computed by the product and solved exactly.
 
     Attributes
     ----------
@@ -40,9 +40,9 @@ class PlanTrial:
     distance : float, mm
         From the reference plan, as `plan_distance`.
     mean, p95, largest : float or None, mm
-        Distance between the two answers over the vertices of the skin; None where `failed`.
+        Distance between the two results over the vertices of the skin; None if `failed`.
     failed : str
-        Why the plan could not be solved; empty where it could.
+        Why the plan could not be solved; empty if it could.
     seconds : float
         Of the exact solution.
     """
@@ -96,7 +96,7 @@ class ExpectedError:
         return distance * float(mean), distance * float(largest)
 
     def usual(self, distance: float) -> float | None:
-        """The largest error that nine of ten plans stay within at a distance, mm, as `at`."""
+        """The error that nine of ten plans stay below at a distance, mm, as in `at`."""
         if distance > self.reach and self.slides:
             return None
         ratios = self._ratios()[:, 1]
@@ -176,7 +176,7 @@ def expected_error(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> ExpectedError:
-    """How far the product deviates from exact solutions at plans around the reference.
+    """The deviation of the product from exact solutions at plans around the reference.
 
     Every segment that the reference moves (all, if it moves none) is shifted by up to `shift` along
     each axis and turned by up to `turn` about a random axis through the middle of its surface, each

@@ -30,10 +30,10 @@ Motions = Mapping[str, ArrayLike]
 class PlanningModel:
     """The face of one patient under any rigid plan.
 
-    Two answers to a plan: `displacements`, `skin`, `face` and `carried` by one product with the
-    columns of the plan operator, in which contact is continued to first order about the reference
-    plan, and corrected by `correction`; `solve`, exactly. Both are the same at the reference and
-    wherever no tissue slides.
+    A plan can be computed in two ways. `displacements`, `skin`, `face` and `carried` use one
+    product with the columns of the plan operator, in which contact is linearised about the
+    reference plan and corrected by `correction`. `solve` is exact. Both agree at the reference, and
+    everywhere if no tissue slides.
 
     Attributes
     ----------
@@ -47,7 +47,8 @@ class PlanningModel:
     reference : mapping of str to (4, 4) float64, mm
         The plan about which contact is continued.
     correction : PlanCorrection or None
-        What exact solutions add to the product away from the reference (`corrected_planning`).
+        Correction of the product by exact solutions, away from the reference
+        (`corrected_planning`).
     """
 
     patient: PatientModel
@@ -64,7 +65,7 @@ class PlanningModel:
 
     @property
     def slides(self) -> bool:
-        """Whether tissue slides on a segment: without, the product is exact for every plan."""
+        """Whether tissue slides on a segment; if not, the product is exact for every plan."""
         return any(np.size(segment.sliding) for segment in self._scene.segments.values())
 
     @cached_property
@@ -77,7 +78,7 @@ class PlanningModel:
         return self.patient.skin
 
     def whole(self, plan: Motions) -> dict[str, Floats]:
-        """The plan with every segment in it; those that it does not name stay.
+        """The plan completed with every segment; segments that it does not name stay.
 
         Raises
         ------
@@ -143,11 +144,11 @@ def planning_model(
     Parameters
     ----------
     patient : PatientModel or Prediction
-        What `build_model` makes, or what a prediction holds.
+        The result of `build_model`, or a prediction.
     model : str, optional
-        "H", "M", "H+S" or "M+S"; that of the prediction, or "M+S", if left out.
+        "H", "M", "H+S" or "M+S"; default: that of the prediction, or "M+S".
     reference : mapping of str to (4, 4) float64, mm, optional
-        The plan about which contact is continued; the patient's own if left out.
+        The plan about which contact is linearised; default: the patient's own.
 
     Returns
     -------
@@ -198,11 +199,11 @@ def _check_scene(scene: Scene) -> None:
     """Refuses a scene of which no product gives the face."""
     if scene.options.kinematics != "linear":
         raise CaseInputError(
-            f"the case has {scene.options.kinematics} kinematics, in which no product of a matrix "
-            'gives the face: set kinematics = "linear", or predict each plan'
+            f"the case has {scene.options.kinematics} kinematics, for which the face is not a "
+            'matrix product: set kinematics = "linear", or predict each plan'
         )
     if not scene.segments:
-        raise CaseInputError("no segment of bone moves: add an osteotomy or a plan to the case")
+        raise CaseInputError("no bone segment moves: add an osteotomy or a plan to the case")
     for name, motion in scene.plan.items():
         if isinstance(motion, MovedSurface) or np.shape(motion) != (4, 4):
             raise CaseInputError(

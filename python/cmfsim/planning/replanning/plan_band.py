@@ -52,9 +52,9 @@ class PlanBand:
     at_reference : SkinBand
         The band of the reference plan, solved exactly: regions, factors, state.
     still : (k,) float64, mm²
-        The variance that no plan changes.
+        The part of the variance that does not depend on the plan.
     shift : (p, k) float64, mm
-        What one standard deviation of each modulus moves the skin by at the reference plan.
+        Movement of the skin by one standard deviation of each modulus, at the reference plan.
     rates : (p, k, 6 s) float64
         Its change with each number of a plan.
     """

@@ -1,4 +1,4 @@
-"""What the sites of jaws and tooth rows rest on: whether the lower jaw can be what is taken for it.
+"""Evidence on whether the part taken for the lower jaw can be the lower jaw.
 
 A mandible that was told from the skull by shape alone may hold a part of the maxilla, or be the
 maxilla. Its sites are then found where they are not, each with its usual error: what gives this
@@ -45,7 +45,7 @@ ROW_SIDE, ROW_BACK = 50.0, 52.0
 
 @dataclass(frozen=True)
 class JawEvidence:
-    """What speaks against the jaw of a head.
+    """Evidence against the jaw of a head.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ def jaw_evidence(
     pose: Pose,
     left_out: Mapping[str, float],
 ) -> JawEvidence:
-    """What speaks against a jaw.
+    """Evidence against a jaw.
 
     Parameters
     ----------
@@ -92,14 +92,14 @@ def _impossible(sites: Mapping[str, Floats], volume: float, size: float) -> Iter
     distance = jaw_distance({n: p for n, p in sites.items() if not n.startswith("_")})
     if distance > FAR_JAW:
         yield (
-            f"its sites lie {size * distance:.0f} mm from those of a closed mouth (up to "
+            f"its sites are {size * distance:.0f} mm from those of a closed mouth (up to "
             f"{size * FAR_JAW:.0f} mm for an open one)"
         )
     opening = _opening(sites)
     if opening < -DEEPEST_BITE:
-        yield f"its incisors stand {-size * opening:.0f} mm above the edge of the upper ones"
+        yield f"its incisors are {-size * opening:.0f} mm above the edge of the upper ones"
     elif opening > WIDEST:
-        yield f"its incisors stand {size * opening:.0f} mm below the upper ones"
+        yield f"its incisors are {size * opening:.0f} mm below the upper ones"
     low, high = POSSIBLE_VOLUMES
     if not low <= volume <= high:
         yield (
@@ -128,9 +128,7 @@ def _doubts(
         )
     if left_out:
         worst = max(left_out, key=lambda name: left_out[name])
-        yield (
-            f"sites of the jaw do not fit one another ({worst} by {size * left_out[worst]:.0f} mm)"
-        )
+        yield (f"sites of the jaw are inconsistent ({worst} by {size * left_out[worst]:.0f} mm)")
 
 
 def _opening(sites: Mapping[str, Floats]) -> float:

@@ -1,4 +1,4 @@
-"""How far a proposed landmark may be off, what speaks against it, and what the image leaves out."""
+"""The expected error of a proposed landmark, doubts about it, and parts missing from the image."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -128,7 +128,7 @@ def _own(points: Mapping[str, Floats], pose: Pose) -> dict[str, Floats]:
 def _impossible(off: Mapping[str, float], gone: dict[str, str]) -> None:
     for name, distance in off.items():
         if distance > IMPOSSIBLE:
-            gone.setdefault(name, "what was found there does not fit the other sites")
+            gone.setdefault(name, "the point found there is inconsistent with the other sites")
 
 
 def _below_a_cut_chin(
@@ -168,7 +168,7 @@ def judged(
             doubts.append(f"left and right differ by {pose.size * gap:.1f} mm")
         if name in odd:
             doubts.append(
-                f"the others put it {pose.size * odd[name]:.1f} mm away in an average head"
+                f"the other sites place it {pose.size * odd[name]:.1f} mm away in an average head"
             )
             error = max(error, 0.5 * pose.size * odd[name])
         sites[name] = ProposedSite(point, error, "; ".join(doubts))

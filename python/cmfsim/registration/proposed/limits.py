@@ -1,4 +1,4 @@
-"""Where a head ends because its image ends: planes at which surfaces are closed flat."""
+"""Ends of a head at the borders of its image: planes at which surfaces are closed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -85,7 +85,7 @@ def surface_samples(surface: SurfaceData, count: int, seed: int = 0) -> tuple[Fl
     doubled = np.linalg.norm(normals, axis=1)
     total = np.cumsum(doubled)
     if not total[-1] > 0.0:
-        raise LandmarkInputError("a surface has no area: no landmark can be found on it")
+        raise LandmarkInputError("a surface has no area, so no landmark can be found on it")
     generator = np.random.default_rng(seed)
     # One throw in each of as many equal shares of the area: evener than free throws.
     throws = (np.arange(count) + generator.random(count)) / count * total[-1]
@@ -144,8 +144,8 @@ def _symmetry(whole: SurfaceData, points: Floats, normals: Floats) -> tuple[Floa
             break
     if not fits:
         raise LandmarkInputError(
-            f"the bones have no plane of symmetry that can be found ({reason}): place the "
-            "landmarks by hand"
+            f"the bones have no recognisable plane of symmetry ({reason}): place the landmarks "
+            "by hand"
         ) from reason
     matrix = min(fits, key=lambda fit: fit.rms).matrix
     # p → R (S (p − c) + c) + t is nearly a reflection; its axis is the eigenvector of −1.
@@ -206,9 +206,9 @@ def _fitted(
     residual = rms
     if residual > WORST_FIT:
         raise LandmarkInputError(
-            f"the bones lie {residual:.1f} mm from an average skull wherever it is placed (at most "
-            f"{WORST_FIT:g} mm allowed): they are not a head, or one turned by more than 30°; "
-            "place the landmarks by hand"
+            f"the bones lie {residual:.1f} mm from an average skull in the best pose (at most "
+            f"{WORST_FIT:g} mm allowed): they are not a head, or a head rotated by more than "
+            "30°; place the landmarks by hand"
         )
     axes = linear / scale @ upright
     origin = centre - upright.T @ (np.linalg.solve(linear, offset))

@@ -80,8 +80,8 @@ def landmarks_from(
     """
     if not bones or not templates:
         raise LandmarkInputError(
-            f"{len(bones)} bones and {len(templates)} template heads are given: landmarks are "
-            "found on at least one bone with at least one template"
+            f"{len(bones)} bones and {len(templates)} template heads are given: at least one of "
+            "each is needed to find landmarks"
         )
     parts = _surfaces(bones, skin)
     average = templates[0]
@@ -124,7 +124,7 @@ def _surfaces(bones: Mapping[str, SurfaceData], skin: SurfaceData | None = None)
     lower = [bone for name, bone in bones.items() if is_lower(name)]
     if not upper:
         raise LandmarkInputError(
-            f"the bones are {', '.join(bones)}: landmarks are found from the cranium, add it"
+            f"the bones are {', '.join(bones)}: add the cranium, which is needed to find landmarks"
         )
     return HeadSurfaces(joined_surface(upper), joined_surface(lower) if lower else None, skin)
 

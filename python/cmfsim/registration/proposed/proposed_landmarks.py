@@ -1,4 +1,4 @@
-"""What landmarks were proposed for a head, how far each may be off, and which are missing."""
+"""The landmarks proposed for a head, with their expected errors, and those that are missing."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -96,9 +96,9 @@ class ProposedLandmarks:
             verdict = "is none" if self.impossible_jaw else "is doubtful"
             yield Finding.warning(
                 "jaw-impossible" if self.impossible_jaw else "jaw-doubtful",
-                f"what was taken for the mandible {verdict}: {self.doubtful_jaw}",
+                f"the part taken for the mandible {verdict}: {self.doubtful_jaw}",
                 where="landmarks.skull",
-                why="landmarks of jaws and teeth lie on it, and segments are cut from it",
+                why="landmarks of jaws and teeth are on it, and segments are cut from it",
                 fix="place the landmarks of the skull by hand and name the file under [landmarks]: "
                 "the jaws are then separated by them",
             )
@@ -110,9 +110,9 @@ class ProposedLandmarks:
                         "landmark-doubtful",
                         f"{name} ({kind}) at ({x:.1f}, {y:.1f}, {z:.1f}) is doubtful: {site.doubt}",
                         where=f"landmarks.{kind}",
-                        why="whatever is placed from it inherits its error",
-                        fix='look at it in the picture of "cmfsim landmarks", and place it by hand '
-                        "where it is wrong",
+                        why="everything placed from it inherits its error",
+                        fix='check it in the picture of "cmfsim landmarks", and place it by '
+                        "hand if it is wrong",
                     )
         for kind, missing in (("skull", self.missing_skull), ("skin", self.missing_skin)):
             for reason in dict.fromkeys(missing.values()):
@@ -121,6 +121,6 @@ class ProposedLandmarks:
                     "landmarks-missing",
                     f"{len(names)} {kind} landmarks were not found: {', '.join(names)}: {reason}",
                     where=f"landmarks.{kind}",
-                    why="they are omitted rather than guessed; whatever needs them is refused",
+                    why="they are omitted rather than guessed; anything that needs them is refused",
                     fix="place them by hand if the image shows them",
                 )

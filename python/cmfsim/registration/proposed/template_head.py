@@ -47,7 +47,7 @@ class TemplateHead(Frozen):
         if not self.bones or not self.skull:
             raise LandmarkInputError(
                 f"template head {self.name!r} has {len(self.bones)} bones and {len(self.skull)} "
-                "skull landmarks: it needs both"
+                "skull landmarks: both are needed"
             )
         for name, bone in self.bones.items():
             check_instance(f"bone {name!r} of template head {self.name!r}", bone, SurfaceData)

@@ -1,4 +1,4 @@
-"""What the bands of methods held, as text: covered patients, and how many were to be expected."""
+"""The coverage of the bands of methods, as text: covered patients, and the expected number."""
 
 from collections.abc import Sequence
 
@@ -12,8 +12,9 @@ from cmfsim.study.benchmark.results import REGIONS, MethodResult
 __all__ = ["band_sections"]
 
 ABOUT = (
-    "Patients whose true skin lies within the band at all vertices of a region; in brackets, "
-    "between how many a band of this calibration holds with a probability of 90 %."
+    "Number of patients whose true skin lies within the band at all vertices of a region; in "
+    "brackets, the range of this number that a band of this calibration has with a probability "
+    "of 90 %."
 )
 
 
@@ -31,8 +32,8 @@ def band_sections(results: Sequence[MethodResult], far: Sequence[str]) -> list[s
         if result.band is not None and not result.band.factors:
             found.append(
                 f"**{result.method}** states standard deviations, but {len(result.band.cases)} "
-                f"patients to calibrate it on are too few for a band: "
-                f"{cases_needed(COVERAGE)} are needed."
+                f"calibration patients are too few for a band: {cases_needed(COVERAGE)} are "
+                "needed."
             )
         elif result.band is not None and result.band.missing:
             names = ", ".join(result.band.missing)

@@ -215,7 +215,7 @@ def check_own(method: str, prediction: SkinPrediction, patient: BenchmarkPatient
     if method in own and not prediction.made_from.endswith(patient.digest()):
         raise CaseInputError(
             "was made by another version, or before the patient was made again: predict it "
-            f"again (--entries {method}), or give your own method another name"
+            f"again (--entries {method}), or rename your own method"
         )
 
 
@@ -233,7 +233,9 @@ def learned_entries(
     """
     both = {patient.name for patient in training} & {patient.name for patient in patients}
     if both:
-        raise CaseInputError(f"{', '.join(sorted(both))}: in the training part, so not predicted")
+        raise CaseInputError(
+            f"{', '.join(sorted(both))}: not predicted, because they are in the training part"
+        )
     taught = hashlib.sha256("".join(p.digest(truth=True) for p in training).encode()).hexdigest()
     place = EntryFolder(folder)
     made_from = {patient.name: f"{taught} {patient.digest()}" for patient in patients}

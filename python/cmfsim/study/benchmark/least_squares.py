@@ -91,7 +91,7 @@ class PartialLeastSquares:
 
 @dataclass(frozen=True, eq=False)
 class LearnedFace:
-    """What was learned from the training part.
+    """The model learned from the training part.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class LearnedFace:
 
 
 def learn_face(patients: Sequence[BenchmarkPatient]) -> LearnedFace:
-    """What the patients of a training part teach.
+    """The training data of the patients of a part.
 
     Raises
     ------

@@ -38,7 +38,7 @@ PREDICTIONS, RESULTS = "predictions", "benchmark"
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What a benchmark found, and the files that say so.
+    """The results of a benchmark, and their files.
 
     Attributes
     ----------
@@ -64,27 +64,30 @@ def run_benchmark(
 ) -> Benchmark:
     """The scores of every method that has predictions in a population's folder.
 
-    The package's own entries are predicted first, where they are not there yet. Then each folder of
-    `predictions` is a method, whoever made it.
+    The package's own entries are predicted first if they do not exist yet. Then each folder of
+    `predictions` is scored as a method, whoever made it.
 
     Parameters
     ----------
     folder : path
         Written by `virtual_population`.
     part : str
-        "test"; or "calibration" or "train", which show nothing about a method that learned there.
+        "test"; or "calibration" or "train", which say nothing about a method that learned from
+        them.
     entries : sequence of str
-        Own entries to predict; may be empty. "hyperelastic" takes longer and has to be named.
+        Own entries to predict; may be empty. "hyperelastic" takes longer and must be named.
     band : sequence of str
-        Models among them that state a standard deviation too, also for the part `calibration`: from
-        that part follows how many of them hold 90 % of patients, and this part shows whether.
+        Models among them that also provide a standard deviation, for the part `calibration` as
+        well. That part determines how many standard deviations cover 90 % of patients, and the
+        scored part tests it.
     band_parts : sequence of str, optional
-        The parts that bands are calibrated on: "calibration" if left out. "train" as well gives
-        more patients, where no method with a band has learned from it.
+        The parts on which bands are calibrated; default "calibration". Adding "train" gives more
+        patients, if no method with a band has learned from it.
     workers : int
         Patients predicted at a time.
     scheduler : str, optional
-        Address of a Dask cluster that sees the same folder; it then decides how many at a time.
+        Address of a Dask cluster with access to the same folder; it then decides how many run at a
+        time.
     progress : callable, optional
         Called with a line of text.
 
@@ -102,8 +105,8 @@ def run_benchmark(
 
     Notes
     -----
-    Any method may state standard deviations: those of the calibration part calibrate its band. For
-    models of this package the calibration is written as `benchmark/calibration_MODEL.json`.
+    Any method may provide standard deviations; those of the calibration part calibrate its band.
+    For models of this package, the calibration is written as `benchmark/calibration_MODEL.json`.
 
     Examples
     --------
@@ -126,8 +129,9 @@ def run_benchmark(
     pending = population.named(PENDING)
     if pending:
         raise CaseInputError(
-            f"{', '.join(pending[:5])}{'…' if len(pending) > 5 else ''}: not made yet; run cmfsim "
-            "virtual-patients --count again, so that all methods are scored on the same patients"
+            f"{', '.join(pending[:5])}{'…' if len(pending) > 5 else ''}: not yet made; run "
+            "cmfsim virtual-patients --count again, so that all methods are scored on the same "
+            "patients"
         )
     patients = patients_of(place, population, [part])
     if not patients:
@@ -135,8 +139,8 @@ def run_benchmark(
     predictions = place / PREDICTIONS
     if part in band_parts:
         raise CaseInputError(
-            f"the part {part!r} is scored, and bands are calibrated on it, which proves "
-            "nothing; score another part, or name other band_parts"
+            f"the part {part!r} would be used both for scoring and for calibrating the bands, "
+            "which proves nothing; score another part, or choose other band_parts"
         )
     calibrating = patients_of(place, population, band_parts)
     jobs = _jobs(patients, predictions, entries, band)
@@ -146,7 +150,7 @@ def run_benchmark(
         learned_entries(patients_of(place, population, [TRAIN]), patients, predictions)
     methods = _methods(predictions)
     if not methods:
-        raise CaseInputError(f"{predictions}: no method has a folder there (docs/benchmark.md)")
+        raise CaseInputError(f"{predictions}: contains no folder of a method (docs/benchmark.md)")
     results = [_result(predictions, method, patients, calibrating) for method in methods]
     table = BenchmarkTable(
         part,

@@ -34,15 +34,15 @@ class SkinPrediction:
     displacement : (v, 3) float64, mm
     half_width : (v,) float64, mm, or None
         Of a band along the normal that, according to the method, covers 90 % of patients in each
-        region of the face. NaN where it states none.
+        region of the face. NaN where there is none.
     sd : (v,) float64, mm, or None
         Instead of `half_width`, the expected standard deviation along the normal, above 0: the part
         `calibration` then determines how many of them cover 90 % of patients.
     settings : str
-        What the standard deviation depends on apart from the patient, as JSON: predictions with
-        different settings do not calibrate one another.
+        The settings on which the standard deviation depends besides the patient, as JSON:
+        predictions with different settings do not calibrate one another.
     made_from : str
-        What the package's own entries were made from, to reuse them; empty for other methods.
+        A digest of the inputs of the package's own entries, for reuse; empty for other methods.
     """
 
     vertices: Floats
@@ -91,8 +91,8 @@ class SkinPrediction:
         places = as_rows("skin", skin, 3)
         if len(places) != len(self.vertices):
             raise CaseInputError(
-                f"{len(self.vertices)} vertices, but the patient's skin.ply has {len(places)}: was "
-                "the population made again, with another seed or resolution?"
+                f"{len(self.vertices)} vertices, but the patient's skin.ply has {len(places)}: "
+                "check whether the population was made again with another seed or resolution"
             )
         away = np.linalg.norm(self.vertices - places, axis=1)
         bad = np.flatnonzero(away > SAME_PLACE)

@@ -35,9 +35,9 @@ COLUMNS = (
     "standard_deviations",
 )
 NOTE = (
-    "In silico: heads made by code and operations computed; no patients. Each figure is the mean "
-    "of the patients' figures. The error is the length of the difference from the true "
-    "displacement of a vertex, sliding along the skin included."
+    "In silico: synthetic heads and computed operations, no patients. Each figure is the mean "
+    "over patients. The error at a vertex is the length of the difference from its true "
+    "displacement, including sliding along the skin."
 )
 
 
@@ -49,7 +49,7 @@ class BenchmarkTable:
     ----------
     part : str
     patients : tuple of str
-        Who are scored.
+        The scored patients.
     without_truth : tuple of str
         Patients of the part whose truth could not be computed.
     results : tuple of MethodResult
@@ -174,13 +174,13 @@ class BenchmarkTable:
         found = []
         if self.without_truth:
             names = ", ".join(self.without_truth)
-            found.append(f"Without a truth, and so not scored: {names} (population.json).")
+            found.append(f"Not scored, because they have no truth: {names} (population.json).")
         for result in self.results:
             if result.missing:
                 reason = f"; it failed on {', '.join(result.failed)}" if result.failed else ""
                 found.append(
-                    f"**{result.method}** has no prediction of {', '.join(result.missing)}"
-                    f"{reason}: its figures are of fewer patients than the others', and not to be "
-                    "compared."
+                    f"**{result.method}** has no prediction of "
+                    f"{', '.join(result.missing)}{reason}: its figures are from fewer patients "
+                    "than those of the other methods and cannot be compared with them."
                 )
         return found

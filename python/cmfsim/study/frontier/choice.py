@@ -24,7 +24,7 @@ KEY_LENGTH = 16
 
 @dataclass(frozen=True)
 class Choice:
-    """All that a sweep varies of one prediction.
+    """The settings of a prediction that a sweep varies.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Choice:
     Raises
     ------
     CaseError
-        (also `ValueError`) A name or number that cannot be meant.
+        (also `ValueError`) An invalid name or number.
 
     Examples
     --------
@@ -76,12 +76,12 @@ class Choice:
         self.options(SolverOptions())
 
     def options(self, given: SolverOptions) -> SolverOptions:
-        """Solver options with what this choice says; the rest is as given."""
+        """Solver options with the values of this choice; the others are as given."""
         named = {f.name for f in fields(SolverOptions)}
         return replace(given, **{k: v for k, v in asdict(self).items() if k in named})
 
     def case(self, given: Case) -> Case:
-        """A case as this choice builds and solves it; muscles only where the model has them."""
+        """A case with the settings of this choice; muscles only if the model has them."""
         muscles = None
         if self.model.startswith("M"):
             muscles = replace(
@@ -91,23 +91,23 @@ class Choice:
         return replace(given, mesh=mesh, muscles=muscles, solver=self.options(given.solver))
 
     def changes(self, base: "Choice") -> dict[str, Any]:
-        """What is otherwise than in another choice, by name."""
+        """The settings that differ from another choice, by name."""
         other = asdict(base)
         return {name: value for name, value in asdict(self).items() if other[name] != value}
 
     def key(self, of: str) -> str:
-        """A name for what this choice solves, of the case (and version) that `of` stands for."""
+        """A key of the solution of this choice, for the case (and version) that `of` identifies."""
         return _hash(of, asdict(self))
 
     def build_key(self, of: str) -> str:
-        """A name for what this choice builds: choices that share a build share it."""
+        """A key of the build of this choice: choices with the same build have the same key."""
         muscles = self.model.startswith("M")
         names = BUILD_FIELDS if muscles else ("edge_length",)
         return _hash(of, {"muscles": muscles, **{name: getattr(self, name) for name in names}})
 
 
 def case_choice(case: Case) -> Choice:
-    """The choice that a case makes by itself: the package's defaults where its file is silent.
+    """The settings of a case: the defaults of the package where its file has none.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a sweep leaves in its folder."""
+"""The files of a sweep."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -50,30 +50,30 @@ def frontier(  # noqa: PLR0913 (options by name)
 ) -> Frontier:
     """Error on the skin against run time of many ways to predict one face.
 
-    Every build and every solve is a process of its own; choices that share a model share its build.
-    Solves are repeated in rounds (A B C, A B C), so that a disturbance of the machine meets all of
-    them alike. A choice that is refused or fails is a row with its error.
+    Every build and every solve is a separate process; choices that share a model share its build.
+    Solves are repeated in rounds (A B C, A B C), so that a disturbance of the machine affects all
+    of them alike. A choice that is refused or fails is a row with its error.
 
     Parameters
     ----------
     case : Case
     folder : path
-        Keeps models and finished runs, so that a sweep that was stopped goes on, and one that is
-        widened runs what is new.
+        Keeps models and finished runs, so that an interrupted sweep continues, and a wider sweep
+        runs only what is new.
     choices : iterable of Choice, optional
-        The first is the base; `sweep_choices(case_choice(case))` where left out.
+        The first is the base; default `sweep_choices(case_choice(case))`.
     reference : Choice, optional
-        What all are compared with; quadratic hyperelastic tets of the smallest edge length of the
-        choices with many samples where left out.
+        The choice with which all are compared; default: quadratic hyperelastic tets of the smallest
+        edge length of the choices, with many samples.
     repeats : int
         Rounds of timing. A solve of more than a minute is timed once.
     threads : int, optional
-        Of each process; all cores where left out.
+        Of each process; default: all cores.
     time_limit : float, s
-        For one build or solve; ten times as long for the reference. What is stopped is not tried on
-        smaller tets.
+        For one build or solve; ten times as long for the reference. A choice that is stopped is not
+        tried on smaller tets.
     fresh : bool
-        Whether what an earlier run finished is done again.
+        Whether finished runs are repeated.
     progress : callable, optional
         Called with the name of each job as it begins.
 
@@ -86,15 +86,15 @@ def frontier(  # noqa: PLR0913 (options by name)
     CaseError
         (also `ValueError`) No choice, less than one round or thread, no time.
     SolverError
-        The reference was not built or solved: there is nothing to compare with.
+        The reference was not built or solved, so there is nothing to compare with.
     OSError
         The folder cannot be written to.
 
     Notes
     -----
     Error: |u - u_ref| at vertices of the detailed face of the patient, the same for every choice,
-    carried by each prediction as its mesh's skin moves. It holds what mesh, element, kinematics and
-    sampling do, and not what the laws of tissue or the plan do.
+    carried by each prediction as its mesh's skin moves. It includes the effects of mesh, element,
+    kinematics and sampling, but not those of the tissue laws or the plan.
 
     Examples
     --------

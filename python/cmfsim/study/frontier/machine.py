@@ -1,4 +1,4 @@
-"""What a bench ran on."""
+"""The machine on which a bench ran."""
 
 import os
 import platform

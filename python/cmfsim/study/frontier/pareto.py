@@ -1,4 +1,4 @@
-"""Which choices no other one beats in both of two costs."""
+"""The choices that no other choice beats in both of two costs."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

@@ -42,13 +42,13 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class FrontierRow:
-    """What one choice costs and buys.
+    """The cost and the error of one choice.
 
     Attributes
     ----------
     choice : Choice
     is_base, is_reference : bool
-        Whether it is the case's own choice, or what the others are compared with.
+        Whether it is the case's own choice, or the choice with which the others are compared.
     error : mapping of str to DistanceStatistics
         |u - u_ref|, mm, over the face, its regions and the whole skin; empty where it failed.
     build_wall, build_cpu : float or None, s
@@ -63,10 +63,10 @@ class FrontierRow:
     details : mapping
         Residual, iterations and contact of the solution, seconds of each stage.
     failure : str
-        Why there is no prediction; empty where there is one.
+        Why there is no prediction; empty if there is one.
     on_front : bool
-        Whether no other row is as near (to 0.001 mm in the mean) in less time. The reference, whose
-        error is 0 by definition, takes no part.
+        Whether no other row is as accurate (to 0.001 mm in the mean) in less time. The reference,
+        whose error is 0 by definition, is not a candidate.
     """
 
     choice: Choice
@@ -152,12 +152,12 @@ class Frontier:
 
     @property
     def reference(self) -> FrontierRow:
-        """What all others are compared with."""
+        """The row with which all others are compared."""
         return next(row for row in self.rows if row.is_reference)
 
     @property
     def front(self) -> tuple[FrontierRow, ...]:
-        """The rows that no other one beats, the fastest first."""
+        """The rows that no other row beats, fastest first."""
         rows = [row for row in self.rows if row.on_front]
         return tuple(sorted(rows, key=lambda row: row.total_wall or 0.0))
 

@@ -60,8 +60,8 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
     regions = {**regions, SKIN: on_tissue | regions[WHOLE]}
     if not regions[WHOLE].any():
         raise CaseInputError(
-            f"{patient.name}: no point of the skin lies on the face: are the skin landmarks in the "
-            "frame of the image?"
+            f"{patient.name}: no point of the skin is on the face: check that the skin landmarks "
+            "are in the frame of the image"
         )
     chosen = np.flatnonzero(regions[SKIN])
     chosen = chosen[:: -(-len(chosen) // MOST_POINTS)]

@@ -1,4 +1,4 @@
-"""What a sweep runs: one factor at a time from a base, and a grid of the three that matter most."""
+"""The runs of a sweep: one factor at a time from a base, and a grid of the three main ones."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -39,7 +39,7 @@ REFERENCE_TOLERANCE = 0.1
 def reference_choice(
     base: Choice, edge_length: float, *, kinematics: str = "hyperelastic"
 ) -> Choice:
-    """What a sweep is compared with: quadratic tets, large deformation, many samples.
+    """The reference of a sweep: quadratic tets, large deformation, many samples.
 
     Parameters
     ----------

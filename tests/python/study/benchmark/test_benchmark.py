@@ -180,7 +180,7 @@ def test_standard_deviations_are_calibrated_on_another_part(folder):
     assert f"calibrated without {calibrating[9]}" in found.markdown()
     (folder / "predictions" / "stated" / f"{calibrating[8]}.npz").unlink()
     text = cmfsim.run_benchmark(folder, entries=[]).table.markdown()
-    assert "8 patients to calibrate it on are too few for a band: 9 are needed" in text
+    assert "8 calibration patients are too few for a band: 9 are needed" in text
 
 
 def test_standard_deviations_of_other_settings_are_not_mixed(folder):
@@ -206,7 +206,7 @@ def test_nothing_is_left_out(folder):
     found = cmfsim.run_benchmark(folder, entries=["no-change"])
     text = found.table.markdown()
     assert "**worse** has no prediction of D009" in text
-    assert f"Without a truth, and so not scored: D{FAILED:03d}" in text
+    assert f"Not scored, because they have no truth: D{FAILED:03d}" in text
     summary = next(line for line in text.splitlines() if line.startswith("| worse |"))
     assert "4 of 5" in summary
     assert "upper lip" in summary.split("|")[-2]
@@ -267,7 +267,7 @@ def test_what_is_refused_says_where_and_why(folder):
     patient = BenchmarkPatient("D003", folder / "D003")
     skin, still = patient.skin, np.zeros_like(patient.skin)
     for vertices, moves, words in (
-        (skin[:-1], still[:-1], "was the population made again"),
+        (skin[:-1], still[:-1], "whether the population was made again"),
         (skin[::-1], still, r"vertices\[0\] lies"),
         (skin + 0.1, still, "before the operation, in its order"),
     ):
@@ -290,7 +290,7 @@ def test_what_is_refused_says_where_and_why(folder):
         cmfsim.SkinPrediction(skin, still, half_width=ones, sd=ones)
     with pytest.raises(CaseInputError, match=r"sd\[4\] is 0 mm: above 0"):
         cmfsim.SkinPrediction(skin, still, sd=np.where(np.arange(len(skin)) == 4, 0.0, 1.0))
-    with pytest.raises(CaseInputError, match="bands are calibrated on it"):
+    with pytest.raises(CaseInputError, match="calibrating the bands"):
         cmfsim.run_benchmark(folder, entries=[], part="train", band_parts=["train"])
     with pytest.raises(CaseInputError, match=r"band is 'M'"):
         cmfsim.run_benchmark(folder, entries=["H"], band=["M"])
@@ -309,7 +309,7 @@ def test_a_population_that_is_not_complete_is_refused(folder):
     entries = dict(population.patients)
     entries["D018"] = cmfsim.PopulationEntry("pending", "test", "M")
     cmfsim.Population(entries).write(folder)
-    with pytest.raises(CaseInputError, match="D018: not made yet"):
+    with pytest.raises(CaseInputError, match="D018: not yet made"):
         cmfsim.run_benchmark(folder, entries=[])
 
 
@@ -317,7 +317,7 @@ def test_learning_never_sees_the_test(folder):
     """A patient in both is an error; the truth of the test part changes no prediction."""
     population = cmfsim.Population.load(folder)
     train, test = (patients_of(folder, population, [part]) for part in ("train", "test"))
-    with pytest.raises(CaseInputError, match="D003: in the training part"):
+    with pytest.raises(CaseInputError, match="D003: not predicted, because they are in"):
         learned_entries([*train, test[0]], test, folder / "predictions")
     learned_entries(train, test, folder / "predictions")
     files = sorted((folder / "predictions" / "pls").glob("*.npz"))

@@ -174,7 +174,7 @@ impl<'a> State<'a> {
         MtmError::NotPositiveDefinite {
             node,
             detail: format!(
-                "conjugate gradients met pᵀAp = {pq:.3e} and rᵀM⁻¹r = {:.3e}; is a part not held?",
+                "conjugate gradients met pᵀAp = {pq:.3e} and rᵀM⁻¹r = {:.3e}; check whether a part is not constrained",
                 self.rz
             ),
         }
@@ -207,7 +207,7 @@ impl<'a> State<'a> {
         let advice = if due.exhausted {
             "allow more iterations (max_iterations) or a larger tolerance, or use method=\"cholesky\""
         } else {
-            "rounding lets it fall no further: use method=\"cholesky\", or allow a larger tolerance"
+            "rounding prevents a smaller error: use method=\"cholesky\", or allow a larger tolerance"
         };
         MtmError::NotConverged { method: "pcg", iterations, shortfall, advice }
     }

@@ -201,7 +201,7 @@ fn check_halvings(halvings: &Halvings<'_>, n_voxels: usize, refinements: u32) ->
             what: "needed refinements".into(),
             index,
             value: f64::from(needed[index]),
-            allowed: "0 to the refinements of the options: ask for fewer there or allow more",
+            allowed: "0 to the refinements of the options: request fewer or allow more",
             kind,
         });
     }
@@ -231,7 +231,7 @@ impl Cover {
                 what: "edge_length".into(),
                 index: 0,
                 value: edge,
-                allowed: "large enough for at most 1e8 cubes over the tissue; are both in mm?",
+                allowed: "large enough for at most 1e8 cubes over the tissue; check the units",
                 kind: ErrorKind::Mesh,
             });
         }

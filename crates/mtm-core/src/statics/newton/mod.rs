@@ -139,7 +139,7 @@ impl Equilibrium {
                 return Err(MtmError::UnknownName {
                     what: "method with large rotations",
                     found: options.method.name().into(),
-                    known: "auto, cholesky, pcg (relaxation is of linear kinematics)",
+                    known: "auto, cholesky, pcg (relaxation needs linear kinematics)",
                     kind: ErrorKind::Solver,
                 });
             }

@@ -439,6 +439,6 @@ fn by_node(springs: &[Spring], moved: &[f64]) -> Vec<[f64; 3]> {
 pub(crate) fn unheld() -> MtmError {
     MtmError::NotPositiveDefinite {
         node: 0,
-        detail: "contact forces carry sliding nodes on by more than the tissue holds".into(),
+        detail: "contact forces push sliding nodes further than the tissue restrains".into(),
     }
 }

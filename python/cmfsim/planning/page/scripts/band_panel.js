@@ -12,8 +12,8 @@ export class BandPanel {
     const percent = Math.round(100 * band.coverage);
     const cases = band.regions[0]?.cases;
     const meaning = band.state === "calibrated"
-      ? `In ${percent} % of cases like the ${cases} of the calibration, all of a region lies this near, along the skin's normal.`
-      : `Uncalibrated: a multiple of the standard deviation that follows from assumptions on tissue and surgery. No case with a known outcome shows that it holds ${percent} %.`;
+      ? `In ${percent} % of cases like the ${cases} of the calibration, all of a region is within this distance, along the skin's normal.`
+      : `Uncalibrated: a multiple of the standard deviation that follows from assumptions about tissue and surgery. No case with a known outcome shows that it covers ${percent} %.`;
     this.root.append(
       element("h2", { textContent: `How far to trust it (${band.state})` }),
       element("table", { id: "band" },

@@ -55,7 +55,7 @@ export class Drawing {
   constructor(canvas, mapColours) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
     if (!gl) {
-      throw new Error("this browser offers no WebGL 2: switch on hardware graphics, or use another browser");
+      throw new Error("this browser does not support WebGL 2: enable hardware graphics, or use another browser");
     }
     this.canvas = canvas;
     this.gl = gl;

@@ -21,7 +21,7 @@ export class ExportPanel {
       this.command,
       element("div", { className: "row" },
         button("Save the plan", () => this.savePlan(), { id: "save-plan" }),
-        button("Copy the command", async () => app.report((await copied(this.command.textContent)) ? "Copied." : "Not copied: the browser does not allow it; select the text instead."))),
+        button("Copy the command", async () => app.report((await copied(this.command.textContent)) ? "Copied." : "Not copied, because the browser does not allow it: select the text instead."))),
       element("h2", { textContent: "Files" }),
       element("div", { className: "row" }, element("label", { for: "plan-file", textContent: "Load a plan" }), this.file),
       element("div", { className: "row" }, element("label", { for: "direction", textContent: "Direction" }), this.direction,
@@ -29,7 +29,7 @@ export class ExportPanel {
       element("div", { className: "row" },
         button("Save the face (STL)", () => this.saveFace(), { id: "save-face" }),
         button("Save a picture (PNG)", () => app.savePicture(), { id: "save-picture" })),
-      element("p", { className: "note", textContent: "Coordinates are LPS in mm. The face is that of the plan operator, not solved exactly." }));
+      element("p", { className: "note", textContent: "Coordinates are LPS in mm. The face comes from the plan operator and is not solved exactly." }));
   }
 
   get stem() {
@@ -59,7 +59,7 @@ export class ExportPanel {
     const file = input.files[0];
     if (!file) return;
     try {
-      if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes: a plan is never that large`);
+      if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes, which is too large for a plan`);
       const { motions, warning } = planOf(this.app.page, await file.text());
       this.app.load(motions, warning);
     } catch (error) {

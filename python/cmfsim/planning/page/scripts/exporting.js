@@ -41,12 +41,12 @@ export function planOf(page, text) {
   const strange = Object.keys(found).filter((name) => !names.includes(name));
   if (strange.length) throw new Error(`the plan moves ${strange[0]}, which this page does not have: ${names.join(", ")}`);
   const missing = names.filter((name) => !(name in found));
-  if (missing.length) throw new Error(`the plan does not mention ${missing.join(", ")}: give the unit matrix to what stays`);
+  if (missing.length) throw new Error(`the plan does not mention ${missing.join(", ")}: give the identity matrix to segments that do not move`);
   for (const name of names) {
     const matrix = found[name];
     if (matrix.slice(12).join() !== "0,0,0,1") throw new Error(`${name}: the last row is not 0, 0, 0, 1`);
     const error = rigidError(matrix);
-    if (!(error <= MOST_ROUNDING)) throw new Error(`${name}: not a rotation and a shift (off by ${error.toExponential(1)})`);
+    if (!(error <= MOST_ROUNDING)) throw new Error(`${name}: not a rotation and a translation (off by ${error.toExponential(1)})`);
   }
   const made = /^# made for: (.+)$/m.exec(text)?.[1].trim();
   let warning = "";
@@ -66,7 +66,7 @@ function readTables(text) {
     const head = /^\[plan\.(?:([A-Za-z0-9_-]+)|("(?:[^"\\]|\\.)*"))\]$/.exec(line);
     if (head && !pending) {
       name = head[1] ?? JSON.parse(head[2]);
-      if (Object.hasOwn(found, name)) fail(`${name} appears here a second time`);
+      if (Object.hasOwn(found, name)) fail(`${name} appears a second time`);
       return;
     }
     if (name === null) fail("not a table [plan.SEGMENT]");

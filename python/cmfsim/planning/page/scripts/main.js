@@ -76,7 +76,7 @@ class App {
     this.profileNote = element("p", { className: "note" });
     document.getElementById("panel").append(
       this.panel.root, this.pulling.root, this.variants.root,
-      element("div", {}, element("h2", { textContent: "Profile in the midline" }), this.profile, this.profileNote),
+      element("div", {}, element("h2", { textContent: "Midline profile" }), this.profile, this.profileNote),
       this.measuring.root, this.trusting.root, this.exporting.root);
     connectPointing(this);
     connectKeys(this);
@@ -257,14 +257,14 @@ class App {
       box.textContent = `Solved exactly on this machine in ${seconds.toFixed(1)} s${converged ? "" : "; contact stopped above its tolerance"}.`;
       warned = !converged;
     } else if (distance <= SAME_PLAN) box.textContent = "The case's plan: this face was solved exactly.";
-    else if (!slides) box.textContent = "No tissue slides in this model: the face is that of an exact solution (rounding 0.01 mm).";
+    else if (!slides) box.textContent = "No tissue slides in this model: the face equals the exact solution (rounding 0.01 mm).";
     else if (!found) {
-      box.textContent = `This plan is ${distance.toFixed(1)} mm from the case's own, farther than any plan that was tried (${reach.toFixed(1)} mm): the face may be wrong. Solve it exactly.`;
+      box.textContent = `This plan is ${distance.toFixed(1)} mm from the case's own, farther than any plan that was tested (${reach.toFixed(1)} mm): the face may be wrong. Solve it exactly.`;
       warned = true;
     } else {
       const count = trials.filter((t) => !t.failed).length;
       const failed = trials.length - count;
-      const corrected = leftOut.length ? ` and ${leftOut.length} left out of the correction in turn` : "";
+      const corrected = leftOut.length ? ` and ${leftOut.length} left out of the correction one by one` : "";
       box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average; at most ${found.usual.toFixed(2)} mm in nine of ten plans as far away, ${found.largest.toFixed(2)} mm in the worst (an estimate from exact solutions of ${count} other plans${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
       if (failed) box.textContent += ` ${failed} more could not be solved.`;
       warned = found.usual > WARNED_ERROR;
@@ -277,7 +277,7 @@ class App {
     const box = document.getElementById("teeth-state");
     const { occlusion, occlusion_absent: absent } = this.page;
     if (!occlusion) {
-      box.textContent = `Teeth are not checked: ${absent}`;
+      box.textContent = `The teeth are not checked: ${absent}`;
       return;
     }
     this.depthBefore ??= this.face.toothDepth(null);

@@ -153,7 +153,7 @@ export class PullPanel {
     const moved = WISHES.map(({ key }, i) => `${signed(numbers[i])} ${key}`).join(", ");
     const away = this.goal && Math.hypot(...place.map((v, k) => v - this.goal[k]));
     this.state.textContent = `The point moves by ${moved} (mm).` +
-      (away === null || away === undefined || away < 0.1 ? "" : ` It is still ${away.toFixed(1)} mm from where it was pulled to.`);
+      (away === null || away === undefined || away < 0.1 ? "" : ` It is still ${away.toFixed(1)} mm from the position to which it was pulled.`);
   }
 
   /** Marks the point, and the way to its goal, in the picture. */

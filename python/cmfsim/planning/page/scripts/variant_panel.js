@@ -23,7 +23,7 @@ export class VariantPanel {
         button("New from the case's plan", () => this.add(app.plans.reference)),
         button("New without movement", () => this.add(app.plans.reference.map(() => STAYS))),
         this.removal = button("Remove", () => { app.plans.remove(); app.changed(); }),
-        button("Reset all", () => app.reset(), { title: "The case's plan alone; undo brings the variants back" })),
+        button("Reset all", () => app.reset(), { title: "Keep only the case's plan; undo restores the variants" })),
       this.differences);
   }
 

@@ -51,7 +51,7 @@ export class ViewPanel {
     bar.style.background = `linear-gradient(to right, ${MAP_COLOURS.join(",")})`;
     const ends = [0, most / 2, most].map((v) => element("span", { textContent: v.toFixed(1) }));
     this.legend.replaceChildren(
-      element("div", { textContent: map ? "Movement of the skin, mm" : "Half the width of the band, mm (0: none is stated)" }), bar,
+      element("div", { textContent: map ? "Movement of the skin, mm" : "Half the width of the band, mm (0: none is available)" }), bar,
       element("div", { className: "ends" }, ...ends));
   }
 }
