@@ -48,7 +48,6 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
     for row in (
         "_core",
         "errors deferred",
-        "checks",
         "values",
         "io registration surfaces",
         "phantom",

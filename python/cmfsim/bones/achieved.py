@@ -21,7 +21,9 @@ from cmfsim.bones.motion import RemovedBone, missing_patches
 from cmfsim.bones.paired import paired_shape
 from cmfsim.bones.shape_fit import ShapeFit
 from cmfsim.bones.stray import StrayPatch, stray_patches
-from cmfsim.checks import (
+from cmfsim.errors import RegistrationError, RegistrationInputError
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import (
     Floats,
     as_floats,
     as_positive,
@@ -30,8 +32,6 @@ from cmfsim.checks import (
     check_one_of,
     frozen,
 )
-from cmfsim.errors import RegistrationError, RegistrationInputError
-from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix
 from cmfsim.values.surface_data import MovedSurface, SurfaceData

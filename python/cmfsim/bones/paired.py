@@ -21,8 +21,8 @@ from cmfsim.bones.shape_fit import (
     vertex_areas,
 )
 from cmfsim.bones.stray import LEAST_STRAY, StrayPatch, stray_patches
-from cmfsim.checks import Floats
 from cmfsim.errors import RegistrationError
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["PairedShape", "paired_shape"]

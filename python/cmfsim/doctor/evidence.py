@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import PRESETS, Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseError, CmfsimError
 from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface
 from cmfsim.io.images import read_image_file
@@ -18,6 +17,7 @@ from cmfsim.io.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import MovedSurface, SurfaceData

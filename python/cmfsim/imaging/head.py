@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_point
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.air import air_level
 from cmfsim.imaging.attached import attached_findings
@@ -24,6 +23,7 @@ from cmfsim.imaging.skin import Skin, find_skin
 from cmfsim.imaging.view import view_findings
 from cmfsim.imaging.working import Working, working_grid
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.progress import Progress

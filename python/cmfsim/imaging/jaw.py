@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.guess import guessed_landmarks
 from cmfsim.imaging.morphology import (
@@ -25,6 +24,7 @@ from cmfsim.imaging.morphology import (
     watershed,
 )
 from cmfsim.imaging.working import Working
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
 __all__ = ["Jaws", "part_jaws"]

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, as_positive
 
 __all__ = [
     "LEGEND_ROW",

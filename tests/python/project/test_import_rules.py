@@ -33,7 +33,7 @@ def test_the_project_keeps_its_import_rules(capsys: pytest.CaptureFixture[str]) 
         ("crates/mtm-core/src/new.rs", "", "add new to CORE"),
         ("crates/mtm-core/src/new/deep.rs", "", "deep.rs: add new to CORE"),
         ("crates/mtm-core/src/utils.rs", "", "name the file after its subject"),
-        ("python/cmfsim/checks.py", "from cmfsim import values", "checks may not import values"),
+        ("python/cmfsim/errors.py", "from cmfsim import values", "errors may not import values"),
         ("python/cmfsim/values/scene.py", "from .. import io", "values may not import io"),
         ("python/cmfsim/meshing/a.py", "import cmfsim.imaging", "meshing may not import imaging"),
         ("python/cmfsim/report.py", "from cmfsim.study import run", "report may not import study"),

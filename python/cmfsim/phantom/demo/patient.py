@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.checks import as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_surface
 from cmfsim.io.files import replacing
@@ -14,6 +13,7 @@ from cmfsim.phantom import HeadParameters, PhantomHead, make_head
 from cmfsim.phantom.demo.truth import DemoTruth, read_demo_truth
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import as_positive
 
 __all__ = ["DEMO_PARAMETERS", "DemoCase", "write_demo_case"]
 

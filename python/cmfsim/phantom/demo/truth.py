@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, as_index_rows, as_rows
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["TRUTH_FILE", "DemoTruth", "read_demo_truth"]

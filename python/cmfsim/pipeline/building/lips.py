@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface, TetMesh
-from cmfsim.checks import Floats, Indices
 from cmfsim.errors import MeshError
 from cmfsim.io import Case, read_surface
 from cmfsim.meshing import separated_mesh
@@ -20,6 +19,7 @@ from cmfsim.pipeline.building.held import held_part
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds

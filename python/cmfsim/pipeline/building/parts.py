@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from cmfsim._core import TetMesh
-from cmfsim.checks import Floats
 from cmfsim.io import Case
 from cmfsim.meshing import MeshReport, TissueRegion
 from cmfsim.meshing.lips import LipSeam
@@ -13,6 +12,7 @@ from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.lips import CaseLipContact
 from cmfsim.registration.proposed import ProposedLandmarks
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.lifted_tissue import LiftedTissue

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh
-from cmfsim.checks import Floats
 from cmfsim.io import Case, read_surface, read_tet_mesh
 from cmfsim.meshing import (
     MeshOptions,
@@ -27,6 +26,7 @@ from cmfsim.pipeline.building.refinement import (
     needed_halvings,
 )
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io.landmarks import write_landmarks
 from cmfsim.io.surfaces import write_surface
@@ -19,6 +18,7 @@ from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, sc
 from cmfsim.pipeline.drafting.roles import MOVING, safe_key
 from cmfsim.pipeline.drafting.surfaces import Anatomy, Question, choose_surfaces
 from cmfsim.values.case_parts import PROCEDURES
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["CaseDraft", "draft_case"]

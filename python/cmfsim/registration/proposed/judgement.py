@@ -6,11 +6,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.registration.proposed.groups import misfits
 from cmfsim.registration.proposed.limits import CutPlane
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.registration.proposed.proposed_landmarks import ProposedSite
+from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
 __all__ = ["MissingSites", "judged", "missing_sites"]

@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.registration.proposed.detection import (
     Detected,
@@ -33,6 +32,7 @@ from cmfsim.registration.proposed.pose import (
 )
 from cmfsim.registration.proposed.proposed_landmarks import ProposedLandmarks
 from cmfsim.registration.proposed.template_head import TemplateHead
+from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
