@@ -22,7 +22,7 @@ from cmfsim.doctor.landmarks import LANDMARK_CODES
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseOrPath, as_case, write_model
 from cmfsim.meshing import tissue_level
-from cmfsim.node_kinds import KindOptions, dental_arches, kind_options
+from cmfsim.meshing.node_kinds import KindOptions, dental_arches, kind_options
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
 from cmfsim.pipeline.building.assembly import assembled
 from cmfsim.pipeline.building.case_checks import misplaced, plan_sizes

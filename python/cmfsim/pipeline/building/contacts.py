@@ -14,7 +14,7 @@ from cmfsim.bones import (
     contact_sheet,
     sheet_departure,
 )
-from cmfsim.node_kinds import DentalArches, KindOptions
+from cmfsim.meshing.node_kinds import DentalArches, KindOptions
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats

@@ -13,7 +13,7 @@ from cmfsim.errors import MeshError
 from cmfsim.io import Case, read_surface
 from cmfsim.meshing import separated_mesh
 from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
-from cmfsim.node_kinds import DentalArches
+from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.held import held_part
 from cmfsim.surfaces.levels import contact_surface

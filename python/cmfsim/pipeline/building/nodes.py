@@ -1,7 +1,7 @@
 """What each node of the soft tissue does, and which tets are left."""
 
 from cmfsim.meshing import report_of_part
-from cmfsim.node_kinds import DentalArches, KindOptions, classify_nodes, lifted_tissue
+from cmfsim.meshing.node_kinds import DentalArches, KindOptions, classify_nodes, lifted_tissue
 from cmfsim.pipeline.building.case_checks import cut_segments, untouched
 from cmfsim.pipeline.building.clefts import without_clefts
 from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets

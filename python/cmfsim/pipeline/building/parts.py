@@ -7,7 +7,7 @@ from cmfsim._core import TetMesh
 from cmfsim.io import Case
 from cmfsim.meshing import MeshReport, TissueRegion
 from cmfsim.meshing.lips import LipSeam
-from cmfsim.node_kinds import DentalArches
+from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.lips import CaseLipContact
 from cmfsim.registration.proposed import ProposedLandmarks

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.node_kinds import dental_arches
+from cmfsim.meshing.node_kinds import dental_arches
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.dental_arch import DentalArch
