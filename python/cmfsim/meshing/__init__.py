@@ -1,4 +1,7 @@
-"""From labels, levels or surfaces to tets, with a report of their quality."""
+"""From labels, levels or surfaces to tets, with a report of their quality.
+
+`node_kinds` states what each node does; `lips` finds the seam at which the mesh is cut.
+"""
 
 from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
 from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report, report_of_part
