@@ -49,8 +49,7 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
         "_core",
         "errors deferred",
         "values",
-        "io registration surfaces",
-        "phantom",
+        "io phantom registration surfaces",
         # The stages: none knows another.
         "bones evaluation imaging meshing muscles solving",
         "doctor pictures planning report",

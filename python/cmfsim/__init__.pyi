@@ -141,7 +141,6 @@ from cmfsim.phantom import HeadParameters as HeadParameters
 from cmfsim.phantom import Muscle as Muscle
 from cmfsim.phantom import PhantomHead as PhantomHead
 from cmfsim.phantom import make_head as make_head
-from cmfsim.phantom.case_files import write_phantom_case as write_phantom_case
 from cmfsim.pipeline.banding import band_regions as band_regions
 from cmfsim.pipeline.banding import band_settings as band_settings
 from cmfsim.pipeline.banding import predict_with_band as predict_with_band
@@ -261,3 +260,4 @@ from cmfsim.virtual import drawn_patient as drawn_patient
 from cmfsim.virtual import virtual_patients as virtual_patients
 from cmfsim.virtual import virtual_population as virtual_population
 from cmfsim.virtual import write_virtual_patient as write_virtual_patient
+from cmfsim.virtual.phantom_case import write_phantom_case as write_phantom_case

@@ -10,10 +10,10 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_surface
 from cmfsim.io.files import replacing
 from cmfsim.phantom import HeadParameters, PhantomHead, make_head
-from cmfsim.phantom.demo.truth import DemoTruth, read_demo_truth
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import as_positive
+from cmfsim.virtual.demo.truth import DemoTruth, read_demo_truth
 
 __all__ = ["DEMO_PARAMETERS", "DemoCase", "write_demo_case"]
 
@@ -148,7 +148,7 @@ def write_demo_case(
 
     Examples
     --------
-    >>> from cmfsim.phantom.demo import write_demo_case
+    >>> from cmfsim.virtual.demo import write_demo_case
     >>> made = write_demo_case("cmfsim-demo")  # doctest: +SKIP
     >>> prediction = cmfsim.predict(made.case, model="M")  # doctest: +SKIP
     """

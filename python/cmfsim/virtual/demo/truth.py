@@ -58,7 +58,7 @@ def read_demo_truth(head: Mapping[str, float], path: Path | None = None) -> Demo
         (also `ValueError`) Not such an archive, or of another head.
     """
     if path is None:
-        own = files("cmfsim.phantom.demo").joinpath(TRUTH_FILE)
+        own = files("cmfsim.virtual.demo").joinpath(TRUTH_FILE)
         if not own.is_file():
             return None
         path = Path(str(own))
