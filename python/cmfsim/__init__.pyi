@@ -152,6 +152,7 @@ from cmfsim.pipeline.drafting import Taken as Taken
 from cmfsim.pipeline.drafting import init_case as init_case
 from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
 from cmfsim.pipeline.evaluating import evaluate as evaluate
+from cmfsim.pipeline.planning_page import write_planning_page as write_planning_page
 from cmfsim.pipeline.predicting import predict as predict
 from cmfsim.pipeline.predicting import predict_models as predict_models
 from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks
@@ -171,7 +172,6 @@ from cmfsim.planning.face_planning import plan_for_face as plan_for_face
 from cmfsim.planning.page import PageContent as PageContent
 from cmfsim.planning.page import page_content as page_content
 from cmfsim.planning.page import page_text as page_text
-from cmfsim.planning.page import write_planning_page as write_planning_page
 from cmfsim.planning.replanning import ExpectedError as ExpectedError
 from cmfsim.planning.replanning import PlanBand as PlanBand
 from cmfsim.planning.replanning import PlanCorrection as PlanCorrection

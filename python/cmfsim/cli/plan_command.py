@@ -22,10 +22,11 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_plan
 from cmfsim.pictures import has_screen
 from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.planning_page import PAGE_FILE, write_planning_page
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.planning.face_planning import FacePlan, FaceSearch, plan_for_face
-from cmfsim.planning.page import PAGE_FILE, PageContent, page_content, write_planning_page
+from cmfsim.planning.page import PageContent, page_content
 from cmfsim.planning.replanning import (
     USUAL,
     ExpectedError,

@@ -49,7 +49,7 @@ from cmfsim.pictures import (
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.painting import Painter
-from cmfsim.planning.page import PAGE_FILE, page_state
+from cmfsim.pipeline.planning_page import PAGE_FILE, page_state
 from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
