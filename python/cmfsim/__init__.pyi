@@ -102,7 +102,6 @@ from cmfsim.io.calibrations import write_calibration as write_calibration
 from cmfsim.io.populations import Population as Population
 from cmfsim.io.populations import PopulationEntry as PopulationEntry
 from cmfsim.meshing import MeshOptions as MeshOptions
-from cmfsim.meshing import MeshReport as MeshReport
 from cmfsim.meshing import TissueMesh as TissueMesh
 from cmfsim.meshing import TissueRegion as TissueRegion
 from cmfsim.meshing import anatomy_from_surfaces as anatomy_from_surfaces
@@ -233,6 +232,7 @@ from cmfsim.values.image_data import ImageData as ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS
 from cmfsim.values.lifted_tissue import LiftedTissue as LiftedTissue
 from cmfsim.values.lip_region import LipRegion as LipRegion
+from cmfsim.values.mesh_report import MeshReport as MeshReport
 from cmfsim.values.moduli import FatModuli as FatModuli
 from cmfsim.values.moduli import MuscleModuli as MuscleModuli
 from cmfsim.values.moduli import TissueModuli as TissueModuli

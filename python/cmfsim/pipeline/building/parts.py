@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from cmfsim._core import TetMesh
 from cmfsim.io import Case
-from cmfsim.meshing import MeshReport, TissueRegion
+from cmfsim.meshing import TissueRegion
 from cmfsim.meshing.lips import LipSeam
 from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.contacts import CaseContacts
@@ -15,6 +15,7 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.lifted_tissue import LiftedTissue
+from cmfsim.values.mesh_report import MeshReport
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import SurfaceData
