@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.imaging.bone import Bone
-from cmfsim.imaging.guess import guessed_landmarks
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -23,7 +22,8 @@ from cmfsim.imaging.morphology import (
     smoothed,
     watershed,
 )
-from cmfsim.imaging.working import Working
+from cmfsim.imaging.rough_places import guessed_landmarks
+from cmfsim.imaging.working_grid import Working
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import Mask, ndimage
-from cmfsim.imaging.working import Working
+from cmfsim.imaging.working_grid import Working
 from cmfsim.values.checks import Floats
 
 __all__ = ["guessed_landmarks"]
