@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 from cmfsim._core import Surface, rigid_fit
 from cmfsim.bones.matching import MatchOptions, lay_on
 from cmfsim.bones.motion import RemovedBone, missing_patches
-from cmfsim.bones.paired import paired_shape
+from cmfsim.bones.paired_surfaces import paired_shape
 from cmfsim.bones.shape_fit import ShapeFit
-from cmfsim.bones.stray import StrayPatch, stray_patches
+from cmfsim.bones.stray_patches import StrayPatch, stray_patches
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import (

@@ -14,10 +14,10 @@ import numpy as np
 
 from cmfsim.cli.band_options import band_options
 from cmfsim.cli.case_commands import case_of, checked
+from cmfsim.cli.desired_faces import TARGET_STD, read_targets
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import StageProgress, escaped
-from cmfsim.cli.wished_faces import TARGET_STD, read_targets
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_plan
 from cmfsim.pictures import has_screen

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.polygons import triangles_of
-from cmfsim.io.words import real_numbers, shown, whole_numbers
+from cmfsim.io.text_numbers import real_numbers, shown, whole_numbers
 from cmfsim.values.checks import Floats
 
 __all__ = ["read_obj", "write_obj"]

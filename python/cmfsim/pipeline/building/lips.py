@@ -14,8 +14,8 @@ from cmfsim.io import Case, read_surface
 from cmfsim.meshing import separated_mesh
 from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.meshing.node_kinds import DentalArches
+from cmfsim.pipeline.building.attached_bodies import held_part
 from cmfsim.pipeline.building.contacts import CaseContacts
-from cmfsim.pipeline.building.held import held_part
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.anatomy import Anatomy, BoneSegment

@@ -10,7 +10,7 @@ import numpy as np
 
 from cmfsim.bones import part_segment
 from cmfsim.bones.motion import smooth_motion, sound_motion, torn_pieces, without_removed
-from cmfsim.doctor.moved import check_pairs
+from cmfsim.doctor.moved_bones import check_pairs
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface
 from cmfsim.pipeline.building.inputs import motion_source, read_motion

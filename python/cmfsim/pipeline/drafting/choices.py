@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from cmfsim.pipeline.drafting.case_lines import Taken
 from cmfsim.pipeline.drafting.finds import ImageFind, LandmarkFind
-from cmfsim.pipeline.drafting.lines import Taken
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 

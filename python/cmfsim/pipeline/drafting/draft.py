@@ -10,10 +10,10 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.io.landmarks import write_landmarks
 from cmfsim.io.surfaces import write_surface
+from cmfsim.pipeline.drafting.case_lines import Taken, Text, quoted
 from cmfsim.pipeline.drafting.choices import Images, Marks, choose_images, choose_landmarks
 from cmfsim.pipeline.drafting.finds import EXTRACTED, LandmarkFind, SurfaceFind
 from cmfsim.pipeline.drafting.gathering import Gathered
-from cmfsim.pipeline.drafting.lines import Taken, Text, quoted
 from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
 from cmfsim.pipeline.drafting.roles import MOVING, safe_key
 from cmfsim.pipeline.drafting.surfaces import Anatomy, Question, choose_surfaces
