@@ -24,9 +24,10 @@ import ct_variants as variants
 from cmfsim.imaging import segment_head
 from cmfsim.io.images import read_image_file
 from cmfsim.pipeline.proposing import head_surfaces, read_template_head
-from cmfsim.registration.proposed import ProposedLandmarks, TemplateHead
+from cmfsim.registration.proposed import TemplateHead
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
+from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import SurfaceData
 from marked import publish
 

@@ -102,7 +102,6 @@ from cmfsim.io.calibrations import write_calibration as write_calibration
 from cmfsim.io.populations import Population as Population
 from cmfsim.io.populations import PopulationEntry as PopulationEntry
 from cmfsim.meshing import MeshOptions as MeshOptions
-from cmfsim.meshing import MeshReport as MeshReport
 from cmfsim.meshing import TissueMesh as TissueMesh
 from cmfsim.meshing import TissueRegion as TissueRegion
 from cmfsim.meshing import anatomy_from_surfaces as anatomy_from_surfaces
@@ -116,6 +115,16 @@ from cmfsim.meshing import tissue_level as tissue_level
 from cmfsim.meshing.lips import LipSeam as LipSeam
 from cmfsim.meshing.lips import lip_regions as lip_regions
 from cmfsim.meshing.lips import lip_seam as lip_seam
+from cmfsim.meshing.node_kinds import ClassifiedNodes as ClassifiedNodes
+from cmfsim.meshing.node_kinds import DentalArches as DentalArches
+from cmfsim.meshing.node_kinds import KindOptions as KindOptions
+from cmfsim.meshing.node_kinds import SlidingBox as SlidingBox
+from cmfsim.meshing.node_kinds import SlidingSphere as SlidingSphere
+from cmfsim.meshing.node_kinds import classify_nodes as classify_nodes
+from cmfsim.meshing.node_kinds import dental_arches as dental_arches
+from cmfsim.meshing.node_kinds import kind_options as kind_options
+from cmfsim.meshing.node_kinds import lifted_tissue as lifted_tissue
+from cmfsim.meshing.node_kinds import segment_data as segment_data
 from cmfsim.muscles.equivalent import Mixture as Mixture
 from cmfsim.muscles.equivalent import MuscleVolume as MuscleVolume
 from cmfsim.muscles.equivalent import equivalent_material as equivalent_material
@@ -127,21 +136,10 @@ from cmfsim.muscles.template import MuscleTemplate as MuscleTemplate
 from cmfsim.muscles.template import check_template as check_template
 from cmfsim.muscles.template import import_bodyparts3d as import_bodyparts3d
 from cmfsim.muscles.template import template_names as template_names
-from cmfsim.node_kinds import ClassifiedNodes as ClassifiedNodes
-from cmfsim.node_kinds import DentalArches as DentalArches
-from cmfsim.node_kinds import KindOptions as KindOptions
-from cmfsim.node_kinds import SlidingBox as SlidingBox
-from cmfsim.node_kinds import SlidingSphere as SlidingSphere
-from cmfsim.node_kinds import classify_nodes as classify_nodes
-from cmfsim.node_kinds import dental_arches as dental_arches
-from cmfsim.node_kinds import kind_options as kind_options
-from cmfsim.node_kinds import lifted_tissue as lifted_tissue
-from cmfsim.node_kinds import segment_data as segment_data
 from cmfsim.phantom import HeadParameters as HeadParameters
 from cmfsim.phantom import Muscle as Muscle
 from cmfsim.phantom import PhantomHead as PhantomHead
 from cmfsim.phantom import make_head as make_head
-from cmfsim.phantom.case_files import write_phantom_case as write_phantom_case
 from cmfsim.pipeline.banding import band_regions as band_regions
 from cmfsim.pipeline.banding import band_settings as band_settings
 from cmfsim.pipeline.banding import predict_with_band as predict_with_band
@@ -153,6 +151,7 @@ from cmfsim.pipeline.drafting import Taken as Taken
 from cmfsim.pipeline.drafting import init_case as init_case
 from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
 from cmfsim.pipeline.evaluating import evaluate as evaluate
+from cmfsim.pipeline.planning_page import write_planning_page as write_planning_page
 from cmfsim.pipeline.predicting import predict as predict
 from cmfsim.pipeline.predicting import predict_models as predict_models
 from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks
@@ -172,7 +171,6 @@ from cmfsim.planning.face_planning import plan_for_face as plan_for_face
 from cmfsim.planning.page import PageContent as PageContent
 from cmfsim.planning.page import page_content as page_content
 from cmfsim.planning.page import page_text as page_text
-from cmfsim.planning.page import write_planning_page as write_planning_page
 from cmfsim.planning.replanning import ExpectedError as ExpectedError
 from cmfsim.planning.replanning import PlanBand as PlanBand
 from cmfsim.planning.replanning import PlanCorrection as PlanCorrection
@@ -234,6 +232,7 @@ from cmfsim.values.image_data import ImageData as ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS
 from cmfsim.values.lifted_tissue import LiftedTissue as LiftedTissue
 from cmfsim.values.lip_region import LipRegion as LipRegion
+from cmfsim.values.mesh_report import MeshReport as MeshReport
 from cmfsim.values.moduli import FatModuli as FatModuli
 from cmfsim.values.moduli import MuscleModuli as MuscleModuli
 from cmfsim.values.moduli import TissueModuli as TissueModuli
@@ -261,3 +260,4 @@ from cmfsim.virtual import drawn_patient as drawn_patient
 from cmfsim.virtual import virtual_patients as virtual_patients
 from cmfsim.virtual import virtual_population as virtual_population
 from cmfsim.virtual import write_virtual_patient as write_virtual_patient
+from cmfsim.virtual.phantom_case import write_phantom_case as write_phantom_case

@@ -40,7 +40,7 @@ LONGEST = (
     "pipeline/test_hard_heads.py",
     "cli/test_crash_safety.py",
     "pipeline/test_prediction.py",
-    "phantom/test_demo.py",
+    "virtual/test_demo.py",
     "pipeline/test_case_lips.py",
     "pipeline/test_build.py",
     "study/test_study_outputs.py",

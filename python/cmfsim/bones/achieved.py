@@ -18,10 +18,12 @@ from numpy.typing import ArrayLike
 from cmfsim._core import Surface, rigid_fit
 from cmfsim.bones.matching import MatchOptions, lay_on
 from cmfsim.bones.motion import RemovedBone, missing_patches
-from cmfsim.bones.paired import paired_shape
+from cmfsim.bones.paired_surfaces import paired_shape
 from cmfsim.bones.shape_fit import ShapeFit
-from cmfsim.bones.stray import StrayPatch, stray_patches
-from cmfsim.checks import (
+from cmfsim.bones.stray_patches import StrayPatch, stray_patches
+from cmfsim.errors import RegistrationError, RegistrationInputError
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import (
     Floats,
     as_floats,
     as_positive,
@@ -30,8 +32,6 @@ from cmfsim.checks import (
     check_one_of,
     frozen,
 )
-from cmfsim.errors import RegistrationError, RegistrationInputError
-from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix
 from cmfsim.values.surface_data import MovedSurface, SurfaceData

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.bones.planes import Cut, Procedure
 from cmfsim.bones.procedures import PROCEDURES, place_procedure
 from cmfsim.bones.segment_checks import check_segments
-from cmfsim.checks import as_number, check_instance
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import as_number, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData

@@ -11,9 +11,9 @@ import numpy as np
 
 from cmfsim._core import IcpFit, Surface
 from cmfsim.bones.shape_fit import ShapeFit, fit_shape
-from cmfsim.checks import Floats, as_number, as_positive
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.registration import icp
+from cmfsim.values.checks import Floats, as_number, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MatchOptions", "lay_on"]

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, SurfaceMotion, rigid_fit
-from cmfsim.checks import Floats
 from cmfsim.errors import BoundaryInputError, RegistrationError, third_party
 from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.surfaces.topology import connected_labels, edges_of
+from cmfsim.values.checks import Floats
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 

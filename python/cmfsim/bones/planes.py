@@ -8,8 +8,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_direction, as_point, as_rows, as_text, check_instance
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, as_direction, as_point, as_rows, as_text, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.bones.planes import Cut, CuttingPlane, Procedure
-from cmfsim.checks import Floats, as_number, check_one_of
 from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.finding import Finding
 
 __all__ = ["PROCEDURES", "place_procedure", "procedure_options"]

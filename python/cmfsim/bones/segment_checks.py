@@ -10,10 +10,10 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseError
 from cmfsim.surfaces.levels import block_of
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats
 
 __all__ = ["check_segments"]
 

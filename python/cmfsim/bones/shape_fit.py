@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, frozen
 from cmfsim.errors import RegistrationInputError
+from cmfsim.values.checks import Floats, frozen
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import SurfaceData

@@ -10,7 +10,6 @@ from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.io import Case
 from cmfsim.phantom import make_head
-from cmfsim.phantom.case_files import write_phantom_case
 from cmfsim.study.frontier import (
     FACTORS,
     WHOLE,
@@ -23,6 +22,7 @@ from cmfsim.study.frontier import (
 from cmfsim.study.frontier import frontier as run_frontier
 from cmfsim.study.frontier.files import write_frontier
 from cmfsim.study.frontier.table import GRID, base_verdict
+from cmfsim.virtual.phantom_case import write_phantom_case
 
 __all__ = ["FRONTIER_FOLDER", "frontier"]
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cmfsim.cli.terminal import escaped
-from cmfsim.meshing import MeshReport
+from cmfsim.values.mesh_report import MeshReport
 
 __all__ = ["WIDTH", "build_text"]
 

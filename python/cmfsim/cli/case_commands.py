@@ -12,7 +12,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
-from cmfsim.checks import as_positive
 from cmfsim.cli.build_report import WIDTH, build_text
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
 from cmfsim.cli.notices import FindingsError, Notices
@@ -23,6 +22,7 @@ from cmfsim.io.models import is_model_file
 from cmfsim.pipeline.building.inputs import plan_key
 from cmfsim.pipeline.predicting import case_for_models
 from cmfsim.pipeline.preparation import prepare
+from cmfsim.values.checks import as_positive
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import SEVERITIES, Finding
 

@@ -12,13 +12,13 @@ from pathlib import Path
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import StageProgress, escaped
-from cmfsim.phantom.demo import DemoCase, write_demo_case
 from cmfsim.pictures import has_screen
 from cmfsim.pipeline.evaluating import evaluate
 from cmfsim.pipeline.outputs import WrittenResults, write_results
 from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.values.prediction import Prediction
+from cmfsim.virtual.demo import DemoCase, write_demo_case
 
 __all__ = ["DEMO_FOLDER", "DEMO_MODELS", "demo"]
 

@@ -21,8 +21,8 @@ from cmfsim.pictures import picture_landmarks
 from cmfsim.pipeline.building.inputs import read_anatomy, read_case_landmarks
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.pipeline.proposing import BY_SHAPE, ProposedHead, proposed_head
-from cmfsim.registration.proposed import ProposedLandmarks, ProposedSite
 from cmfsim.values.finding import Finding
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 
 __all__ = ["landmarks"]
 

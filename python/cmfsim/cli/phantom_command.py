@@ -4,11 +4,11 @@ import argparse
 import json
 import sys
 
-from cmfsim.checks import as_positive
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.terminal import StageProgress
 from cmfsim.phantom import HeadParameters, make_head
-from cmfsim.phantom.case_files import write_phantom_case
+from cmfsim.values.checks import as_positive
+from cmfsim.virtual.phantom_case import write_phantom_case
 
 __all__ = ["phantom"]
 

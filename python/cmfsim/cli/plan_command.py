@@ -14,18 +14,19 @@ import numpy as np
 
 from cmfsim.cli.band_options import band_options
 from cmfsim.cli.case_commands import case_of, checked
+from cmfsim.cli.desired_faces import TARGET_STD, read_targets
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import StageProgress, escaped
-from cmfsim.cli.wished_faces import TARGET_STD, read_targets
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_plan
 from cmfsim.pictures import has_screen
 from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.planning_page import PAGE_FILE, write_planning_page
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.planning.face_planning import FacePlan, FaceSearch, plan_for_face
-from cmfsim.planning.page import PAGE_FILE, PageContent, page_content, write_planning_page
+from cmfsim.planning.page import PageContent, page_content
 from cmfsim.planning.replanning import (
     USUAL,
     ExpectedError,

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import PRESETS, Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseError, CmfsimError
 from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface
 from cmfsim.io.images import read_image_file
@@ -18,6 +17,7 @@ from cmfsim.io.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
@@ -148,24 +148,43 @@ class Evidence:
 def gather(case: Case) -> Evidence:
     """What can be read of a case, with a finding for each file that cannot."""
     findings: list[Finding] = []
-    skin: Body | None = None
-    bones: dict[str, Body] = {}
-    if case.surfaces is not None:
-        files = {"skin": case.surfaces.skin}
-        files |= {f"bones.{name}": path for name, path in case.surfaces.bones.items()}
-        for key, path in files.items():
-            # A bone's size is checked against the skin's.
-            is_sized = key == "skin" or skin is not None
-            body = _body(case, case.surfaces, key, path, findings, is_sized=is_sized)
-            if body is None:
-                continue
-            if key == "skin":
-                skin = body
-            else:
-                bones[body.name] = body
+    skin, bones = _surfaces(case, findings)
     image = _image(case, findings)
     skull = _landmarks(case, "landmarks.skull", case.landmarks.skull, findings)
     skin_points = _landmarks(case, "landmarks.skin", case.landmarks.skin, findings)
+    _check_other_files(case, findings)
+    motions, transforms = _motions(case, findings)
+    _check_region(case, skull, findings)
+    _check_preset(case, findings)
+    _check_output(case, findings)
+    return Evidence(
+        case, image, skin, bones, skull, skin_points, motions, tuple(findings), transforms
+    )
+
+
+def _surfaces(case: Case, findings: list[Finding]) -> tuple[Body | None, dict[str, Body]]:
+    """The skin and the bones of the surfaces that can be read."""
+    skin: Body | None = None
+    bones: dict[str, Body] = {}
+    if case.surfaces is None:
+        return skin, bones
+    files = {"skin": case.surfaces.skin}
+    files |= {f"bones.{name}": path for name, path in case.surfaces.bones.items()}
+    for key, path in files.items():
+        # A bone's size is checked against the skin's.
+        is_sized = key == "skin" or skin is not None
+        body = _body(case, case.surfaces, key, path, findings, is_sized=is_sized)
+        if body is None:
+            continue
+        if key == "skin":
+            skin = body
+        else:
+            bones[body.name] = body
+    return skin, bones
+
+
+def _check_other_files(case: Case, findings: list[Finding]) -> None:
+    """Whether the files that no check looks into are there."""
     if case.mesh.parting is not None:
         _check_file(case, "mesh.parting.surface", case.mesh.parting, findings)
     if case.lips.contact and isinstance(case.lips.seam, Path):
@@ -180,6 +199,12 @@ def gather(case: Case) -> Evidence:
             if path is not None:
                 folder = key == "image"
                 _check_file(case, f"postoperative.{key}", path, findings, folder=folder)
+
+
+def _motions(
+    case: Case, findings: list[Finding]
+) -> tuple[dict[str, Floats], dict[str, TransformFile]]:
+    """The motions of the plan that are known by now, and the transform files that give some."""
     motions: dict[str, Floats] = {}
     transforms: dict[str, TransformFile] = {}
     for name, motion in case.plan.items():
@@ -190,6 +215,11 @@ def gather(case: Case) -> Evidence:
         matrix = motion.matrix if transform is None else transform.matrix
         if matrix is not None:
             motions[name] = matrix
+    return motions, transforms
+
+
+def _check_region(case: Case, skull: Mapping[str, Floats], findings: list[Finding]) -> None:
+    """Whether the landmarks place the plane behind the face."""
     try:
         if not case.landmarks.proposed:
             case.region.plane(skull, 0.0, 0.0)
@@ -203,6 +233,10 @@ def gather(case: Case) -> Evidence:
                 fix="place these landmarks, or give posterior_plane",
             )
         )
+
+
+def _check_preset(case: Case, findings: list[Finding]) -> None:
+    """Whether the constants of the tissue are known."""
     if case.tissue.kind == "preset" and case.tissue.preset not in PRESETS:
         findings.append(
             Finding.error(
@@ -213,10 +247,6 @@ def gather(case: Case) -> Evidence:
                 fix=f"use one of: {', '.join(PRESETS)}",
             )
         )
-    _check_output(case, findings)
-    return Evidence(
-        case, image, skin, bones, skull, skin_points, motions, tuple(findings), transforms
-    )
 
 
 def _body(

@@ -10,7 +10,6 @@ from importlib import import_module
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.doctor.places import direction_text, place_text, shift_text
 from cmfsim.errors import LandmarkError, RegistrationError
 from cmfsim.registration import (
@@ -20,6 +19,7 @@ from cmfsim.registration import (
     mirror_agreement,
     swapped_names,
 )
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 

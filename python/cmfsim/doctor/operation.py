@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.bones import Procedure, place_procedure
-from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
@@ -14,6 +13,7 @@ from cmfsim.errors import CaseError, CmfsimError, LandmarkError
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.io.transforms import motion_in_lps
 from cmfsim.values.case_parts import CaseOsteotomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import Finding
 

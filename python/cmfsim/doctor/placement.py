@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Body, Evidence
 from cmfsim.doctor.landmarks import (
     Nearest,
@@ -17,6 +16,7 @@ from cmfsim.doctor.places import place_text
 from cmfsim.errors import ImageError
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.values.case_parts import UNITS
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
 __all__ = ["check_placement"]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 
 __all__ = ["direction_text", "place_text", "shift_text"]
 

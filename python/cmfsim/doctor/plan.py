@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 
 from cmfsim.bones.motion import sound_motion, torn_pieces
-from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
+from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion
 from cmfsim.values.surface_data import MovedSurface
 

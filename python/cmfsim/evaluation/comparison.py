@@ -9,14 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, ThinPlateSpline
-from cmfsim.checks import (
-    Floats,
-    as_indices,
-    as_positive,
-    as_rows,
-    check_one_of,
-    frozen,
-)
 from cmfsim.errors import (
     CaseInputError,
     LandmarkError,
@@ -27,6 +19,14 @@ from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
 from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
+from cmfsim.values.checks import (
+    Floats,
+    as_indices,
+    as_positive,
+    as_rows,
+    check_one_of,
+    frozen,
+)
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import as_floats, as_number
 from cmfsim.errors import CalibrationError
 from cmfsim.values.calibration import BandFactor
+from cmfsim.values.checks import as_floats, as_number
 
 __all__ = ["calibrate", "cases_needed", "covered_interval", "region_scores"]
 

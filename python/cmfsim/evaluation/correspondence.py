@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, ThinPlateSpline
-from cmfsim.checks import Floats
 from cmfsim.surfaces.barycentric import barycentric
 from cmfsim.surfaces.topology import edges_of
+from cmfsim.values.checks import Floats
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 

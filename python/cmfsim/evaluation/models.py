@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, SurfaceMotion
-from cmfsim.checks import Floats, as_rows, as_text, check_one_of, frozen
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.comparison import (
     Choice,
@@ -21,6 +20,7 @@ from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.surfaces.depth import moved_outward
+from cmfsim.values.checks import Floats, as_rows, as_text, check_one_of, frozen
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_models"]

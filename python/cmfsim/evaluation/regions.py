@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_floats, as_rows
 from cmfsim.errors import LandmarkInputError
+from cmfsim.values.checks import Floats, as_floats, as_rows
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 
 __all__ = ["REGIONS", "SKIN_LANDMARKS", "UNMOVED_REGIONS", "skin_regions", "unmoved_regions"]

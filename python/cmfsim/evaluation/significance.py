@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import as_floats, check_one_of
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.values.checks import as_floats, check_one_of
 
 __all__ = ["PAIRED_BY", "PairedTest", "wilcoxon_test"]
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_floats
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, as_floats
 
 __all__ = ["LIMITS", "DistanceStatistics", "distance_statistics"]
 

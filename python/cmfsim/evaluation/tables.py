@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import as_text, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.models import WHOLE, ModelComparison
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics
+from cmfsim.values.checks import as_text, check_one_of
 
 __all__ = ["ErrorTable", "error_table"]
 

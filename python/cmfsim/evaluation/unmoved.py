@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_floats
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.comparison import SkinComparison, compare_skins
+from cmfsim.values.checks import Floats, as_floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [

@@ -7,7 +7,7 @@ from cmfsim.imaging.levels import level_of
 from cmfsim.imaging.morphology import Volume, label, sizes_of
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import SKIN_SCALE, Skin
-from cmfsim.imaging.working import Working
+from cmfsim.imaging.working_grid import Working
 
 __all__ = ["air_level"]
 

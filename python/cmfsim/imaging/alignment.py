@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import rigid_matrix
-from cmfsim.checks import Floats, check_instance
 from cmfsim.errors import BoundaryError, RegistrationError, RegistrationInputError
 from cmfsim.imaging.alignment_options import AlignmentOptions
-from cmfsim.imaging.descent import Clipped, Places, align, inverse, matrix_of
 from cmfsim.imaging.morphology import Mask
+from cmfsim.imaging.mutual_information import Clipped, Places, align, inverse, matrix_of
+from cmfsim.values.checks import Floats, check_instance
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["VolumeAlignment", "register_volumes"]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.checks import as_number, as_positive
 from cmfsim.errors import RegistrationInputError
+from cmfsim.values.checks import as_number, as_positive
 
 __all__ = ["AlignmentOptions"]
 

@@ -28,7 +28,7 @@ from cmfsim.imaging.morphology import (
 from cmfsim.imaging.plates import STEP as PLATE_STEP
 from cmfsim.imaging.plates import find_plates
 from cmfsim.imaging.skin import Skin
-from cmfsim.imaging.working import Working, coarse_of
+from cmfsim.imaging.working_grid import Working, coarse_of
 from cmfsim.values.finding import Finding
 
 __all__ = ["attached_findings"]

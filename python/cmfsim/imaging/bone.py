@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.errors import ImageInputError
-from cmfsim.imaging.half_way import at_half_height
+from cmfsim.imaging.bone_edge import at_half_height
 from cmfsim.imaging.levels import level_of
 from cmfsim.imaging.metal import Metal, without_streaks
 from cmfsim.imaging.morphology import (
@@ -21,7 +21,7 @@ from cmfsim.imaging.morphology import (
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import Skin
-from cmfsim.imaging.working import Working, coarse_of
+from cmfsim.imaging.working_grid import Working, coarse_of
 from cmfsim.values.finding import Finding
 
 __all__ = ["Bone", "find_bone"]

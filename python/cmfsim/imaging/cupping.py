@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cmfsim.imaging.intensity import AIR, SOFT
 from cmfsim.imaging.morphology import Mask, Volume, depth, largest, ndimage, resampled_to
-from cmfsim.imaging.working import Working, coarse_of
+from cmfsim.imaging.working_grid import Working, coarse_of
 from cmfsim.values.finding import Finding
 
 __all__ = ["without_cupping"]

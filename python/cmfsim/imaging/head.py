@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_point
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.air import air_level
 from cmfsim.imaging.attached import attached_findings
 from cmfsim.imaging.bone import Bone, bone_level, find_bone, teeth_level
+from cmfsim.imaging.coverage import view_findings
 from cmfsim.imaging.cupping import without_cupping
 from cmfsim.imaging.intensity import weak_bone
 from cmfsim.imaging.jaw import part_jaws
@@ -21,9 +21,9 @@ from cmfsim.imaging.morphology import Mask
 from cmfsim.imaging.noise import without_noise
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import Skin, find_skin
-from cmfsim.imaging.view import view_findings
-from cmfsim.imaging.working import Working, working_grid
+from cmfsim.imaging.working_grid import Working, working_grid
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.progress import Progress

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
-from cmfsim.imaging.field import round_field
+from cmfsim.imaging.field_of_view import round_field
 from cmfsim.imaging.morphology import Volume
 from cmfsim.values.finding import Finding
 

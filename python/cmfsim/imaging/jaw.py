@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.imaging.bone import Bone
-from cmfsim.imaging.guess import guessed_landmarks
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -24,7 +22,9 @@ from cmfsim.imaging.morphology import (
     smoothed,
     watershed,
 )
-from cmfsim.imaging.working import Working
+from cmfsim.imaging.rough_places import guessed_landmarks
+from cmfsim.imaging.working_grid import Working
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
 __all__ = ["Jaws", "part_jaws"]

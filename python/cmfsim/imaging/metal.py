@@ -20,7 +20,7 @@ from cmfsim.imaging.morphology import (
     sizes_of,
 )
 from cmfsim.imaging.options import METAL, SegmentOptions
-from cmfsim.imaging.working import Working
+from cmfsim.imaging.working_grid import Working
 from cmfsim.values.finding import Finding
 
 __all__ = ["Metal", "find_metal", "metal_within", "without_streaks"]

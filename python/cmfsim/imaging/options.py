@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.checks import as_number, as_positive
 from cmfsim.errors import ImageInputError
+from cmfsim.values.checks import as_number, as_positive
 
 __all__ = ["BONE", "METAL", "SegmentOptions"]
 

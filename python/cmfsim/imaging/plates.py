@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.imaging.morphology import Mask, Volume, label, ndimage, sizes_of, smoothed
+from cmfsim.values.checks import Floats
 
 __all__ = ["STEP", "find_plates"]
 

@@ -26,7 +26,7 @@ from cmfsim.imaging.morphology import (
     sizes_of,
 )
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.imaging.working import Working, coarse_of
+from cmfsim.imaging.working_grid import Working, coarse_of
 from cmfsim.values.finding import Finding
 
 __all__ = ["Skin", "find_skin"]

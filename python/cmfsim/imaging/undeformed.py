@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import as_floats, as_number, as_positive, as_rows, check_instance
 from cmfsim.errors import LandmarkInputError, RegistrationInputError
 from cmfsim.imaging.morphology import distance
+from cmfsim.values.checks import as_floats, as_number, as_positive, as_rows, check_instance
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["undeformed_mask"]

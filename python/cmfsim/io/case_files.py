@@ -10,7 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
-from cmfsim.checks import as_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io.case_plans import is_achieved, osteotomies_of, plan_of
 from cmfsim.io.case_tables import (
@@ -43,6 +42,7 @@ from cmfsim.values.case_parts import (
     CaseSurfaces,
 )
 from cmfsim.values.case_region import Region
+from cmfsim.values.checks import as_text
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import TissueData
 

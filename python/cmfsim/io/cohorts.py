@@ -4,11 +4,11 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from cmfsim.checks import as_text, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io.case_files import CASE_FILE
 from cmfsim.io.files import FORMAT_VERSION, is_there
 from cmfsim.io.tables import read_tables
+from cmfsim.values.checks import as_text, check_one_of
 from cmfsim.values.prediction import MODELS
 
 __all__ = ["COHORT_FORMAT", "Cohort"]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import LandmarkInputError
 from cmfsim.io.markups import Markup, markup_of, markup_text, markups_of, write_markups
+from cmfsim.values.checks import Floats, as_rows
 
 __all__ = ["read_curves", "write_curves"]
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io.child import Answer, ReaderError, ReadLimits, read_in_child
+from cmfsim.values.checks import Floats
 
 __all__ = ["parse_itk_hdf5", "read_itk_hdf5"]
 

@@ -16,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, check_one_of
 from cmfsim.errors import LandmarkInputError
 from cmfsim.io.markups import (
     as_position,
@@ -27,6 +26,7 @@ from cmfsim.io.markups import (
     markups_of,
     write_markups,
 )
+from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.io.files import MAX_WHOLE, check_readable, parsed_json, replacing
+from cmfsim.values.checks import Floats
 
 __all__ = [
     "Markup",

@@ -7,10 +7,10 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io.polygons import triangles_of
-from cmfsim.io.words import real_numbers, shown, whole_numbers
+from cmfsim.io.text_numbers import real_numbers, shown, whole_numbers
+from cmfsim.values.checks import Floats
 
 __all__ = ["read_obj", "write_obj"]
 

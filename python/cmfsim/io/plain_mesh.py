@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats
 
 __all__ = ["CELL_CORNERS", "Cells", "PlainMesh"]
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats
 
 __all__ = ["checked_indices", "triangles_of"]
 

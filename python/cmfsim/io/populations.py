@@ -8,9 +8,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import FORMAT_VERSION, check_readable, named, parsed_json, replacing
+from cmfsim.values.checks import check_one_of
 
 __all__ = [
     "CALIBRATION",

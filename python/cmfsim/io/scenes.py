@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import as_floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
 from cmfsim.io.files import (
@@ -22,6 +21,7 @@ from cmfsim.io.files import (
 )
 from cmfsim.io.meshes import read_mesh, read_tets
 from cmfsim.io.surfaces import read_moved_surface, read_surface
+from cmfsim.values.checks import as_floats
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NODE_KINDS
 from cmfsim.values.scene import Scene, SegmentData

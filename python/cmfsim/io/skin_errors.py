@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats, as_floats, as_rows, frozen
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import replacing
 from cmfsim.io.meshes import read_mesh
 from cmfsim.io.metrics import AGAIN
 from cmfsim.io.summaries import checked_file
 from cmfsim.io.vtk import write_triangles
+from cmfsim.values.checks import Floats, as_floats, as_rows, frozen
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["SkinErrors", "read_skin_errors", "skin_errors_file", "write_skin_errors"]

@@ -17,11 +17,11 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.io.files import replacing
 from cmfsim.io.markups import markup_of, markups_text
 from cmfsim.io.transforms import motion_in_lps, transform_text
 from cmfsim.io.vtk import write_triangles
+from cmfsim.values.checks import Floats
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData
 

@@ -15,11 +15,11 @@ from xml.parsers import expat
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files import check_readable, is_below, is_there, named
 from cmfsim.io.strict_xml import strict_parser
 from cmfsim.io.transforms import motion_in_lps, read_transform_file
+from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix
 
 __all__ = ["KINDS", "SceneNode", "SlicerScene", "read_slicer_scene"]

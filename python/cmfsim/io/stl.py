@@ -6,9 +6,9 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
-from cmfsim.io.words import real_numbers, shown
+from cmfsim.io.text_numbers import real_numbers, shown
+from cmfsim.values.checks import Floats
 
 __all__ = ["read_stl", "write_stl"]
 

@@ -9,7 +9,6 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError, UnpairedError
 from cmfsim.io.files import named, replacing
 from cmfsim.io.meshes import read_mesh
@@ -20,6 +19,7 @@ from cmfsim.io.polygons import triangles_of
 from cmfsim.io.stl import write_stl
 from cmfsim.io.vtk import data_array, write_vtk
 from cmfsim.values.case_parts import FRAMES, UNITS
+from cmfsim.values.checks import check_one_of
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [

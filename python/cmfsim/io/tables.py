@@ -10,7 +10,6 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files import (
     check_numbers,
@@ -21,6 +20,7 @@ from cmfsim.io.files import (
     toml_module,
 )
 from cmfsim.io.toml_lines import KeyPath, line_of, toml_lines
+from cmfsim.values.checks import Floats
 
 __all__ = ["UNDECIDED", "Table", "nearest", "read_tables"]
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io.archives import member_of, read_archive, write_archive
+from cmfsim.values.checks import Floats
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.words import real_numbers, whole_numbers
+from cmfsim.io.text_numbers import real_numbers, whole_numbers
 
 __all__ = ["Cursor"]
 

@@ -14,11 +14,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_floats, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import MAX_TEXT, check_readable, named, replacing
 from cmfsim.io.itk_hdf5 import read_itk_hdf5
 from cmfsim.values.case_parts import DIRECTIONS, FRAMES
+from cmfsim.values.checks import Floats, as_floats, check_one_of
 from cmfsim.values.motion import rigid_matrix
 
 __all__ = [

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.blocks import UNPACKERS
 from cmfsim.io.plain_mesh import Cells, PlainMesh
 from cmfsim.io.polygons import triangles_of
 from cmfsim.io.stated_frames import stated_in_field
 from cmfsim.io.strict_xml import strict_parser
+from cmfsim.io.text_numbers import real_numbers, shown, whole_numbers
+from cmfsim.io.vtk_blocks import UNPACKERS
 from cmfsim.io.vtk_cells import cells_by_type
-from cmfsim.io.words import real_numbers, shown, whole_numbers
 
 __all__ = ["read_vtk_xml"]
 

@@ -1,7 +1,10 @@
-"""From labels, levels or surfaces to tets, with a report of their quality."""
+"""From labels, levels or surfaces to tets, with a report of their quality.
+
+`node_kinds` states what each node does; `lips` finds the seam at which the mesh is cut.
+"""
 
 from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
-from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report, report_of_part
+from cmfsim.meshing.quality import mesh_findings, mesh_report, report_of_part
 from cmfsim.meshing.separation import SeparatedMesh, part_mesh, separated_mesh
 from cmfsim.meshing.stuffing import (
     MeshOptions,
@@ -14,7 +17,6 @@ from cmfsim.meshing.tissue import TissueRegion, near_skin, tissue_level
 
 __all__ = [
     "MeshOptions",
-    "MeshReport",
     "SeparatedMesh",
     "TissueMesh",
     "TissueRegion",

@@ -6,9 +6,9 @@ import numpy as np
 
 from cmfsim import _core
 from cmfsim._core import Surface
-from cmfsim.checks import as_positive
 from cmfsim.errors import MeshInputError
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import as_positive
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData

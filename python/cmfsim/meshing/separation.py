@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from cmfsim import _core
 from cmfsim._core import Surface, TetMesh
-from cmfsim.checks import Indices
+from cmfsim.values.checks import Indices
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["SeparatedMesh", "part_mesh", "separated_mesh"]

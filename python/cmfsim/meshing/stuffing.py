@@ -7,11 +7,12 @@ from numpy.typing import ArrayLike
 
 from cmfsim import _core
 from cmfsim._core import TetMesh
-from cmfsim.checks import as_number, as_point, as_positive
 from cmfsim.errors import MeshInputError
-from cmfsim.meshing.quality import MeshReport, mesh_findings, mesh_report
+from cmfsim.meshing.quality import mesh_findings, mesh_report
+from cmfsim.values.checks import as_number, as_point, as_positive
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.mesh_report import MeshReport
 
 __all__ = ["MeshOptions", "TissueMesh", "mesh_from_labels", "mesh_from_level"]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim._core import TetMesh
-from cmfsim.checks import as_positive
 from cmfsim.errors import MeshInputError
+from cmfsim.values.checks import as_positive
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["mesh_with_tetwild"]

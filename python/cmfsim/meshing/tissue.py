@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
-from cmfsim.checks import Floats, as_number, as_point, as_positive
 from cmfsim.errors import MeshInputError, third_party
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats, as_number, as_point, as_positive
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from cmfsim import _core
 from cmfsim._core import PRESETS, MuscleFibres, Surface, TetMesh, Tissue
-from cmfsim.checks import Floats, check_instance, check_one_of, frozen
 from cmfsim.errors import MaterialInputError, MeshError, MeshInputError
 from cmfsim.muscles.mixing import check_muscle_names, mixed_tissue, moduli_findings
+from cmfsim.values.checks import Floats, check_instance, check_one_of, frozen
 from cmfsim.values.finding import Finding
 from cmfsim.values.moduli import TissueModuli
 from cmfsim.values.musculature import MuscleSurface

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from cmfsim._core import MuscleShares, Tissue
-from cmfsim.checks import Floats
 from cmfsim.errors import MaterialInputError
 from cmfsim.io.tables import nearest
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.moduli import MuscleModuli, TissueModuli
 from cmfsim.values.tissue_data import TissueData

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 
 __all__ = ["Level", "Table", "clipped", "smooth_curve", "smooth_max", "smooth_step", "turn_about"]
 

@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom.curves import Level
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Field", "gradient_at", "level_grid", "level_surface", "to_surface"]

@@ -6,11 +6,11 @@ from typing import Protocol
 
 import numpy as np
 
-from cmfsim.checks import Floats, frozen
 from cmfsim.phantom.curves import Level
 from cmfsim.phantom.grid import Field, to_surface
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.phantom.warp import FaceWarp, JawWarp
+from cmfsim.values.checks import Floats, frozen
 
 __all__ = ["find_skin_landmarks", "find_skull_landmarks"]
 

@@ -8,7 +8,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_number, as_positive, as_rows, check_instance, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import scan
 from cmfsim.phantom.curves import Level, smooth_max
@@ -28,6 +27,14 @@ from cmfsim.phantom.skull import (
 )
 from cmfsim.phantom.warp import FaceWarp, JawWarp, JawWarped
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import (
+    Floats,
+    as_number,
+    as_positive,
+    as_rows,
+    check_instance,
+    check_one_of,
+)
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 

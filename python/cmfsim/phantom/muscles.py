@@ -8,12 +8,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_rows, frozen
 from cmfsim.phantom.courses import COURSES, Course, Row
 from cmfsim.phantom.curves import Level, smooth_curve, smooth_max
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
 from cmfsim.phantom.shapes import REACH, Box, FlatTube
 from cmfsim.phantom.warp import FaceWarp, JawWarp
+from cmfsim.values.checks import Floats, as_rows, frozen
 
 __all__ = ["Muscle", "Tissue", "make_muscles"]
 

@@ -5,8 +5,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.checks import as_number
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import as_number
 
 __all__ = ["PARAMETER_RANGES", "HeadParameters"]
 

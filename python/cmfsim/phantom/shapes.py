@@ -14,8 +14,8 @@ from typing import Protocol
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.phantom.curves import Level, Table, clipped, smooth_max, smooth_step
+from cmfsim.values.checks import Floats
 
 __all__ = [
     "REACH",

@@ -7,10 +7,10 @@ encloses count as bone, as `Anatomy.bones` wants it; `brain_shape` and the like 
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.phantom.curves import smooth_curve, turn_about
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.phantom.shapes import Blend, Box, Egg, FlatTube, Step, Tube
+from cmfsim.values.checks import Floats
 
 __all__ = [
     "CONDYLE",

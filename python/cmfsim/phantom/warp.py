@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.phantom.curves import Level, smooth_step
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.phantom.shapes import REACH, Box, Shape
+from cmfsim.values.checks import Floats
 
 __all__ = ["FaceWarp", "JawWarp", "JawWarped"]
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats, as_index_rows, as_rows
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData

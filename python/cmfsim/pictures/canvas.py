@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, as_positive
 
 __all__ = [
     "LEGEND_ROW",
@@ -141,11 +141,7 @@ def draw(
                         view.caption, position=(10, 10), font_size=TEXT_SIZE, color="black"
                     )
                 plotter.subplot(0, 0)
-                swatches = []
-                for row, (text, colour) in enumerate(legend):
-                    top = height - 14 - (row + 1) * LEGEND_ROW
-                    plotter.add_text(text, position=(38, top), font_size=TEXT_SIZE, color="black")
-                    swatches.append((height - top - LEGEND_ROW + 4, colour))
+                swatches = _legend_text(plotter, legend, height)
                 image = np.array(plotter.screenshot(return_img=True))[:, :, :3]
             finally:
                 plotter.close()
@@ -155,12 +151,29 @@ def draw(
         raise CaseInputError(
             f"{path.name}: the picture cannot be drawn ({error}); {NO_OPENGL}"
         ) from error
-    for top, colour in swatches:
-        image[top - 1 : top + 19, 11:31] = 90
-        image[top : top + 18, 12:30] = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    _colour_swatches(image, swatches)
     if band:
         image = np.concatenate([image, written])
     write_picture(path, image)
+
+
+def _legend_text(
+    plotter: Any, legend: Sequence[tuple[str, str]], height: int
+) -> list[tuple[int, str]]:
+    """Writes the words of a legend; the row of pixels and the colour of each swatch."""
+    swatches = []
+    for row, (text, colour) in enumerate(legend):
+        top = height - 14 - (row + 1) * LEGEND_ROW
+        plotter.add_text(text, position=(38, top), font_size=TEXT_SIZE, color="black")
+        swatches.append((height - top - LEGEND_ROW + 4, colour))
+    return swatches
+
+
+def _colour_swatches(image: NDArray[np.uint8], swatches: Sequence[tuple[int, str]]) -> None:
+    """Colours the swatches of a legend, with a grey rim, in place."""
+    for top, colour in swatches:
+        image[top - 1 : top + 19, 11:31] = 90
+        image[top : top + 18, 12:30] = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
 
 
 def _wrapped(words: Sequence[str], width: int) -> list[str]:

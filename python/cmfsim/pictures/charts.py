@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import as_floats
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import as_floats
 
 __all__ = ["MODEL_COLOURS", "chart_errors", "write_figure"]
 

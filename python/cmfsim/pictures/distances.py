@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
+from cmfsim.values.checks import Floats, as_floats, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["DISTANCE_LIMIT", "distance_colour", "picture_distance_grid", "picture_distances"]

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats
 from cmfsim.pictures.canvas import LEGEND_ROW, LETTER, TEXT_SIZE, pyvista_module
+from cmfsim.values.checks import Floats
 
 __all__ = ["Label", "LabelPlaces", "add_labels", "column_width", "label_places", "spread"]
 

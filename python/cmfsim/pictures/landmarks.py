@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
 from cmfsim.pictures.canvas import View, bounds, draw, polydata, pyvista_module
 from cmfsim.pictures.labels import Label, add_labels, column_width
+from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["picture_landmarks"]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cmfsim._core import MuscleFibres, Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["SkinEnds", "skin_ends", "trimmed"]

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import (
     View,
@@ -22,6 +21,7 @@ from cmfsim.pictures.canvas import (
     silent_vtk,
     write_picture,
 )
+from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["ViewPart", "has_screen", "view_parts"]

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import StaticSolver, Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import CalibrationError
 from cmfsim.evaluation import SKIN_LANDMARKS, calibrate, skin_regions
 from cmfsim.pipeline.face_regions import FaceLandmarks, face_landmarks
@@ -19,6 +18,7 @@ from cmfsim.solving.rates import SkinRates, skin_rates
 from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.values.band_options import BandOptions
 from cmfsim.values.calibration import BandFactor, Calibration, settings_digest
+from cmfsim.values.checks import Floats
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import WHOLE_FACE, SkinBand

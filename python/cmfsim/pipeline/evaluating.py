@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError, RegistrationError
 from cmfsim.evaluation import (
     NO_CHANGE,
@@ -31,6 +30,7 @@ from cmfsim.pipeline.face_regions import face_landmarks
 from cmfsim.pipeline.predicting import named_models, predictions_of
 from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.finding_groups import grouped
 from cmfsim.values.prediction import MODELS, Prediction

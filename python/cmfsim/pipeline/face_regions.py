@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CmfsimError
 from cmfsim.evaluation import SKIN_LANDMARKS
 from cmfsim.pipeline.proposing import head_surfaces, propose_landmarks
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.patient_model import PatientModel
 

@@ -49,7 +49,7 @@ from cmfsim.pictures import (
 )
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.painting import Painter
-from cmfsim.planning.page import PAGE_FILE, page_state
+from cmfsim.pipeline.planning_page import PAGE_FILE, page_state
 from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
@@ -189,16 +189,10 @@ def write_results(
         for prediction in predictions:
             stage(f"writing {prediction.model}")
             place = "" if len(models) == 1 else prediction.model
-            (fresh / place).mkdir(exist_ok=True)
-            begun = {}
-            if pictures(prediction.model):
-                for name, picture in _pictures_of(prediction):
-                    begun[name] = painter.begin(picture, fresh / place / name)
-            more = partial(_more_files, prediction, begun, clock, slicer=slicer)
-            clock.begin(place, prediction.summary["timings"])
-            with clock.timed("writing the files"):
-                names = fill_prediction(fresh / place, prediction, more)
-            written.predictions.append(WrittenPrediction(place, names, prediction.summary))
+            drawing = painter if pictures(prediction.model) else None
+            written.predictions.append(
+                _fill_model(fresh, place, prediction, clock, painter=drawing, slicer=slicer)
+            )
         clock.place = None
         key = written.predictions[0].summary["case_key"]
         compared: Mapping[str, Any] | None
@@ -238,6 +232,28 @@ def write_results(
     written.left_out = [name for name in written.left_out if name not in names]
     _warn_of_removed(output, written.left_out)
     return written
+
+
+def _fill_model(
+    fresh: Path,
+    place: str,
+    prediction: Prediction,
+    clock: _Clock,
+    *,
+    painter: Painter | None,
+    slicer: bool,
+) -> WrittenPrediction:
+    """The files of one prediction in its folder, with pictures if there is a painter."""
+    (fresh / place).mkdir(exist_ok=True)
+    begun = {}
+    if painter is not None:
+        for name, picture in _pictures_of(prediction):
+            begun[name] = painter.begin(picture, fresh / place / name)
+    more = partial(_more_files, prediction, begun, clock, slicer=slicer)
+    clock.begin(place, prediction.summary["timings"])
+    with clock.timed("writing the files"):
+        names = fill_prediction(fresh / place, prediction, more)
+    return WrittenPrediction(place, names, prediction.summary)
 
 
 def _older(output: Path, places: Iterable[str]) -> list[str]:

@@ -4,7 +4,6 @@ import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from cmfsim.checks import check_one_of
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.building.case_model import model_of
@@ -15,6 +14,7 @@ from cmfsim.solving.models import predict_patient
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.band_options import BandOptions
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.checks import check_one_of
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction

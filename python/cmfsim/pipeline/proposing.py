@@ -12,16 +12,12 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.pipeline.building.inputs import read_anatomy
-from cmfsim.registration.proposed import (
-    ProposedLandmarks,
-    ProposedSite,
-    TemplateHead,
-    landmarks_from,
-)
+from cmfsim.registration.proposed import TemplateHead, landmarks_from
 from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import ThinPlateSpline
-from cmfsim.checks import Floats, as_rows, frozen
 from cmfsim.errors import LandmarkInputError
+from cmfsim.values.checks import Floats, as_rows, frozen
 
 __all__ = ["LandmarkAgreement", "leave_one_out"]
 

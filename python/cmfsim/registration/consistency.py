@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkError, RegistrationError
 from cmfsim.registration.agreement import LandmarkAgreement, leave_one_out
+from cmfsim.values.checks import Floats
 
 __all__ = ["CommonShift", "common_shift", "mirror_agreement", "swapped_names"]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import ThinPlateSpline
-from cmfsim.checks import Floats, as_rows
+from cmfsim.values.checks import Floats, as_rows
 
 __all__ = ["FoldReport", "fold_report"]
 

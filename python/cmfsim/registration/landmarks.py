@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import ThinPlateSpline, rigid_fit
-from cmfsim.checks import Floats, frozen
 from cmfsim.errors import LandmarkInputError, RegistrationError
 from cmfsim.registration.sides import swapped_pairs, wrong_sides
+from cmfsim.values.checks import Floats, frozen
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 

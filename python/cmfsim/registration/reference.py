@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 
 __all__ = ["REFERENCE_PLACES"]
 

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from cmfsim._core import rigid_fit
-from cmfsim.checks import Floats
 from cmfsim.errors import RegistrationError
+from cmfsim.values.checks import Floats
 
 __all__ = ["side_pairs", "side_vectors", "swapped_pairs", "wrong_sides"]
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import MassTensors
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
 __all__ = ["inversion_finding", "least_volume_ratios"]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Solution, StaticSolver, rigid_fit
-from cmfsim.checks import Floats, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.solving.simulation import scene_solver, solved_scene, told
+from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import decompose_motion

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import MassTensors, Solution, StaticSolver
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.solving.simulation import scene_plan
 from cmfsim.solving.tissue_changes import TissueParts, tissue_parts
+from cmfsim.values.checks import Floats
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene
 from cmfsim.values.surface_data import MovedSurface

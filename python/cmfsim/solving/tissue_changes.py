@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cmfsim._core import Tissue
-from cmfsim.checks import Floats
 from cmfsim.errors import MaterialError
+from cmfsim.values.checks import Floats
 from cmfsim.values.moduli import PRESET_MODULI, FatModuli
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.tissue_data import TissueData

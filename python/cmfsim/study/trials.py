@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.pipeline.building.muscles import with_muscles
@@ -16,6 +15,7 @@ from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.checks import Floats, as_positive, as_rows
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 
 __all__ = ["at_closest", "barycentric"]
 

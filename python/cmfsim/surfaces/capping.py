@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 
 __all__ = ["cap_loop"]
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.crossings import crossing_pairs
 from cmfsim.surfaces.topology import Edges, component_labels, edges_of, orientation_flips
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import MeshInputError
+from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MOST_DEPTH", "moved_outward", "tissue_depth"]

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim import _core
-from cmfsim.checks import Floats, Indices, as_number, as_positive
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats, Indices, as_number, as_positive
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData

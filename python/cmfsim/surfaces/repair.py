@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, as_number
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.capping import cap_loop
 from cmfsim.surfaces.checks import (
@@ -17,6 +16,7 @@ from cmfsim.surfaces.checks import (
     thin_triangles,
 )
 from cmfsim.surfaces.topology import component_labels, connected_labels, edges_of, orientation_flips
+from cmfsim.values.checks import Floats, as_number
 from cmfsim.values.finding import Finding
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData

@@ -11,11 +11,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.checks import (
+from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import (
     as_text,
     check_instance,
 )
-from cmfsim.errors import CaseInputError
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.image_data import ImageData

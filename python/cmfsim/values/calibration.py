@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats, as_number, as_text, check_one_of
 from cmfsim.errors import CalibrationError
+from cmfsim.values.checks import Floats, as_number, as_text, check_one_of
 from cmfsim.values.model_names import MODELS
 
 __all__ = ["BandFactor", "Calibration", "CalibrationCase", "settings_digest"]

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats, as_text, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.values.case_region import Plane
+from cmfsim.values.checks import Floats, as_text, check_one_of
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.moduli import TissueModuli
 

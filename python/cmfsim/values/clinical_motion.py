@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import rigid_fit
-from cmfsim.checks import Floats
 from cmfsim.errors import BoundaryInputError, RegistrationError
+from cmfsim.values.checks import Floats
 from cmfsim.values.motion import decompose_motion, rigid_motion
 from cmfsim.values.surface_data import MovedSurface
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.checks import (
+from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import (
     Floats,
     as_number,
     as_point,
     check_one_of,
 )
-from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 
 __all__ = ["JAWS", "LEAST_ARCH", "SHEET_DEPTH", "DentalArch"]

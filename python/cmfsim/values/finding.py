@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from cmfsim.checks import as_text, check_one_of
+from cmfsim.values.checks import as_text, check_one_of
 
 __all__ = ["SEVERITIES", "Finding", "OnFindings"]
 

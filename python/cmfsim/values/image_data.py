@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import (
+from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import (
     Floats,
     as_point,
     as_rows,
 )
-from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 
 __all__ = ["ImageData"]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface, SurfaceMotion
-from cmfsim.checks import Floats, Indices
+from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.surface_data import MovedSurface
 

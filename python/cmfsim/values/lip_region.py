@@ -7,7 +7,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import frozen
+from cmfsim.values.checks import frozen
 from cmfsim.values.frozen import Frozen
 
 __all__ = ["LIPS", "LipRegion"]

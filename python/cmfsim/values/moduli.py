@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 
 from cmfsim._core import Tissue
-from cmfsim.checks import as_number, as_text, check_instance
 from cmfsim.errors import MaterialError, MaterialInputError
+from cmfsim.values.checks import as_number, as_text, check_instance
 from cmfsim.values.tissue_data import TissueData
 
 __all__ = [

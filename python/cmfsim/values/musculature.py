@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from cmfsim._core import MOST_BOXES
-from cmfsim.checks import Floats, as_rows, as_text, check_instance, check_one_of
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, as_rows, as_text, check_instance, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.surface_data import SurfaceData

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import (
+from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import (
     check_one_of,
     frozen,
 )
-from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 
 __all__ = ["NODE_KINDS", "NodeKinds"]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, SurfaceMotion
-from cmfsim.checks import Floats, as_rows, check_one_of
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, as_rows, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.model_names import MODELS

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import (
+from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import (
     Floats,
     Indices,
     as_floats,
@@ -28,7 +29,6 @@ from cmfsim.checks import (
     check_one_of,
     frozen,
 )
-from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import rigid_matrix
 from cmfsim.values.solver_options import SolverOptions

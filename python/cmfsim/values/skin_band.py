@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.values.calibration import BandFactor, settings_digest
+from cmfsim.values.checks import Floats
 from cmfsim.values.frozen import Frozen
 
 __all__ = ["WHOLE_FACE", "SkinBand"]

@@ -4,11 +4,11 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
-from cmfsim.checks import (
+from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import (
     as_positive,
     check_one_of,
 )
-from cmfsim.errors import CaseInputError
 
 __all__ = ["CONTACTS", "SolverOptions"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, Indices, as_index_rows, as_number, as_rows
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, Indices, as_index_rows, as_number, as_rows
 from cmfsim.values.frozen import Frozen
 
 __all__ = ["MovedSurface", "SurfaceData", "joined_surface"]

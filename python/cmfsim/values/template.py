@@ -8,8 +8,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_rows, as_text, check_instance
 from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.values.checks import Floats, as_rows, as_text, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.musculature import MuscleSurface, Musculature

@@ -7,14 +7,14 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import (
+from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import (
     Floats,
     as_floats,
     as_text,
     check_one_of,
     frozen,
 )
-from cmfsim.errors import CaseInputError
 from cmfsim.values.frozen import Frozen
 
 __all__ = ["MIXINGS", "TISSUE_ARRAYS", "TISSUE_OPTIONAL", "TissueData"]

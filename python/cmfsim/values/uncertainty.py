@@ -8,7 +8,7 @@ that gives the figure.
 from dataclasses import dataclass
 from typing import Any
 
-from cmfsim.checks import as_positive
+from cmfsim.values.checks import as_positive
 
 __all__ = ["ADDED", "NOT_COVERED", "PLAN", "TISSUE", "Source", "band_sources"]
 

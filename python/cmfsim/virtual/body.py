@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.values.checks import Floats, as_index_rows, as_rows
 from cmfsim.virtual.hyperelastic import HyperelasticTissue, cofactor
 
 __all__ = ["HyperelasticBody"]

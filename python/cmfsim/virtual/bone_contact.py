@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["BoneContact", "SmoothDistance"]

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_index_rows, as_number, as_rows
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.values.checks import Floats, as_index_rows, as_number, as_rows
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["carried", "scanned"]

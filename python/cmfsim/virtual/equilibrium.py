@@ -11,8 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, SolverError, third_party
+from cmfsim.values.checks import Floats
 from cmfsim.virtual.body import HyperelasticBody
 
 __all__ = ["Contact", "Equilibrium", "EquilibriumOptions", "NoContact", "find_equilibrium"]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats
 
 __all__ = ["FAT", "MUSCLE", "HyperelasticTissue", "Moduli", "cofactor"]
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats, as_index_rows, as_positive, as_rows
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
 from cmfsim.virtual.equilibrium import Contact
 from cmfsim.virtual.open_mouth import MARGIN, MouthSlit
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_index_rows, as_positive, as_rows
 from cmfsim.phantom import Muscle, PhantomHead
 from cmfsim.phantom.curves import smooth_max
 from cmfsim.phantom.muscles import MELT
 from cmfsim.phantom.shapes import FlatTube
+from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
 
 __all__ = ["muscle_field", "thickened"]
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, signed_distance_image
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import PhantomHead
 from cmfsim.phantom.skull import UPPER_ARCH
 from cmfsim.phantom.warp import JawWarp
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 
 __all__ = ["LEAST_GAP", "MARGIN", "MouthSlit", "with_open_mouth"]
 

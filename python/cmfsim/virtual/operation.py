@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, signed_distance_image
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import decompose_motion, rigid_motion
 from cmfsim.values.node_kinds import NodeKinds

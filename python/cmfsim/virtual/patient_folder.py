@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from cmfsim._core import __version__
-from cmfsim.checks import Floats, as_number, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cohorts import COHORT_FORMAT
 from cmfsim.io.files import replacing
 from cmfsim.phantom import PhantomHead, make_head
+from cmfsim.values.checks import Floats, as_number, as_positive
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.carried_skin import scanned

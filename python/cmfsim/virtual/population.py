@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.checks import as_number
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
+from cmfsim.values.checks import as_number
 from cmfsim.values.uncertainty import ADDED, PLAN
 from cmfsim.virtual.people import DRAWN, Relocation, VirtualPatient
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import as_number, as_positive
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing
 from cmfsim.io.parallel import answers
@@ -23,6 +22,7 @@ from cmfsim.io.populations import (
     PopulationEntry,
     part_of,
 )
+from cmfsim.values.checks import as_number, as_positive
 from cmfsim.virtual.patient_folder import (
     TRUTH,
     cohort_text,

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, TetMesh
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
@@ -16,6 +15,7 @@ from cmfsim.pipeline.building.case_model import build_model
 from cmfsim.surfaces.depth import moved_outward, tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NodeKinds

@@ -8,7 +8,7 @@ import pytest
 import arch_head
 import cmfsim
 import meshes
-from cmfsim.bones import sheet_departure, sheets
+from cmfsim.bones import contact_sheets, sheet_departure
 from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets
 from cmfsim.surfaces.levels import surface_of_level
 from head_case import HeadCase
@@ -130,8 +130,10 @@ def test_no_voxel_depends_on_the_last_digits_of_a_processor(sheet, jaw, monkeypa
 
     The jaw's faces lie on grid points, and another processor's least squares differ by as much.
     """
-    plane, rng = sheets._plane, np.random.default_rng(4)
-    monkeypatch.setattr(sheets, "_plane", lambda points: plane(points) + 1e-14 * rng.normal(size=3))
+    plane, rng = contact_sheets._plane, np.random.default_rng(4)
+    monkeypatch.setattr(
+        contact_sheets, "_plane", lambda points: plane(points) + 1e-14 * rng.normal(size=3)
+    )
     for _ in range(3):
         made = cmfsim.contact_sheet("maxilla", jaw[0].bones["maxilla"], arch_head.arch())
         assert (made.surface.triangles == sheet.surface.triangles).all()

@@ -18,7 +18,7 @@ from cmfsim.cli import main
 from cmfsim.cli.case_commands import case_of
 from cmfsim.io.tables import read_tables
 from cmfsim.pipeline.building.inputs import plan_key
-from cmfsim.planning.page import page_state
+from cmfsim.pipeline.planning_page import page_state
 from head_case import HeadCase
 
 pytest.importorskip("skimage")

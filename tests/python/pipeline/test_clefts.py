@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.pipeline.building.attached_bodies import held_part
 from cmfsim.pipeline.building.clefts import cleft_tets, without_clefts
-from cmfsim.pipeline.building.held import held_part
 
 EDGE = 1.0
 

@@ -35,7 +35,7 @@ STAGES = {
     "cmfsim.solving.inversion",
     "cmfsim.io",
     "cmfsim.meshing",
-    "cmfsim.node_kinds",
+    "cmfsim.meshing.node_kinds",
     "cmfsim.bones",
     "cmfsim.phantom",
     "cmfsim.pictures",

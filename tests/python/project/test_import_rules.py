@@ -33,7 +33,7 @@ def test_the_project_keeps_its_import_rules(capsys: pytest.CaptureFixture[str]) 
         ("crates/mtm-core/src/new.rs", "", "add new to CORE"),
         ("crates/mtm-core/src/new/deep.rs", "", "deep.rs: add new to CORE"),
         ("crates/mtm-core/src/utils.rs", "", "name the file after its subject"),
-        ("python/cmfsim/checks.py", "from cmfsim import values", "checks may not import values"),
+        ("python/cmfsim/errors.py", "from cmfsim import values", "errors may not import values"),
         ("python/cmfsim/values/scene.py", "from .. import io", "values may not import io"),
         ("python/cmfsim/meshing/a.py", "import cmfsim.imaging", "meshing may not import imaging"),
         ("python/cmfsim/report.py", "from cmfsim.study import run", "report may not import study"),
@@ -129,6 +129,25 @@ def test_too_many_entries_are_counted(tmp_path: Path, capsys: pytest.CaptureFixt
     printed = capsys.readouterr().out
     most = check_imports.MOST_PYTHON_ENTRIES
     assert f"python/cmfsim: {most + 1} entries, at most {most}" in printed
+
+
+def test_too_many_imports_between_entries_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each pair of entries counts once, also for an import inside a function."""
+    package = tmp_path / "python/cmfsim"
+    (package / "io").mkdir(parents=True)
+    (package / "io/a.py").write_text("from cmfsim import errors, values\n", encoding="utf-8")
+    (package / "io/b.py").write_text(
+        "def f():\n    from cmfsim.values.scene import Scene\n", encoding="utf-8"
+    )
+    (package / "__init__.py").write_text("from cmfsim import errors, io\n", encoding="utf-8")
+    monkeypatch.setattr(check_imports, "MOST_PYTHON_PAIRS", 2)
+    assert check_imports.main(tmp_path) == 0
+    monkeypatch.setattr(check_imports, "MOST_PYTHON_PAIRS", 1)
+    assert check_imports.main(tmp_path) == 1
+    printed = capsys.readouterr().out
+    assert "python/cmfsim: 2 imports between entries, at most 1" in printed
 
 
 def test_the_core_runs_downhill() -> None:

@@ -100,7 +100,10 @@ def test_a_volume_is_cut_by_the_procedures_that_the_segments_need(tmp_path):
         ({"segments": []}, "at least one model of a bone"),
         ({"skull_landmarks": None, "model": "M+S"}, "skull landmarks"),
         ({"model": "X"}, "one of H, M"),
-        ({"segments": [case_folder.Segment("a b", Path("a.vtp"), MOTION.tolist())]}, "not a valid bone name"),
+        (
+            {"segments": [case_folder.Segment("a b", Path("a.vtp"), MOTION.tolist())]},
+            "not a valid bone name",
+        ),
         ({"segments": [case_folder.Segment("cranium", Path("a.vtp"))]}, "No segment moves"),
         ({"segments": 2 * [case_folder.Segment("chin", Path("a.vtp"))]}, "Two bones"),
     ],

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.meshing.lips.frame import MouthFrame
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 
 __all__ = ["MouthLine", "SkinProfiles", "crease_line", "skin_profiles", "smoothed"]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 from cmfsim.values.dental_arch import DentalArch
 
 __all__ = ["MouthFrame", "mouth_frame"]

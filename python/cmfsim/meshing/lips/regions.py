@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, Indices, as_index_rows, as_positive, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.case_parts import LIP_HEIGHT
+from cmfsim.values.checks import Floats, Indices, as_index_rows, as_positive, as_rows
 from cmfsim.values.lip_region import LIPS, LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData

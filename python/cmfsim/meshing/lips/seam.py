@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_number, as_rows, check_instance, check_one_of
 from cmfsim.meshing.lips.crease import MouthLine, SkinProfiles, crease_line, skin_profiles
 from cmfsim.meshing.lips.frame import MouthFrame, mouth_frame
 from cmfsim.meshing.lips.sheet import lip_sheet
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import LIP_DEPTH, LIP_SEAMS
+from cmfsim.values.checks import Floats, as_number, as_rows, check_instance, check_one_of
 from cmfsim.values.dental_arch import DentalArch
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key

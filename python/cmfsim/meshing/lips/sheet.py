@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.meshing.lips.crease import MIDDLE, MouthLine, SkinProfiles, smoothed, solid
 from cmfsim.meshing.lips.frame import MouthFrame
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["LipSheet", "lip_sheet"]

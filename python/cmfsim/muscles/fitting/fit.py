@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import MeshError, MeshInputError
 from cmfsim.muscles.fitting.lattice import Lattice
 from cmfsim.muscles.fitting.room import Room
@@ -18,6 +17,7 @@ from cmfsim.muscles.fitting.solving import Problem, Targets
 from cmfsim.muscles.fitting.volumes import Volumes
 from cmfsim.muscles.template.morphing import MorphedMusculature
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.surface_data import SurfaceData

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim import _core
-from cmfsim.checks import Floats
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["Room"]

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.muscles.fitting.lattice import Lattice, sparse
 from cmfsim.muscles.fitting.room import Room
 from cmfsim.muscles.fitting.volumes import Volumes
+from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["Problem", "Targets"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Volumes"]

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io.landmarks import read_landmarks
 from cmfsim.io.surfaces import read_surface
@@ -30,6 +29,7 @@ from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.registration import side_vectors
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import RepairOptions, clean_surface, repair_surface
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface

@@ -7,8 +7,8 @@ frontalis down from the vertex to the brow. Frame LPS.
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.muscles.template.fibre_lines import fan_lines, lane_lines
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["atlas_course"]

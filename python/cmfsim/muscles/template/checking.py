@@ -6,12 +6,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.io.templates import survey_template
 from cmfsim.muscles.template.built_in import template_path
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
 from cmfsim.surfaces.repair import clean_surface
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface

@@ -8,8 +8,8 @@ in depth.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import MeshInputError
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["fan_lines", "lane_lines"]

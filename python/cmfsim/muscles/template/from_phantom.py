@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.io.template_archives import mirrored_muscle
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.phantom import Muscle, PhantomHead, make_head
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
+from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.progress import Progress, no_progress

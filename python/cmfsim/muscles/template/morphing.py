@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import ThinPlateSpline
-from cmfsim.checks import Floats, as_number
 from cmfsim.errors import CaseInputError, LandmarkError
 from cmfsim.io.landmarks import read_landmark_file
 from cmfsim.io.templates import write_template
@@ -20,6 +19,7 @@ from cmfsim.registration import (
     leave_one_out,
     match_landmarks,
 )
+from cmfsim.values.checks import Floats, as_number
 from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MuscleSurface, Musculature
 from cmfsim.values.surface_data import SurfaceData

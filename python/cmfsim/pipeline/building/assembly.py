@@ -12,7 +12,7 @@ from cmfsim._core import __version__
 from cmfsim.bones import Procedure
 from cmfsim.io import Case
 from cmfsim.meshing.lips import seam_faces
-from cmfsim.node_kinds import segment_data
+from cmfsim.meshing.node_kinds import segment_data
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
 from cmfsim.pipeline.building.landmarks import landmark_summary
 from cmfsim.pipeline.building.lips import lip_summary

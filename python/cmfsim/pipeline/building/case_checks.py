@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from cmfsim._core import Surface, TetMesh
-from cmfsim.checks import Floats
 from cmfsim.doctor import SizedMotion, check_motion_size
 from cmfsim.doctor.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.motions import PlannedBones
 from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import MovedSurface

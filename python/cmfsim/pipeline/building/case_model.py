@@ -17,13 +17,12 @@ from cmfsim.bones import (
     free_cut,
     place_procedure,
 )
-from cmfsim.checks import Floats
 from cmfsim.doctor import diagnose
 from cmfsim.doctor.landmarks import LANDMARK_CODES
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseOrPath, as_case, write_model
 from cmfsim.meshing import tissue_level
-from cmfsim.node_kinds import KindOptions, dental_arches, kind_options
+from cmfsim.meshing.node_kinds import KindOptions, dental_arches, kind_options
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
 from cmfsim.pipeline.building.assembly import assembled
 from cmfsim.pipeline.building.case_checks import misplaced, plan_sizes
@@ -38,6 +37,7 @@ from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.building.tissue_mesh import region_of, tissue_mesh
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import Progress, no_progress

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, TetMesh
-from cmfsim.checks import Floats
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.renumbering import used_nodes

@@ -14,10 +14,10 @@ from cmfsim.bones import (
     contact_sheet,
     sheet_departure,
 )
-from cmfsim.checks import Floats
-from cmfsim.node_kinds import DentalArches, KindOptions
+from cmfsim.meshing.node_kinds import DentalArches, KindOptions
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.node_kinds import NodeKinds

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cmfsim._core import __version__
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io import (
     Case,
@@ -29,6 +28,7 @@ from cmfsim.meshing import anatomy_from_surfaces
 from cmfsim.surfaces.repair import repair_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMesh, CaseMotion
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import MovedSurface, SurfaceData

@@ -6,9 +6,9 @@ from cmfsim.errors import LandmarkError, LandmarkInputError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.parts import Head
 from cmfsim.pipeline.building.stages import Stages
-from cmfsim.registration.proposed import ProposedLandmarks
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
+from cmfsim.values.proposed_landmarks import ProposedLandmarks
 
 __all__ = ["found_landmarks", "landmark_summary"]
 

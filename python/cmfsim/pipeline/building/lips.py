@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface, TetMesh
-from cmfsim.checks import Floats, Indices
 from cmfsim.errors import MeshError
 from cmfsim.io import Case, read_surface
 from cmfsim.meshing import separated_mesh
 from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
-from cmfsim.node_kinds import DentalArches
+from cmfsim.meshing.node_kinds import DentalArches
+from cmfsim.pipeline.building.attached_bodies import held_part
 from cmfsim.pipeline.building.contacts import CaseContacts
-from cmfsim.pipeline.building.held import held_part
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds

@@ -9,7 +9,7 @@ import numpy as np
 
 from cmfsim.bones.motion import RemovedBone
 from cmfsim.bones.shape_fit import OPEN, OpenDirection, ShapeFit
-from cmfsim.bones.stray import REACH, StrayPatch
+from cmfsim.bones.stray_patches import REACH, StrayPatch
 from cmfsim.io import Case
 from cmfsim.values.finding import Finding
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from cmfsim.bones import part_segment
 from cmfsim.bones.motion import smooth_motion, sound_motion, torn_pieces, without_removed
-from cmfsim.checks import Floats
-from cmfsim.doctor.moved import check_pairs
+from cmfsim.doctor.moved_bones import check_pairs
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface
 from cmfsim.pipeline.building.inputs import motion_source, read_motion
@@ -23,6 +22,7 @@ from cmfsim.pipeline.building.motion_findings import (
 from cmfsim.pipeline.building.postoperative import REFERENCES, Postoperative, read_postoperative
 from cmfsim.surfaces.repair import clean_surface
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import frozen_mapping
 from cmfsim.values.surface_data import MovedSurface, SurfaceData, joined_surface

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 
 from cmfsim._core import TetMesh
-from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.muscles.equivalent import equivalent_material
 from cmfsim.muscles.fitting import MuscleFit, fit_muscles
@@ -14,6 +13,7 @@ from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.muscles.template.morphing import MorphedMusculature
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.checks import Floats
 from cmfsim.values.moduli import FatModuli
 from cmfsim.values.patient_model import PatientModel
 

@@ -1,16 +1,16 @@
 """The kind of each node of the soft tissue, and the remaining tets."""
 
 from cmfsim.meshing import report_of_part
-from cmfsim.node_kinds import DentalArches, KindOptions, classify_nodes, lifted_tissue
+from cmfsim.meshing.node_kinds import DentalArches, KindOptions, classify_nodes, lifted_tissue
+from cmfsim.pipeline.building.attached_bodies import held_part
 from cmfsim.pipeline.building.case_checks import cut_segments, untouched
 from cmfsim.pipeline.building.clefts import without_clefts
 from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets
-from cmfsim.pipeline.building.ends import end_findings
-from cmfsim.pipeline.building.held import held_part
 from cmfsim.pipeline.building.lips import CaseLipContact, lip_contact, separated_at_seam
 from cmfsim.pipeline.building.motions import PlannedBones
 from cmfsim.pipeline.building.parts import Head, Nodes, Tissue
 from cmfsim.pipeline.building.stages import Stages
+from cmfsim.pipeline.building.tissue_ends import end_findings
 from cmfsim.pipeline.building.tissue_mesh import end_planes
 
 __all__ = ["made_contacts", "nodes_of"]

@@ -4,19 +4,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from cmfsim._core import TetMesh
-from cmfsim.checks import Floats
 from cmfsim.io import Case
-from cmfsim.meshing import MeshReport, TissueRegion
+from cmfsim.meshing import TissueRegion
 from cmfsim.meshing.lips import LipSeam
-from cmfsim.node_kinds import DentalArches
+from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.contacts import CaseContacts
 from cmfsim.pipeline.building.lips import CaseLipContact
-from cmfsim.registration.proposed import ProposedLandmarks
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.lifted_tissue import LiftedTissue
+from cmfsim.values.mesh_report import MeshReport
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Head", "Nodes", "Tissue"]

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim._core import rigid_fit
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, RegistrationError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.images import read_image_file
@@ -20,6 +19,7 @@ from cmfsim.pipeline.building.inputs import (
 from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.case_parts import CasePostoperative
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["on_skin"]

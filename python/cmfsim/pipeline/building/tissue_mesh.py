@@ -7,11 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import TetMesh
-from cmfsim.checks import Floats
 from cmfsim.io import Case, read_surface, read_tet_mesh
 from cmfsim.meshing import (
     MeshOptions,
-    MeshReport,
     TissueRegion,
     mesh_findings,
     mesh_from_level,
@@ -27,8 +25,10 @@ from cmfsim.pipeline.building.refinement import (
     needed_halvings,
 )
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.mesh_report import MeshReport
 
 __all__ = ["end_planes", "region_of", "tissue_mesh"]
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io import replacing
+from cmfsim.pipeline.drafting.case_lines import Taken
 from cmfsim.pipeline.drafting.draft import CaseDraft, draft_case
 from cmfsim.pipeline.drafting.finds import EXTRACTED
 from cmfsim.pipeline.drafting.gathering import gather
-from cmfsim.pipeline.drafting.lines import Taken
 
 __all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case"]
 

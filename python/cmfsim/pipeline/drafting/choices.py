@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cmfsim.checks import Floats
+from cmfsim.pipeline.drafting.case_lines import Taken
 from cmfsim.pipeline.drafting.finds import ImageFind, LandmarkFind
-from cmfsim.pipeline.drafting.lines import Taken
+from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
 __all__ = ["Images", "Marks", "choose_images", "choose_landmarks"]

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.io.landmarks import write_landmarks
 from cmfsim.io.surfaces import write_surface
+from cmfsim.pipeline.drafting.case_lines import Taken, Text, quoted
 from cmfsim.pipeline.drafting.choices import Images, Marks, choose_images, choose_landmarks
 from cmfsim.pipeline.drafting.finds import EXTRACTED, LandmarkFind, SurfaceFind
 from cmfsim.pipeline.drafting.gathering import Gathered
-from cmfsim.pipeline.drafting.lines import Taken, Text, quoted
 from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
 from cmfsim.pipeline.drafting.roles import MOVING, safe_key
 from cmfsim.pipeline.drafting.surfaces import Anatomy, Question, choose_surfaces
 from cmfsim.values.case_parts import PROCEDURES
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["CaseDraft", "draft_case"]

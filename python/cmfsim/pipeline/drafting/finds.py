@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files import is_below
 from cmfsim.io.images import read_image_file
@@ -16,6 +15,7 @@ from cmfsim.io.stated_frames import is_own_file
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.pipeline.drafting.roles import NameRole, name_role
 from cmfsim.surfaces.topology import edges_of
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 

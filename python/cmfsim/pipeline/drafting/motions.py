@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CmfsimError
 from cmfsim.io.transforms import is_itk_file, motion_in_lps, read_transform_file
+from cmfsim.pipeline.drafting.case_lines import Taken, quoted
 from cmfsim.pipeline.drafting.finds import OtherFind, SurfaceFind, TransformFind
-from cmfsim.pipeline.drafting.lines import Taken, quoted
 from cmfsim.pipeline.drafting.roles import MOVING, safe_key
 from cmfsim.pipeline.drafting.scene_finds import LooseMotion
 from cmfsim.pipeline.drafting.surfaces import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import clinical_motion
 
 __all__ = ["DraftMotion", "Plan", "file_motions", "scene_motions"]

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CmfsimError
 from cmfsim.io.slicer_scenes import SceneNode, SlicerScene
 from cmfsim.pipeline.drafting.finds import (
@@ -17,6 +16,7 @@ from cmfsim.pipeline.drafting.finds import (
 )
 from cmfsim.pipeline.drafting.roles import NameRole, name_role
 from cmfsim.pipeline.drafting.segment_finds import segment_finds
+from cmfsim.values.checks import Floats
 
 __all__ = ["LooseMotion", "SceneFinds", "scene_finds"]
 

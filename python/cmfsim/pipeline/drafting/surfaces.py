@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
+from cmfsim.pipeline.drafting.case_lines import Taken
 from cmfsim.pipeline.drafting.finds import SurfaceFind
-from cmfsim.pipeline.drafting.lines import Taken
 from cmfsim.pipeline.drafting.roles import MOVING, safe_key
+from cmfsim.values.checks import Floats
 
 __all__ = ["Anatomy", "Question", "choose_surfaces"]
 

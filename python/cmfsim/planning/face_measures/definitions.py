@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 
 __all__ = ["FORMULAS", "MEASURES", "Measure", "measure_sites"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MIDLINE", "MidlineProfile", "midline_profile"]

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.planning.face_measures.definitions import MEASURES, measure_sites
 from cmfsim.planning.face_measures.profile import midline_profile
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction

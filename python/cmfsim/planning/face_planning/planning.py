@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_planning.search import bounded_least_squares
 from cmfsim.planning.face_planning.targets import CarriedPoints, Target, Wish, wish_of
 from cmfsim.planning.replanning import PlanningModel
+from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
 from cmfsim.values.prediction import Prediction
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, SurfaceMotion
-from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
 from cmfsim.planning.replanning import Motions, PlanningModel
+from cmfsim.values.checks import Floats, as_positive, as_rows
 from cmfsim.values.prediction import carried_share
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, __version__
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, midline_profile
 from cmfsim.planning.page.band_content import band_content
@@ -24,6 +23,7 @@ from cmfsim.planning.replanning import (
 )
 from cmfsim.surfaces.barycentric import barycentric
 from cmfsim.surfaces.levels import simplified_surface
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.prediction import Prediction, carried_share
 from cmfsim.values.surface_data import SurfaceData

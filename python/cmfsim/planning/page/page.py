@@ -1,4 +1,4 @@
-"""The planning page as one file: scripts, style and numbers inside, nothing from elsewhere.
+"""The text of the planning page: scripts, style and numbers in one file, nothing from elsewhere.
 
 The scripts are ES modules in their own files; they are joined in the order of their imports. The
 policy of the page allows these very scripts and this style, by their hashes, and no network.
@@ -8,20 +8,16 @@ import base64
 import hashlib
 import html
 import json
-import os
 import re
 from collections.abc import Mapping
 from importlib.resources import files
-from pathlib import Path
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io import replacing
 from cmfsim.planning.page.content import PageContent
 from cmfsim.planning.page.packing import packed_arrays
 
-__all__ = ["PAGE_FILE", "page_state", "page_text", "write_planning_page"]
+__all__ = ["page_text"]
 
-PAGE_FILE = "plan.html"
 MAIN = "main.js"
 DISCLAIMER = "Research software, not a medical device. Not for diagnosis or treatment decisions."
 IMPORT = re.compile(r'^import \{[^}]*\} from "\./([a-z_]+\.js)";\n', re.MULTILINE)
@@ -29,9 +25,6 @@ EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const|class)\b)", re.MUL
 # A name that a module defines at its top.
 DEFINED = re.compile(r"^(?:export )?(?:async )?(?:function|const|let|class) (\w+)", re.MULTILINE)
 FIELD = re.compile(r"@([a-z]+)@")
-STATE = re.compile(rb'<meta name="cmfsim-made-for" content="([0-9a-f]{64})">')
-# The state stands before the style and scripts.
-HEAD_BYTES = 2048
 EXACT_NOTE = (
     "Away from the case's own plan, the contact of soft tissue with teeth and gums is "
     "extrapolated, not solved again. For the exact face, save the plan next to the case file "
@@ -106,45 +99,6 @@ def page_text(
     template = package.joinpath("page.html").read_text(encoding="utf-8")
     # In one pass, so that no text is searched for the fields of another.
     return FIELD.sub(lambda match: fields[match[1]], template)
-
-
-def write_planning_page(
-    path: str | os.PathLike[str], content: PageContent, *, case_file: str = "case.toml"
-) -> int:
-    """The size in bytes of a planning page, written to a file in one step.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Numbers that are not finite.
-    OSError
-        The folder cannot be written to.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> cmfsim.write_planning_page("plan.html", content)  # doctest: +SKIP
-    5550695
-    """
-    data = page_text(content, case_file=case_file).encode()
-    with replacing(Path(path)) as file:
-        file.write(data)
-    return len(data)
-
-
-def page_state(path: str | os.PathLike[str]) -> str | None:
-    """What the planning page at a path was made for (`plan_key`); None where there is no page.
-
-    Raises
-    ------
-    OSError
-        The file is there and cannot be read.
-    """
-    if not Path(path).is_file():
-        return None
-    with Path(path).open("rb") as file:
-        found = STATE.search(file.read(HEAD_BYTES))
-    return None if found is None else found[1].decode()
 
 
 def joined_scripts(modules: Mapping[str, str]) -> str:

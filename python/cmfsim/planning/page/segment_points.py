@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.checks import Floats
+from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import clinical_motion
 
 __all__ = ["SegmentPoint", "segment_points"]

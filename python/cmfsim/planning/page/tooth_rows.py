@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
-from cmfsim.node_kinds import dental_arches
+from cmfsim.meshing.node_kinds import dental_arches
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats
 from cmfsim.values.dental_arch import DentalArch
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.patient_model import PatientModel

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import PlanOperator
-from cmfsim.checks import Floats, frozen
 from cmfsim.errors import SolverError
+from cmfsim.values.checks import Floats, frozen
 from cmfsim.values.motion import rigid_motion
 
 __all__ = ["COLUMNS", "PlanColumns", "plan_columns"]

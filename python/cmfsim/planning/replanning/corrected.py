@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction
 from cmfsim.planning.replanning.expected_error import (
@@ -17,6 +16,7 @@ from cmfsim.planning.replanning.expected_error import (
     segment_boxes,
 )
 from cmfsim.planning.replanning.model import Motions, PlanningModel
+from cmfsim.values.checks import Floats, as_positive
 
 __all__ = ["CORRECTIONS", "corrected_planning"]
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.model import Motions, PlanningModel
+from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.progress import Progress
 

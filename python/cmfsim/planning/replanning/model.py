@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import StaticSolver
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.replanning.columns import PlanColumns, plan_columns
 from cmfsim.planning.replanning.correction import PlanCorrection
 from cmfsim.solving.models import model_scene, predict_patient
 from cmfsim.solving.simulation import scene_plan, scene_solver
+from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction, carried_points

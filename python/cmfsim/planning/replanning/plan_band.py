@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Solution, Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.replanning.columns import PlanColumns
 from cmfsim.planning.replanning.model import Motions, PlanningModel
@@ -23,6 +22,7 @@ from cmfsim.solving.models import model_scene
 from cmfsim.solving.rates import ACCURACY, scene_parts, tissue_load
 from cmfsim.solving.simulation import scene_plan
 from cmfsim.values.calibration import BandFactor
+from cmfsim.values.checks import Floats
 from cmfsim.values.motion import decompose_motion
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import SkinBand

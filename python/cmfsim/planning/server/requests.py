@@ -12,9 +12,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import BoundaryError, CaseInputError
 from cmfsim.planning.replanning import PlanningModel
+from cmfsim.values.checks import Floats
 
 __all__ = ["MOST_BYTES", "RefusedError", "check_headers", "check_token", "plan_of_body"]
 

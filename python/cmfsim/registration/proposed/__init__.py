@@ -1,12 +1,9 @@
 """Landmarks found without a person: each site where its own definition holds, with a confidence."""
 
 from cmfsim.registration.proposed.proposal import landmarks_from, measured_biases
-from cmfsim.registration.proposed.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.registration.proposed.template_head import TemplateHead
 
 __all__ = [
-    "ProposedLandmarks",
-    "ProposedSite",
     "TemplateHead",
     "landmarks_from",
     "measured_biases",

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import third_party
+from cmfsim.values.checks import Floats
 
 __all__ = ["STEP", "DepthMap", "depth_map"]
 

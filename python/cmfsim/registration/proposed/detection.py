@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.registration.proposed.depth_maps import depth_map
 from cmfsim.registration.proposed.pose import Pose, surface_samples
 from cmfsim.registration.proposed.skin_sites import find_skin_sites
 from cmfsim.registration.proposed.skull_sites import FRONT_REACH, find_skull_sites, skull_views
 from cmfsim.registration.proposed.template_head import TemplateHead
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Detected", "HeadSurfaces", "biases", "detect", "is_lower"]

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.registration.reference import REFERENCE_PLACES
+from cmfsim.values.checks import Floats
 
 __all__ = ["FAR_JAW", "JAW_SITES", "jaw_distance", "misfits"]
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.registration.proposed.groups import FAR_JAW, jaw_distance
 from cmfsim.registration.proposed.pose import Pose
-from cmfsim.registration.proposed.proposed_landmarks import ProposedSite
+from cmfsim.values.checks import Floats
+from cmfsim.values.proposed_landmarks import ProposedSite
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["JawEvidence", "jaw_evidence", "separation_points", "weakened"]

@@ -6,12 +6,12 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.registration.proposed.groups import misfits
 from cmfsim.registration.proposed.limits import CutPlane
 from cmfsim.registration.proposed.pose import Pose
-from cmfsim.registration.proposed.proposed_landmarks import ProposedSite
+from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
+from cmfsim.values.proposed_landmarks import ProposedSite
 
 __all__ = ["MissingSites", "judged", "missing_sites"]
 

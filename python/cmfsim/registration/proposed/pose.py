@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim._core import IcpFit, Surface, icp
-from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError, RegistrationError
+from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.registration.proposed.depth_maps import STEP, DepthMap
+from cmfsim.values.checks import Floats
 
 __all__ = ["farthest_from_chord", "local_midline", "most_outside", "smoothed", "upper_end"]
 

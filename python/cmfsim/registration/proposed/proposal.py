@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import LandmarkInputError
 from cmfsim.registration.proposed.detection import (
     Detected,
@@ -31,9 +30,10 @@ from cmfsim.registration.proposed.pose import (
     levelled,
     surface_samples,
 )
-from cmfsim.registration.proposed.proposed_landmarks import ProposedLandmarks
 from cmfsim.registration.proposed.template_head import TemplateHead
+from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
+from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
 __all__ = ["landmarks_from", "measured_biases"]

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import third_party
 from cmfsim.registration.proposed.depth_maps import STEP, DepthMap
 from cmfsim.registration.proposed.profile import most_outside, smoothed
+from cmfsim.values.checks import Floats
 
 __all__ = ["Orbit", "SideView", "Sites", "find_orbit", "find_side_sites"]
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.registration.proposed.depth_maps import STEP, DepthMap
 from cmfsim.registration.proposed.profile import local_midline, smoothed
+from cmfsim.values.checks import Floats
 
 __all__ = ["find_skin_sites"]
 

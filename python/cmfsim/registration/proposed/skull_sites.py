@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.registration.proposed.depth_maps import STEP, DepthMap, depth_map
 from cmfsim.registration.proposed.profile import (
     farthest_from_chord,
@@ -14,6 +13,7 @@ from cmfsim.registration.proposed.profile import (
     upper_end,
 )
 from cmfsim.registration.proposed.side_sites import SideView, Sites, find_orbit, find_side_sites
+from cmfsim.values.checks import Floats
 
 __all__ = ["SkullViews", "find_skull_sites", "skull_views"]
 

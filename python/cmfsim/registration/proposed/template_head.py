@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from cmfsim.checks import Floats, as_text, check_instance
 from cmfsim.errors import LandmarkInputError
+from cmfsim.values.checks import Floats, as_text, check_instance
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.surface_data import SurfaceData
 

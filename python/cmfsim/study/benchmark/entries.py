@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing
 from cmfsim.pipeline.banding import predict_with_band
@@ -26,6 +25,7 @@ from cmfsim.study.benchmark.skin_predictions import (
     write_skin_prediction,
 )
 from cmfsim.surfaces.barycentric import at_closest
+from cmfsim.values.checks import Floats
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import ThinPlateSpline
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.evaluation import SKIN_LANDMARKS
 from cmfsim.study.benchmark.patients import BenchmarkPatient
+from cmfsim.values.checks import Floats
 
 __all__ = ["LEAST_TRAINED", "LearnedFace", "PartialLeastSquares", "learn_face"]
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, __version__
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation import skin_regions
 from cmfsim.io import Case, read_landmarks, read_surface
 from cmfsim.io.populations import MADE, Population
+from cmfsim.values.checks import Floats
 from cmfsim.values.uncertainty import ADDED, PLAN, Source
 
 __all__ = ["LIPS", "BenchmarkPatient", "far_from_models", "patients_of"]

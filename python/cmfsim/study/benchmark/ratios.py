@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim._core import ThinPlateSpline
-from cmfsim.checks import Floats
 from cmfsim.study.benchmark.patients import BenchmarkPatient
+from cmfsim.values.checks import Floats
 
 __all__ = ["RATIOS", "Ratio", "predict_by_ratios"]
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cmfsim.checks import as_number, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io import replacing
 from cmfsim.io.parallel import answers
@@ -28,6 +27,7 @@ from cmfsim.study.benchmark.results import MethodResult
 from cmfsim.study.benchmark.scores import score
 from cmfsim.study.benchmark.skin_predictions import read_skin_prediction
 from cmfsim.study.benchmark.table import BenchmarkTable
+from cmfsim.values.checks import as_number, check_one_of
 from cmfsim.values.model_names import MODELS
 
 __all__ = ["Benchmark", "run_benchmark"]

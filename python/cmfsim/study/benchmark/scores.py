@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.study.benchmark.patients import BenchmarkPatient
 from cmfsim.study.benchmark.skin_predictions import SkinPrediction
 from cmfsim.values.calibration import BandFactor
+from cmfsim.values.checks import Floats
 
 __all__ = ["WITHIN", "RegionScore", "score"]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files import check_readable, named, replacing
+from cmfsim.values.checks import Floats, as_rows
 
 __all__ = ["SkinPrediction", "read_skin_prediction", "write_skin_prediction"]
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from cmfsim.checks import as_positive, check_one_of
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.checks import as_positive, check_one_of
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import MIXINGS

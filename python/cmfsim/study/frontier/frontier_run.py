@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim import _core
-from cmfsim.checks import Floats, as_positive
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.io import Case
 from cmfsim.io.archives import member_of, read_archive
@@ -24,6 +23,7 @@ from cmfsim.study.frontier.rows import Frontier, FrontierRow, Spread, with_front
 from cmfsim.study.frontier.skin_points import WHOLE, read_points, skin_errors
 from cmfsim.study.frontier.sweep import reference_choice, sweep_choices
 from cmfsim.study.frontier.worker import MOVED_FORMAT
+from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.progress import Progress, no_progress
 
 __all__ = ["content_key", "frontier"]

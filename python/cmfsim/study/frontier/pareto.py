@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import as_floats
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import as_floats
 
 __all__ = ["pareto_front"]
 

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, as_rows
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation import (
     SKIN_LANDMARKS,
@@ -16,6 +15,7 @@ from cmfsim.evaluation import (
     skin_regions,
 )
 from cmfsim.io.archives import member_of, read_archive, write_archive
+from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.patient_model import PatientModel
 
 __all__ = ["SKIN", "WHOLE", "read_points", "skin_errors", "skin_points", "write_points"]

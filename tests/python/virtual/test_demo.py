@@ -11,8 +11,8 @@ import pytest
 import cmfsim
 from cmfsim.cli import main
 from cmfsim.phantom import make_head
-from cmfsim.phantom.demo import read_demo_truth, write_demo_case
-from cmfsim.phantom.demo.patient import DEMO_PARAMETERS
+from cmfsim.virtual.demo import read_demo_truth, write_demo_case
+from cmfsim.virtual.demo.patient import DEMO_PARAMETERS
 
 pytest.importorskip("skimage")
 pytest.importorskip("jinja2")

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.checks import Floats
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.imaging.alignment_options import AlignmentOptions
 from cmfsim.imaging.morphology import Mask, as_itk, box_of, resampled_to, simpleitk, smoothed
+from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 
 __all__ = ["Clipped", "Places", "align", "inverse", "matrix_of"]

@@ -20,9 +20,9 @@ from cmfsim.bones.shape_fit import (
     fit_shape,
     vertex_areas,
 )
-from cmfsim.bones.stray import LEAST_STRAY, StrayPatch, stray_patches
-from cmfsim.checks import Floats
+from cmfsim.bones.stray_patches import LEAST_STRAY, StrayPatch, stray_patches
 from cmfsim.errors import RegistrationError
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["PairedShape", "paired_shape"]

@@ -7,8 +7,16 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.checks import Floats, as_number, as_point, as_positive, as_rows, as_text, check_one_of
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import (
+    Floats,
+    as_number,
+    as_point,
+    as_positive,
+    as_rows,
+    as_text,
+    check_one_of,
+)
 
 __all__ = ["BORDERS", "KindOptions", "SlidingBox", "SlidingSphere", "kind_options"]
 

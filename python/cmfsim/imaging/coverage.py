@@ -5,7 +5,7 @@ import numpy as np
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import depth
 from cmfsim.imaging.skin import Skin
-from cmfsim.imaging.working import COARSE, Working
+from cmfsim.imaging.working_grid import COARSE, Working
 from cmfsim.values.finding import Finding
 
 __all__ = ["view_findings"]

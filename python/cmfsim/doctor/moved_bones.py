@@ -5,13 +5,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmfsim._core import rigid_fit
-from cmfsim.checks import Floats
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.operation import check_against_skin
 from cmfsim.doctor.places import place_text
 from cmfsim.doctor.plan_size import FAR, TOO_FAR, check_tiny, check_turn
 from cmfsim.errors import CmfsimError, RegistrationError
 from cmfsim.surfaces.topology import edges_of
+from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData

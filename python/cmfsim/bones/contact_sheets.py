@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
-from cmfsim.checks import Floats, as_positive, as_rows
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
+from cmfsim.values.checks import Floats, as_positive, as_rows
 from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData

@@ -3,10 +3,10 @@
 Kim et al. (2010), section 2.5 and Figure 4. Only nodes on the boundary of the mesh get a kind.
 """
 
-from cmfsim.node_kinds.arches import DentalArches, dental_arches
-from cmfsim.node_kinds.classification import ClassifiedNodes, classify_nodes, segment_data
-from cmfsim.node_kinds.lifted import lifted_tissue
-from cmfsim.node_kinds.options import KindOptions, SlidingBox, SlidingSphere, kind_options
+from cmfsim.meshing.node_kinds.arches import DentalArches, dental_arches
+from cmfsim.meshing.node_kinds.classification import ClassifiedNodes, classify_nodes, segment_data
+from cmfsim.meshing.node_kinds.lifted import lifted_tissue
+from cmfsim.meshing.node_kinds.options import KindOptions, SlidingBox, SlidingSphere, kind_options
 
 __all__ = [
     "ClassifiedNodes",

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.checks import Floats, as_index_rows, as_rows
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats, as_index_rows, as_rows
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["TRUTH_FILE", "DemoTruth", "read_demo_truth"]
@@ -58,7 +58,7 @@ def read_demo_truth(head: Mapping[str, float], path: Path | None = None) -> Demo
         (also `ValueError`) Not such an archive, or of another head.
     """
     if path is None:
-        own = files("cmfsim.phantom.demo").joinpath(TRUTH_FILE)
+        own = files("cmfsim.virtual.demo").joinpath(TRUTH_FILE)
         if not own.is_file():
             return None
         path = Path(str(own))

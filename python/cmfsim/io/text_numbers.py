@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.errors import CaseInputError
+from cmfsim.values.checks import Floats
 
 __all__ = ["real_numbers", "shown", "whole_numbers"]
 

@@ -6,31 +6,24 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.checks import as_positive
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_surface
 from cmfsim.io.files import replacing
-from cmfsim.phantom import HeadParameters, PhantomHead, make_head
-from cmfsim.phantom.demo.truth import DemoTruth, read_demo_truth
+from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import as_positive
+from cmfsim.virtual.demo.truth import DemoTruth, read_demo_truth
+from cmfsim.virtual.people import PATIENTS
 
 __all__ = ["DEMO_PARAMETERS", "DemoCase", "write_demo_case"]
 
-# Of class III: a long mandible with a strong chin under a maxilla that lies back. Lips stand 2 mm
-# apart and teeth 2.5 mm, as in a patient who is scanned at rest.
-DEMO_PARAMETERS = HeadParameters(
-    face_height=1.02,
-    nose_length=1.0,
-    chin_projection=2.0,
-    mandible_advance=3.0,
-    lip_gap=2.0,
-    bite_gap=2.5,
-)
-# Le Fort I: forwards and up, and turned about the transverse axis through this landmark, degrees.
-MAXILLA_MOVE, MAXILLA_TURN, MAXILLA_CENTRE = (0.0, -5.0, 0.5), 2.0, "supradentale"
-# Sagittal split: the mandible back and up with the maxilla. All mm, LPS.
-MANDIBLE_MOVE = (0.0, 3.5, 0.5)
+# Of class III: a long mandible with a strong chin under a maxilla that lies back.
+DEMO_PATIENT = PATIENTS[1]
+DEMO_PARAMETERS = DEMO_PATIENT.parameters
+# Le Fort I: forwards and up, and turned about the transverse axis through a landmark. Sagittal
+# split: the mandible back and up with the maxilla.
+MAXILLA, MANDIBLE = DEMO_PATIENT.plan["maxilla"], DEMO_PATIENT.plan["mandible_body"]
 # Height up to which there is tissue, mm: the scalp above takes two fifths of the tets and stays.
 TISSUE_TOP = 75.0
 # The head's voxels, in edges of the tets, and their bounds, mm: finer ones cost time and change
@@ -148,7 +141,7 @@ def write_demo_case(
 
     Examples
     --------
-    >>> from cmfsim.phantom.demo import write_demo_case
+    >>> from cmfsim.virtual.demo import write_demo_case
     >>> made = write_demo_case("cmfsim-demo")  # doctest: +SKIP
     >>> prediction = cmfsim.predict(made.case, model="M")  # doctest: +SKIP
     """
@@ -184,15 +177,15 @@ def _check_folder(folder: Path) -> None:
 
 
 def _case_text(head: PhantomHead, edge_length: float, after: DemoTruth | None) -> str:
-    centre = [round(float(x), 3) for x in head.skull_landmarks[MAXILLA_CENTRE]]
+    centre = [round(float(x), 3) for x in head.skull_landmarks[MAXILLA.centre]]
     return CASE.format(
         mark=MARK,
         command="predict" if after is None else "evaluate",
         note=NOTE if after is None else NOTE + IN_SILICO,
-        maxilla=list(MAXILLA_MOVE),
-        turn=MAXILLA_TURN,
+        maxilla=list(MAXILLA.translation),
+        turn=MAXILLA.angle,
         centre=centre,
-        mandible=list(MANDIBLE_MOVE),
+        mandible=list(MANDIBLE.translation),
         upper=TISSUE_TOP,
         edge_length=edge_length,
         after="" if after is None else AFTER,

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, Indices, as_index_rows, as_point, as_rows, check_instance
 from cmfsim.errors import CaseInputError
-from cmfsim.node_kinds.arches import DentalArches, dental_arches
-from cmfsim.node_kinds.options import BORDERS, KindOptions
-from cmfsim.node_kinds.sliding import sliding_nodes
+from cmfsim.meshing.node_kinds.arches import DentalArches, dental_arches
+from cmfsim.meshing.node_kinds.options import BORDERS, KindOptions
+from cmfsim.meshing.node_kinds.sliding import sliding_nodes
 from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.checks import Floats, Indices, as_index_rows, as_point, as_rows, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.renumbering import used_nodes

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats, as_point
 from cmfsim.errors import CaseInputError
 from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.dental_arch import DentalArch
 from cmfsim.values.finding import Finding
 

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.errors import third_party
-from cmfsim.node_kinds.arches import DentalArches
-from cmfsim.node_kinds.options import KindOptions
+from cmfsim.meshing.node_kinds.arches import DentalArches
+from cmfsim.meshing.node_kinds.options import KindOptions
 from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.checks import Floats
 from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData

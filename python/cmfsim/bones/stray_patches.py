@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.checks import Floats
 from cmfsim.surfaces.topology import connected_labels, edges_of
+from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["LEAST_STRAY", "REACH", "StrayPatch", "stray_patches"]

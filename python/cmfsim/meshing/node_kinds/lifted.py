@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface
-from cmfsim.checks import as_rows
-from cmfsim.node_kinds.options import KindOptions
+from cmfsim.meshing.node_kinds.options import KindOptions
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import as_rows
 from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.node_kinds import NodeKinds
 

@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.checks import Floats
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.morphology import Mask, ndimage
-from cmfsim.imaging.working import Working
+from cmfsim.imaging.working_grid import Working
+from cmfsim.values.checks import Floats
 
 __all__ = ["guessed_landmarks"]
 
