@@ -75,6 +75,9 @@ class SkinComparison:
         Area of the evaluated vertices, of the area of the predicted skin.
     n_masked : int
         Vertices of the prediction outside the mask.
+    n_covered, back_covered : int
+        Vertices inside the mask that other skin covers, of the prediction and of the post-operative
+        skin: they are not evaluated.
     n_border, n_far : int
         Excluded vertices: with a partner on the border of the post-operative skin; with a partner
         beyond the limit.
@@ -96,8 +99,10 @@ class SkinComparison:
     region_vertices: Mapping[str, NDArray[np.uint32]]
     share: float
     n_masked: int
+    n_covered: int
     n_border: int
     n_far: int
+    back_covered: int
     back_border: int
     back_far: int
     findings: tuple[Finding, ...]
@@ -186,8 +191,10 @@ class SkinComparison:
             "evaluated_share_of_area": self.share,
             "excluded": {
                 "masked": self.n_masked,
+                "covered": self.n_covered,
                 "border": self.n_border,
                 "far": self.n_far,
+                "covered_backward": self.back_covered,
                 "border_backward": self.back_border,
                 "far_backward": self.back_far,
             },
@@ -250,6 +257,9 @@ def compare_skins(
 
     Notes
     -----
+    Vertices with other skin within 3 mm in front of them, such as between closed lips, are not
+    evaluated, because no scan shows them; they are counted.
+
     The error is the distance of the *unwarped* vertex from its partner. It is at least the distance
     to the closest point, and more where skin moved along itself: corners of the mouth, wings of
     the nose.
@@ -276,7 +286,13 @@ def compare_skins(
     names = landmarks[0] if landmarks is not None else None
     has_names = isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS)
     parts = _chosen_regions(regions, skin, names if has_names else None)
-    chosen = _chosen_vertices(mask, skin, parts)
+    asked = _chosen_vertices(mask, skin, parts)
+    chosen, seen = asked & ~skin.covered(), ~other.covered()
+    if not chosen.any():
+        raise RegistrationInputError(
+            f"all {asked.sum()} vertices to evaluate have other skin within 3 mm in front of them: "
+            "check that the predicted skin is one surface whose normals point outwards"
+        )
     matches = match_skins(
         skin,
         chosen,
@@ -287,7 +303,11 @@ def compare_skins(
     )
     _check_matched(matches, int(chosen.sum()))
     backward = _backward(
-        skin, chosen, other, warp=warps.back, limit=max_distance, exclude_borders=exclude_borders
+        (other, seen),
+        (skin, chosen),
+        warp=warps.back,
+        limit=max_distance,
+        exclude_borders=exclude_borders,
     )
     found = _findings(matches, int(chosen.sum()), warps.forth, skin.vertices[chosen])
     areas = skin.vertex_areas()
@@ -298,9 +318,11 @@ def compare_skins(
         partners=frozen(matches.partners),
         statistics=distance_statistics(matches.signed),
         **_from_behind(matches, backward),
+        n_covered=int(asked.sum() - chosen.sum()),
+        back_covered=int(len(seen) - seen.sum()),
         **_by_region(matches, parts),
         share=float(areas[matches.vertices].sum() / areas.sum()),
-        n_masked=int(len(chosen) - chosen.sum()),
+        n_masked=int(len(asked) - asked.sum()),
         n_border=matches.n_border,
         n_far=matches.n_far,
         findings=(*warps.findings, *found),
@@ -428,24 +450,23 @@ def _as_choice(name: str, value: ArrayLike, count: int) -> NDArray[np.bool_]:
 
 
 def _backward(
-    skin: Skin,
-    chosen: NDArray[np.bool_],
-    other: Skin,
+    seen_part: tuple[Skin, NDArray[np.bool_]],
+    evaluated: tuple[Skin, NDArray[np.bool_]],
     *,
     warp: ThinPlateSpline | None,
     limit: float | None,
     exclude_borders: bool,
 ) -> Matches:
     """Partners of the post-operative vertices on the evaluated part of the simulated skin."""
+    (other, seen), (skin, chosen) = seen_part, evaluated
     part = skin if chosen.all() else skin.part(chosen)
-    everywhere = np.ones(len(other.vertices), dtype=bool)
     if part is None:
         none = np.zeros(0, dtype=np.int64)
         return Matches(none, np.zeros((0, 3)), np.zeros(0), 0, 0)
     # The border of a part of the skin is always left out: what lies beyond was masked.
     return match_skins(
         other,
-        everywhere,
+        seen,
         part,
         warp=warp,
         max_distance=limit,

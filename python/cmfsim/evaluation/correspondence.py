@@ -17,6 +17,9 @@ __all__ = ["Matches", "Skin", "match_skins"]
 # A partner lies on the border if its distance from the border's edge, as a share of the height of
 # its triangle, is below this: more than the rounding of a closest point at 1000 mm.
 ON_EDGE = 1e-7
+# Places in front of a vertex, mm, at which other skin covers it: the skin of closed lips touches or
+# is a voxel apart, and no wall of tissue is thinner than a step.
+IN_FRONT = (0.25, 1.0, 2.0, 3.0)
 
 
 class Skin:
@@ -45,6 +48,36 @@ class Skin:
             ),
             dtype=np.float64,
         )
+
+    def covered(self) -> NDArray[np.bool_]:
+        """Which vertices have other skin within 3 mm in front of them, such as between lips, (v,).
+
+        No camera sees them, and the two surfaces of a scan are fused there.
+        """
+        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
+        weighted = np.cross(b - a, c - a)
+        normals = np.zeros_like(self.vertices)
+        for axis in range(3):
+            normals[:, axis] = np.bincount(
+                self.triangles.ravel(),
+                weights=np.repeat(weighted[:, axis], 3),
+                minlength=len(self.vertices),
+            )
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0.0)
+        # Where the vertex itself is nearest to the farthest place, nothing stands between them.
+        farthest = IN_FRONT[-1]
+        places = self.vertices + farthest * normals
+        nearest, outward, _ = self.core.closest(places)
+        covered = ((places - nearest) * outward).sum(axis=1) < 0.0
+        apart = np.linalg.norm(places - nearest, axis=1)
+        doubtful = ~covered & (apart < (1.0 - ON_EDGE) * farthest)
+        for distance in IN_FRONT[:-1]:
+            asked = np.flatnonzero(doubtful & ~covered)
+            places = self.vertices[asked] + distance * normals[asked]
+            nearest, outward, _ = self.core.closest(places)
+            covered[asked] = ((places - nearest) * outward).sum(axis=1) < 0.0
+        return covered
 
     def part(self, chosen: NDArray[np.bool_]) -> "Skin | None":
         """The triangles all of whose vertices are chosen; None if there is none."""

@@ -32,6 +32,53 @@ def moved(surface, vertices):
     return cmfsim.SurfaceData(vertices, surface.triangles)
 
 
+# --- covered skin ---------------------------------------------------------------------------------
+
+
+def two_lips(gap):
+    """Two balls of radius 10 mm above one another, `gap` mm apart, as one skin."""
+    ball = sphere(10.0, level=3)
+    shift = np.array([0.0, 0.0, 10.0 + gap / 2.0])
+    return cmfsim.SurfaceData(
+        np.concatenate([ball.vertices + shift, ball.vertices - shift]),
+        np.concatenate([ball.triangles, ball.triangles + len(ball.vertices)]),
+    )
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.5, 2.0])
+def test_skin_between_lips_is_not_evaluated(gap):
+    """3 mm in front of a vertex at an angle a from the pole lies a place that is inside the other
+    ball if 13² + D² − 26 D cos a < 10², with D the distance of the centres.
+    """
+    lips = two_lips(gap)
+    found = cmfsim.compare_skins(lips, lips, method="closest")
+    covered = np.ones(len(lips.vertices), dtype=bool)
+    covered[found.vertices] = False
+    assert found.n_covered == found.back_covered == covered.sum()
+    apart = 20.0 + gap
+    cosine = (apart / 2.0 - np.abs(lips.vertices[:, 2])) / 10.0
+    least = (69.0 + apart**2) / (26.0 * apart)
+    # The balls of the mesh are up to 0.05 mm flatter.
+    assert covered[cosine > least + 0.01].all()
+    assert not covered[cosine < least - 0.01].any()
+    assert covered.any()
+    assert found.max == 0.0
+
+
+def test_open_mouth_is_evaluated():
+    lips = two_lips(3.5)
+    assert cmfsim.compare_skins(lips, lips, method="closest").n_covered == 0
+
+
+def test_lips_that_part_are_judged_by_their_outside():
+    """The prediction has closed lips, the scan open ones: without the skin between them the
+    distances are those of the outside, at most half the gap.
+    """
+    found = cmfsim.compare_skins(two_lips(0.5), two_lips(4.0), method="closest")
+    assert found.max < 1.76
+    assert found.back_covered == 0
+
+
 # --- figures --------------------------------------------------------------------------------------
 
 
