@@ -69,7 +69,7 @@ class Skin:
         farthest = IN_FRONT[-1]
         places = self.vertices + farthest * normals
         nearest, outward, _ = self.core.closest(places)
-        covered = ((places - nearest) * outward).sum(axis=1) < 0.0
+        covered: NDArray[np.bool_] = ((places - nearest) * outward).sum(axis=1) < 0.0
         apart = np.linalg.norm(places - nearest, axis=1)
         doubtful = ~covered & (apart < (1.0 - ON_EDGE) * farthest)
         for distance in IN_FRONT[:-1]:
