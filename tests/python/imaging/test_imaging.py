@@ -198,7 +198,7 @@ def test_metres_are_refused(head):
 
 
 def test_thresholds_must_ascend():
-    with pytest.raises(ImageError, match="ascend"):
+    with pytest.raises(ImageError, match="must increase"):
         SegmentOptions(skin_threshold=300.0)
     with pytest.raises(ValueError, match="closing"):
         SegmentOptions(closing=0.0)
