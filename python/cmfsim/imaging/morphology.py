@@ -268,7 +268,7 @@ def smoothed(
     """Values after a Gaussian of sigma mm (voxels where no spacing is given)."""
     itk = simpleitk()
     steps = np.ones(3) if spacing is None else spacing
-    image = itk.Cast(as_itk(values, steps), itk.sitkFloat32)
+    image = as_itk(values.astype(np.float32, copy=False), steps)
     smooth: Volume = as_array(itk.SmoothingRecursiveGaussian(image, float(sigma)))
     return smooth
 
