@@ -138,7 +138,7 @@ def contact_sheet(
     options = options or SheetOptions()
     grid = _Grid(name, bone, arch, options)
     solid = _extended(grid, _filled(grid, _bridged(grid.inside, BRIDGE)))
-    depth = _depth(np.pad(solid, grid.margin), np.pad(grid.near, grid.margin, mode="edge"))
+    depth = _depth(np.pad(solid, grid.margin), np.pad(grid.near(), grid.margin, mode="edge"))
     smoothing = _ndimage()
     for relief in RELIEFS:
         level = smoothing.gaussian_filter(depth, relief / SPACING, mode="nearest", truncate=4.0)
@@ -218,17 +218,25 @@ class _Grid:
             for low, high in zip(self.low, self.high, strict=True)
         ]
         self.shape = tuple(len(line) for line in self.lines)
-        places = np.stack(np.meshgrid(*self.lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        world = np.round(self.origin + places @ self.axes, DECIMALS)
-        values = bone.sample(world)
-        # What the image does not hold is no bone, however its border is coloured.
-        held = ((world >= bone.lowest) & (world <= bone.highest)).all(axis=1)
-        self.inside: Mask = ((values > 0.0) & held).reshape(self.shape)
-        # Distance from the surface of the bone, mm, where it is known better than by voxels.
-        level = values.reshape(self.shape)
-        slope = np.sqrt(sum(np.square(g) for g in np.gradient(level, SPACING)))
+        world = np.empty((*self.shape, 3))
+        held = np.ones(self.shape, dtype=bool)
+        for axis, coordinate in enumerate(np.moveaxis(world, 3, 0)):
+            s, a, v = (
+                line * part for line, part in zip(self.lines, self.axes[:, axis], strict=True)
+            )
+            columns = self.origin[axis] + s[:, None] + a
+            np.round(columns[:, :, None] + v, DECIMALS, out=coordinate)
+            # What the image does not hold is no bone, however its border is coloured.
+            held &= (coordinate >= bone.lowest[axis]) & (coordinate <= bone.highest[axis])
+        self.level = bone.sample(world.reshape(-1, 3)).reshape(self.shape)
+        self.inside: Mask = (self.level > 0.0) & held
+
+    def near(self) -> Floats:
+        """Distance from the surface of the bone, mm, where it is known better than by voxels."""
+        slope = np.sqrt(sum(np.square(g) for g in np.gradient(self.level, SPACING)))
         # Away from the surface the level is clipped and has no slope.
-        self.near = level / np.maximum(slope, 1e-3)
+        near: Floats = self.level / np.maximum(slope, 1e-3)
+        return near
 
     def _edges(self, tip: Floats) -> tuple[Floats, Floats]:
         """A point on the plane of the teeth's edges and the unit normal past them, in space."""

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import product
 from typing import cast
 
 import numpy as np
@@ -26,6 +27,8 @@ Levels = NDArray[np.float32]
 ORDER = {"le_fort_3": 0, "le_fort_1": 1, "bsso": 2, "genioplasty": 3}
 # Half-width of the block of voxels that is transferred with a fragment.
 CRUMB_RIM = 2
+# Edge of the blocks in which distances from planes are measured, voxels.
+BLOCK = 24
 # Number of surfaces made concurrently.
 SURFACES_AT_ONCE = 2
 
@@ -316,8 +319,34 @@ def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
     # Levels are clipped at `limit`. A plane clipped at less than a cell's diagonal would be bent
     # inside the cells that it cuts, and its zero would shift: so the diagonal becomes the limit.
     diagonal = float(np.linalg.norm(grid.spacing))
-    depth = cut.region_on(grid) * (limit / diagonal)
-    return np.clip(depth, -limit, limit).astype(np.float32)
+    parts = [[plane.distance_along(grid) for plane in group] for group in cut.groups]
+    scaled = np.empty(grid.values.shape, dtype=np.float32)
+    starts = [range(0, n, BLOCK) for n in grid.values.shape]
+    for corner in product(*starts):
+        block = tuple(slice(start, start + BLOCK) for start in corner)
+        # A sum of three parts, each of one axis, has its least and its most in a block where they
+        # have: most blocks lie on one side of all planes, and need no distance of their voxels.
+        here = [
+            [[line[_own(block, axis)] for axis, line in enumerate(lines)] for lines in group]
+            for group in parts
+        ]
+        least, most = (
+            max(min(sum(float(end(line)) for line in lines) for lines in group) for group in here)
+            for end in (np.min, np.max)
+        )
+        if least >= diagonal or most <= -diagonal:
+            scaled[block] = np.copysign(limit, least)
+            continue
+        depth = np.maximum.reduce(
+            [np.minimum.reduce([x + y + z for x, y, z in group]) for group in here]
+        )
+        scaled[block] = np.clip(depth * (limit / diagonal), -limit, limit)
+    return scaled
+
+
+def _own(block: tuple[slice, ...], axis: int) -> tuple[slice, ...]:
+    """The part of a block that a line along one axis has."""
+    return tuple(part if a == axis else slice(None) for a, part in enumerate(block))
 
 
 def _join_crumbs(

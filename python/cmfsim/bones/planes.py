@@ -59,10 +59,15 @@ class CuttingPlane:
 
     def distance_on(self, image: ImageData) -> Floats:
         """The signed distance at every voxel of an image's grid, (nx, ny, nz) mm."""
-        point, normal = self.point, self.normal
-        x, y, z = image.axes()
-        dx, dy, dz = x - point[0], y - point[1], z - point[2]
-        return cast("Floats", normal[0] * dx + normal[1] * dy + normal[2] * dz)
+        along_x, along_y, along_z = self.distance_along(image)
+        return along_x + along_y + along_z
+
+    def distance_along(self, image: ImageData) -> tuple[Floats, Floats, Floats]:
+        """The parts of `distance_on` that vary along x, y and z, shaped to broadcast."""
+        x, y, z = (
+            n * (line - p) for line, p, n in zip(image.axes(), self.point, self.normal, strict=True)
+        )
+        return x, y, z
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,8 @@ def predict(options: argparse.Namespace) -> int:
     before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
     failed: dict[str, CmfsimError] = {}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        predictions = predict_models(
+        predicted = partial(
+            predict_models,
             case,
             models,
             progress=progress.stage,
@@ -68,7 +70,9 @@ def predict(options: argparse.Namespace) -> int:
         )
         written = write_results(
             case.output,
-            _timed(_at_least_one(predictions, failed), before),
+            lambda on_patient: _timed(
+                _at_least_one(predicted(on_patient=on_patient), failed), before
+            ),
             models,
             stage=progress.stage,
             with_report=not options.no_report,

@@ -11,6 +11,7 @@ from cmfsim.imaging.metal import Metal, without_streaks
 from cmfsim.imaging.morphology import (
     Mask,
     Volume,
+    chosen,
     closed,
     depth,
     grown,
@@ -114,7 +115,7 @@ def _without_islands(
     volumes = sizes_of(labels, count) * float(np.prod(work.spacing))
     kept = volumes > min(options.island, float(volumes.max()) - 1e-9)
     dropped = float(volumes[~kept].sum())
-    kept_mask: Mask = kept[labels]
+    kept_mask = chosen(kept, labels)
     findings = []
     if dropped > options.island:
         findings.append(
@@ -198,7 +199,7 @@ def _enclosed(
     if not outer[1:].any():
         outer[np.argmax(sizes)] = True
     outer[0] = False
-    hollows = ~walls & ~outer[labels]
+    hollows = ~walls & ~chosen(outer, labels)
     if cavity is not None:
         hollows |= cavity
     # Of the closed walls only what bounds a hollow belongs to bone; the rest are outer grooves.

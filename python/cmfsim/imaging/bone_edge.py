@@ -37,15 +37,18 @@ def at_half_height(
     # Borders of the image have no other side.
     for axis in range(3):
         np.moveaxis(near, axis, 0)[[0, -1]] = False
-    index = np.stack(np.nonzero(near))
+    # By their numbers in the order of memory, which is that of z, y, x.
+    voxels, values = np.flatnonzero(near.T), hu.T.reshape(-1)
+    index = np.stack(np.unravel_index(voxels, hu.T.shape)[::-1])
+    steps = np.cumprod([1, *hu.shape[:2]])
     gradient = np.stack(
         [
-            (hu[tuple(index + step)] - hu[tuple(index - step)]) / (2.0 * width)
-            for step, width in zip(np.eye(3, dtype=int)[:, :, None], spacing, strict=True)
+            (values[voxels + step] - values[voxels - step]) / (2.0 * width)
+            for step, width in zip(steps, spacing, strict=True)
         ]
     )
     inwards = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
-    own = hu[near]
+    own = values[voxels]
     densest = own.copy()
     for far in np.arange(SAMPLE, BLUR + 0.5 * SAMPLE, SAMPLE):
         places = index + inwards * (far * spacing.max() / spacing)[:, None]
@@ -54,7 +57,7 @@ def at_half_height(
         )
     half = np.clip(0.5 * (SOFT + densest), threshold, max(HIGHEST, threshold))
     lowered = hu.copy(order="F")
-    lowered[near] = own - (half - np.float32(threshold)).astype(np.float32)
+    lowered.T.reshape(-1)[voxels] = own - (half - np.float32(threshold)).astype(np.float32)
     # Marrow behind compact bone is low as well: only what is open to the outside is cut.
     low = near & mask & (lowered <= threshold)
     cut = np.zeros_like(mask)

@@ -272,15 +272,18 @@ def _tooth_rows(
     incisal, left, right = plane
     normal = np.cross(left - incisal, right - incisal)
     normal *= np.sign(normal[2]) / np.linalg.norm(normal)
-    height = normal[0] * (x - incisal[0]) + normal[1] * (y - incisal[1])
-    height = height + normal[2] * (z - incisal[2])
     behind = 0.5 * (left[1] + right[1]) - BEFORE_RAMUS
     # Laterally the row ends where the rami begin.
     low, high = sorted((left[0], right[0]))
-    row = (y < behind) & (x > low - BEFORE_RAMUS) & (x < high + BEFORE_RAMUS)
+    across = (x > low - BEFORE_RAMUS) & (x < high + BEFORE_RAMUS)
+    # Heights only where the row is: both lines ascend, so that it is a block.
+    row = box_of(across & (y < behind))[:2]
+    x, y, part = x[row[0]], y[:, row[1]], seeds[row]
+    height = normal[0] * (x - incisal[0]) + normal[1] * (y - incisal[1])
+    height = height + normal[2] * (z - incisal[2])
     near, far = CROWN
-    seeds[row & (height > near) & (height < far)] = 2
-    seeds[row & (height < -near) & (height > -far)] = 1
+    part[(height > near) & (height < far)] = 2
+    part[(height < -near) & (height > -far)] = 1
 
 
 def _occlusal_points(landmarks: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats] | None:

@@ -214,15 +214,21 @@ def label(mask: Mask, *, corners: bool = False) -> tuple[NDArray[np.int32], int]
 
 def sizes_of(labels: NDArray[np.int32], count: int) -> NDArray[np.intp]:
     """How many voxels each label has; that of 0 is given as 0."""
-    sizes = np.bincount(labels.ravel(order="K"), minlength=count + 1)
+    sizes = np.zeros(count + 1, dtype=np.intp)
+    # Counting makes long integers of the labels: of a layer at a time they stay in the cache.
+    for layer in labels.T:
+        sizes += np.bincount(layer.ravel(), minlength=count + 1)
     sizes[0] = 0
     return sizes
 
 
 def chosen(wanted: Mask, labels: NDArray[np.int32]) -> Mask:
     """The voxels whose label is wanted; `wanted` has an entry for each label."""
-    voxels: Mask = wanted.take(labels.T).T
-    return voxels
+    voxels = np.empty(labels.T.shape, dtype=bool)
+    # As `sizes_of`; every label has its entry, so that none is clipped.
+    for layer, found in zip(labels.T, voxels, strict=True):
+        np.take(wanted, layer, out=found, mode="clip")
+    return voxels.T
 
 
 def largest(mask: Mask) -> Mask:
@@ -253,7 +259,7 @@ def filled(mask: Mask) -> Mask:
     for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         outside[np.unique(face)] = True
     outside[0] = False
-    return ~outside[labels]
+    return ~chosen(outside, labels)
 
 
 def smoothed(
@@ -262,7 +268,7 @@ def smoothed(
     """Values after a Gaussian of sigma mm (voxels where no spacing is given)."""
     itk = simpleitk()
     steps = np.ones(3) if spacing is None else spacing
-    image = itk.Cast(as_itk(values, steps), itk.sitkFloat32)
+    image = as_itk(values.astype(np.float32, copy=False), steps)
     smooth: Volume = as_array(itk.SmoothingRecursiveGaussian(image, float(sigma)))
     return smooth
 

@@ -237,9 +237,9 @@ def segment_colours(names: Sequence[str]) -> dict[str, str]:
     return {n: SEGMENT_COLOURS[n] if n in SEGMENT_COLOURS else next(others) for n in names}
 
 
-def add_bone(plotter: Any, surface: SurfaceData, colour: str) -> None:
-    """Adds the surface of a bone segment in a colour to a view."""
-    plotter.add_mesh(
+def add_bone(plotter: Any, surface: SurfaceData, colour: str) -> Any:
+    """The actor of the surface of a bone segment, added in a colour to a view."""
+    return plotter.add_mesh(
         polydata(surface.vertices, surface.triangles),
         color=colour,
         smooth_shading=True,

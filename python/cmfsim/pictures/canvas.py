@@ -32,6 +32,7 @@ __all__ = [
     "NO_OPENGL",
     "SIZE",
     "Picture",
+    "Shown",
     "View",
     "add_scale_bar",
     "bounds",
@@ -203,6 +204,20 @@ def _band_of_text(lines: Sequence[str], width: int, height: int) -> NDArray[np.u
         return np.array(plotter.screenshot(return_img=True))[:, :, :3]
     finally:
         plotter.close()
+
+
+class Shown:
+    """The shapes of a picture: one that an earlier view shows is not prepared a second time."""
+
+    def __init__(self) -> None:
+        self._actors: dict[str, Any] = {}
+
+    def add(self, plotter: Any, name: str, make: Callable[[], Any]) -> None:
+        """Adds a shape to a view; `make` adds it to the first, and returns its actor."""
+        if name in self._actors:
+            plotter.add_actor(self._actors[name], reset_camera=False, render=False)
+        else:
+            self._actors[name] = make()
 
 
 def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
-from cmfsim.pictures.canvas import SIZE, Picture, View, add_scale_bar, bounds, draw, polydata
+from cmfsim.pictures.canvas import SIZE, Picture, Shown, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction
@@ -181,14 +181,18 @@ def picture_motions(
     """Writes a picture of segments of bone before and after; see `picture_plan`."""
     colours = segment_colours(list(before))
     corners = bounds([s.vertices for s in (*before.values(), *after.values())])
+    shown = Shown()
+
+    def ghost(plotter: Any, surface: SurfaceData) -> Any:
+        shape = polydata(surface.vertices, surface.triangles)
+        return plotter.add_mesh(shape, color=GHOST_COLOUR, opacity=0.3, smooth_shading=True)
 
     def paint(plotter: Any, view: View) -> None:
         del view
         for name, now in after.items():
-            add_bone(plotter, now, colours[name])
+            shown.add(plotter, name, partial(add_bone, plotter, now, colours[name]))
             if name not in still:
-                shape = polydata(before[name].vertices, before[name].triangles)
-                plotter.add_mesh(shape, color=GHOST_COLOUR, opacity=0.3, smooth_shading=True)
+                shown.add(plotter, f"{name} before", partial(ghost, plotter, before[name]))
 
     views = tuple(View(name, name) for name in ("right", "front", "left"))
     legend = [*colours.items(), ("before", GHOST_COLOUR)]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import colorsys
 import os
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cmfsim._core import MuscleFibres, Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, View, bounds, draw, polydata
+from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, Shown, View, bounds, draw, polydata
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
@@ -73,10 +74,18 @@ def picture_muscles(
     clouds = [muscle.surface.vertices for muscle in musculature]
     corners = bounds(clouds if skull is None else [*clouds, skull.vertices])
 
+    shown = Shown()
+
     def paint_skull(plotter: Any) -> None:
         if skull is not None:
-            shape = polydata(skull.vertices, skull.triangles)
-            plotter.add_mesh(shape, color=BONE_COLOUR, smooth_shading=True)
+            vertices, triangles = skull.vertices, skull.triangles
+            shown.add(
+                plotter,
+                "skull",
+                lambda: plotter.add_mesh(
+                    polydata(vertices, triangles), color=BONE_COLOUR, smooth_shading=True
+                ),
+            )
 
     if fibres:
         length = STROKE * float(np.linalg.norm(corners[1] - corners[0]))
@@ -86,7 +95,8 @@ def picture_muscles(
             del view
             paint_skull(plotter)
             for muscle, strokes, edges, colour in drawn:
-                add_muscle(plotter, muscle, MUSCLE_COLOUR)
+                make = partial(add_muscle, plotter, muscle, MUSCLE_COLOUR)
+                shown.add(plotter, f"muscle {muscle.name}", make)
                 plotter.add_lines(strokes, color=LINE_COLOUR, width=2)
                 plotter.add_lines(edges, color=colour, width=1)
 
@@ -108,7 +118,8 @@ def picture_muscles(
             return
         paint_skull(plotter)
         for muscle in musculature:
-            add_muscle(plotter, muscle, colours[_without_side(muscle.name)])
+            make = partial(add_muscle, plotter, muscle, colours[_without_side(muscle.name)])
+            shown.add(plotter, f"muscle {muscle.name}", make)
 
     # The legend is next to the heads, not on them.
     views = (View("front", ""), View("front", "front"), View("left", "left"))
@@ -116,10 +127,10 @@ def picture_muscles(
     draw(path, views, corners, size, paint_names, legend=list(colours.items())[:rows])
 
 
-def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> None:
-    """Adds a muscle in a colour to a view."""
+def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> Any:
+    """The actor of a muscle, added in a colour to a view."""
     shape = polydata(muscle.surface.vertices, muscle.surface.triangles)
-    plotter.add_mesh(shape, color=colour, smooth_shading=True, ambient=0.15)
+    return plotter.add_mesh(shape, color=colour, smooth_shading=True, ambient=0.15)
 
 
 def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:

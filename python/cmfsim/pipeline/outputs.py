@@ -52,6 +52,7 @@ from cmfsim.pipeline.painting import Painter
 from cmfsim.pipeline.planning_page import PAGE_FILE, page_state
 from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.musculature import Musculature
+from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import joined_surface
@@ -67,8 +68,14 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
+# Predictions, or what gives them and calls a function with the patient before it solves any.
+Predictions = (
+    Iterable[Prediction] | Callable[[Callable[[PatientModel], None]], Iterable[Prediction]]
+)
+
 # Pictures of a case's report, in the folder of its prediction and in its own.
 PREDICTION_PICTURES = ("prediction", "band", "plan", "muscles")
+MUSCLES = "muscles.png"
 REPORT_STAGE = "writing the report"
 BOXES_CAPTION = (
     "Sizes of the errors by region: quartiles, median, mean (diamond), whiskers to 1.5 boxes, and "
@@ -146,9 +153,51 @@ class _Clock:
             write_timings(fresh / place, of_prediction)
 
 
+class _Drawing:
+    """The pictures of predictions as they are begun, in a folder for each of several models."""
+
+    def __init__(
+        self,
+        painter: Painter,
+        fresh: Path,
+        models: Sequence[str],
+        wanted: Callable[[str], bool],
+    ) -> None:
+        self._painter, self._fresh = painter, fresh
+        self._models, self._wanted = models, wanted
+        self._early: dict[str, Future[None]] = {}
+
+    def place(self, model: str) -> str:
+        """The folder of a model's prediction."""
+        return "" if len(self._models) == 1 else model
+
+    def begin_early(self, patient: PatientModel) -> None:
+        """Begins the muscles of the first model that shows them: they need no solution."""
+        model = next((m for m in self._models if m.startswith("M") and self._wanted(m)), None)
+        if model is not None and patient.muscles is not None:
+            folder = self._fresh / self.place(model)
+            folder.mkdir(exist_ok=True)
+            picture = _muscles_picture(patient.muscles, patient)
+            self._early[model] = self._painter.begin(picture, folder / MUSCLES)
+
+    def begin(self, prediction: Prediction) -> dict[str, "Future[None]"]:
+        """The pictures of a prediction by name, with the one that was begun early."""
+        model = prediction.model
+        if not self._wanted(model):
+            return {}
+        begun = {}
+        for name, picture in _pictures_of(prediction):
+            if name == MUSCLES and model in self._early:
+                begun[name] = self._early[model]
+            else:
+                path = self._fresh / self.place(model) / name
+                begun[name] = self._painter.begin(picture, path)
+        return begun
+
+
 def write_results(
     output: Path,
-    predictions: Iterable[Prediction],
+    predictions: Predictions,
     models: Sequence[str],
     *,
     stage: Progress,
@@ -163,8 +212,9 @@ def write_results(
     ----------
     output : Path
         The case's output folder: predictions of several models lie in a folder for each.
-    predictions : iterable of Prediction
-        Written one by one, as each is solved.
+    predictions : iterable of Prediction, or callable
+        Written one by one, as each is solved. A callable gives them; it takes a function to be
+        called with the patient before any is solved, which begins the picture of the muscles.
     models : sequence of str
         That were asked for, whether or not all could be predicted.
     stage : callable
@@ -186,12 +236,12 @@ def write_results(
     clock = _Clock()
 
     def fill(fresh: Path) -> list[str]:
-        for prediction in predictions:
+        drawing = _Drawing(painter, fresh, models, pictures)
+        given = predictions(drawing.begin_early) if callable(predictions) else predictions
+        for prediction in given:
             stage(f"writing {prediction.model}")
-            place = "" if len(models) == 1 else prediction.model
-            drawing = painter if pictures(prediction.model) else None
             written.predictions.append(
-                _fill_model(fresh, place, prediction, clock, painter=drawing, slicer=slicer)
+                _fill_model(fresh, prediction, clock, drawing=drawing, slicer=slicer)
             )
         clock.place = None
         key = written.predictions[0].summary["case_key"]
@@ -235,20 +285,12 @@ def write_results(
 
 
 def _fill_model(
-    fresh: Path,
-    place: str,
-    prediction: Prediction,
-    clock: _Clock,
-    *,
-    painter: Painter | None,
-    slicer: bool,
+    fresh: Path, prediction: Prediction, clock: _Clock, *, drawing: _Drawing, slicer: bool
 ) -> WrittenPrediction:
-    """The files of one prediction in its folder, with pictures if there is a painter."""
+    """The files of one prediction in its folder, with the pictures that are wanted."""
+    place = drawing.place(prediction.model)
     (fresh / place).mkdir(exist_ok=True)
-    begun = {}
-    if painter is not None:
-        for name, picture in _pictures_of(prediction):
-            begun[name] = painter.begin(picture, fresh / place / name)
+    begun = drawing.begin(prediction)
     more = partial(_more_files, prediction, begun, clock, slicer=slicer)
     clock.begin(place, prediction.summary["timings"])
     with clock.timed("writing the files"):
@@ -323,19 +365,19 @@ def _drawn(begun: Mapping[str, "Future[None]"]) -> list[str]:
 
 def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Picture]]:
     if prediction.muscles is not None:
-        segments = prediction.patient.segments
-        yield (
-            "muscles.png",
-            partial(
-                picture_muscles,
-                musculature=Musculature(prediction.muscles.muscles),
-                skull=joined_surface([segment.surface for segment in segments]),
-            ),
-        )
+        yield MUSCLES, _muscles_picture(prediction.muscles, prediction.patient)
     yield "plan.png", plan_picture(prediction)
     yield "prediction.png", prediction_picture(prediction)
     if prediction.band is not None:
         yield "band.png", band_picture(prediction)
+
+
+def _muscles_picture(muscles: Musculature, patient: PatientModel) -> Picture:
+    return partial(
+        picture_muscles,
+        musculature=Musculature(muscles.muscles),
+        skull=joined_surface([segment.surface for segment in patient.segments]),
+    )
 
 
 @contextlib.contextmanager

@@ -1,7 +1,7 @@
 """One case from its files to the predicted face."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
@@ -87,6 +87,7 @@ def predict_models(  # noqa: PLR0913 (options by name)
     after: Postoperative | None = None,
     failed: dict[str, CmfsimError] | None = None,
     on_findings: OnFindings | None = None,
+    on_patient: Callable[[PatientModel], None] | None = None,
     band: BandOptions | None = None,
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, which is built once.
@@ -109,6 +110,8 @@ def predict_models(  # noqa: PLR0913 (options by name)
         recorded here with its error, and the others continue.
     on_findings : callable, optional
         Called with new findings of each stage and each solution.
+    on_patient : callable, optional
+        Called with the patient once it is built, before any model is solved.
     band : BandOptions, optional
         As for `predict`.
 
@@ -135,6 +138,7 @@ def predict_models(  # noqa: PLR0913 (options by name)
         anatomy=anatomy,
         after=after,
         on_findings=on_findings,
+        on_patient=on_patient,
     )
     yield from predictions_of(as_case(case), named_models(models), options, failed, band=band)
 
@@ -152,6 +156,8 @@ def predictions_of(
         # Before a case is built for a minute.
         band.check(models)
     patient = build_patient(case, models, options)
+    if options.on_patient is not None:
+        options.on_patient(patient)
     known = set(patient.findings)
     for model in models:
         if options.progress is not None:

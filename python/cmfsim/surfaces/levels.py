@@ -235,15 +235,22 @@ def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floa
     if not rounds:
         return points
     sparse = third_party("scipy.sparse", "surfaces are smoothed", "imaging")
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    # The surface is closed: each edge is passed both ways, which makes both ends neighbours.
+    corners = triangles.astype(np.int32)
+    edges = corners.ravel(), corners[:, [1, 2, 0]].ravel()
     n = len(points)
-    near = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    near = (near + near.T).tocsr()
+    near = sparse.coo_matrix((np.ones(len(edges[0])), edges), shape=(n, n)).tocsr()
     near.data[:] = 1.0
     count = np.asarray(near.sum(axis=1))
+    points = points.copy()
     for _ in range(rounds):
         for step in (SHRINK, GROW):
-            points = points + step * (near @ points / count - points)
+            # points + step (mean of the neighbours − points)
+            towards = near @ points
+            towards /= count
+            towards -= points
+            towards *= step
+            points += towards
     return points
 
 

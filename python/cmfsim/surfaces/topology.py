@@ -18,6 +18,9 @@ __all__ = [
 
 Integers = NDArray[np.int64]
 
+# The cube of fewer items is a long integer.
+MOST_CUBED = 1 << 21
+
 
 @dataclass(frozen=True, eq=False)
 class Edges:
@@ -134,8 +137,14 @@ def tet_bodies(tets: NDArray[Any]) -> Integers:
     """
     corners = np.sort(tets.astype(np.int64), axis=1)
     faces = corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
-    order = np.lexsort(faces.T)
-    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
+    # One number for each face is sorted much faster than a row of three.
+    count = int(corners.max(initial=0)) + 1
+    face = faces[:, 0] * count + faces[:, 1]
+    if count >= MOST_CUBED:
+        face = np.unique(face, return_inverse=True)[1].reshape(-1)
+    face = face * count + faces[:, 2]
+    order = np.argsort(face)
+    same = face[order[1:]] == face[order[:-1]]
     pairs = np.stack([order[:-1][same], order[1:][same]]) // 4
     sparse = import_module("scipy.sparse")
     ones = np.ones(pairs.shape[1], dtype=bool)

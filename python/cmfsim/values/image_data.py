@@ -17,6 +17,9 @@ from cmfsim.values.frozen import Frozen
 
 __all__ = ["ImageData"]
 
+# Points that are looked up at a time.
+AT_A_TIME = 8192
+
 
 @dataclass(frozen=True, eq=False)
 class ImageData(Frozen):
@@ -104,9 +107,17 @@ class ImageData(Frozen):
         -------
         (n,) float64
         """
+        places = as_rows("points", points, 3)
+        found = np.empty(len(places))
+        # Some thousand points at a time: their weights stay in the cache.
+        for begin in range(0, len(places), AT_A_TIME):
+            part = slice(begin, begin + AT_A_TIME)
+            found[part] = self._trilinear(places[part])
+        return found
+
+    def _trilinear(self, points: Floats) -> Floats:
         shape = np.array(self.values.shape)
-        place = (as_rows("points", points, 3) - self.lowest) / self.spacing
-        place = np.clip(place, 0.0, shape - 1.0)
+        place = np.clip((points - self.lowest) / self.spacing, 0.0, shape - 1.0)
         low = np.minimum(place.astype(np.intp), np.maximum(shape - 2, 0))
         part = place - low
         high = np.minimum(low + 1, shape - 1)

@@ -292,8 +292,10 @@ def _spread(surface: SurfaceData) -> tuple[NDArray[np.intp], Floats]:
     each = np.bincount(triangles.ravel(), np.repeat(area, 3), minlength=len(vertices))
     middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     cells = np.floor((vertices - middle) / POINT_SPACING).astype(np.int64)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    cell = cell.ravel()
+    cells -= cells.min(axis=0)
+    # One number for each cell, which ascends as rows of three do and is sorted much faster.
+    number = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+    _, cell = np.unique(number, return_inverse=True)
     # The vertex nearest to the mean of its cell.
     count = np.bincount(cell)
     mean = np.stack([np.bincount(cell, vertices[:, a]) / count for a in range(3)], axis=1)

@@ -54,7 +54,9 @@ class Lattice:
         origin = 0.5 * (low + high) - 0.5 * cells * spacing
         shape = cells + REACH - 1
         reached = np.zeros(shape, dtype=bool)
-        first = np.unique(np.floor((points - origin) / spacing).astype(np.intp), axis=0)
+        held = np.zeros(shape, dtype=bool)
+        held[tuple(np.floor((points - origin) / spacing).astype(np.intp).T)] = True
+        first = np.argwhere(held)
         for i, j, k in np.ndindex(REACH, REACH, REACH):
             reached[first[:, 0] + i, first[:, 1] + j, first[:, 2] + k] = True
         number = np.full(shape, -1, dtype=np.intp)

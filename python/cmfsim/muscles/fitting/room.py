@@ -104,15 +104,20 @@ def known_part(skin: ImageData) -> tuple[Floats, Floats]:
 
 def _resampled(level: ImageData, axes: list[Floats]) -> NDArray[np.float32]:
     """A level at the crossings of three axes, trilinear, beyond the border as at the border."""
-    values = level.values
-    for axis, places in enumerate(axes):
-        spacing = float(level.spacing[axis])
-        at = np.clip((places - level.lowest[axis]) / spacing, 0.0, values.shape[axis] - 1.0)
-        before = np.minimum(at.astype(np.intp), max(values.shape[axis] - 2, 0))
-        after = np.minimum(before + 1, values.shape[axis] - 1)
-        part = (at - before).astype(np.float32)
-        part = part.reshape([-1 if a == axis else 1 for a in range(3)])
-        low, high = np.take(values, before, axis), np.take(values, after, axis)
+    sides = []
+    for places, n, lowest, spacing in zip(
+        axes, level.values.shape, level.lowest.tolist(), level.spacing.tolist(), strict=True
+    ):
+        at = np.clip((places - lowest) / spacing, 0.0, n - 1.0)
+        before = np.minimum(at.astype(np.intp), max(n - 2, 0))
+        sides.append((before, np.minimum(before + 1, n - 1), (at - before).astype(np.float32)))
+    # Only the block between the outermost places: the head is larger.
+    block = tuple(slice(before.min(), after.max() + 1) for before, after, _ in sides)
+    values = level.values[block]
+    for axis, (before, after, share) in enumerate(sides):
+        first = before.min()
+        part = share.reshape([-1 if a == axis else 1 for a in range(3)])
+        low, high = np.take(values, before - first, axis), np.take(values, after - first, axis)
         values = low * (1 - part) + high * part
     return values.astype(np.float32, copy=False)
 

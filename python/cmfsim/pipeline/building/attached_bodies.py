@@ -34,8 +34,8 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     holds = np.isin(kinds.kind, (1, 2))
     corner = holds[tets]
     # Each held node once for each body that it is in.
-    pairs = np.unique(np.stack([np.repeat(body, 4)[corner.ravel()], tets[corner]]), axis=1)
-    loose = np.bincount(pairs[0], minlength=n_bodies) < LEAST_HELD
+    held = np.unique(np.repeat(body, 4)[corner.ravel()] * mesh.n_nodes + tets[corner])
+    loose = np.bincount(held // mesh.n_nodes, minlength=n_bodies) < LEAST_HELD
     if not loose.any():
         return mesh, kinds, ()
     if loose.all():

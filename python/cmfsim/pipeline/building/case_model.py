@@ -218,8 +218,9 @@ def _bones(
         # What was compared with the voxels of the CT is compared with the bones made of them.
         stages.drop(LANDMARK_CODES)
         stages.add(misplaced(case, head.landmarks, head.anatomy, cut.segments))
-    # Again for all of them together: pieces of two bones never met before.
-    check_segments(bones.segments)
+    if bones.segments != cut.segments:
+        # Again for all of them together: pieces of two bones never met before.
+        check_segments(bones.segments)
     return bones, cut.procedures
 
 

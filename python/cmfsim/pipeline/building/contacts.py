@@ -159,7 +159,10 @@ def _whole_bone(
 
     But for a bone that the other arch, too, was cut from.
     """
-    level = np.maximum.reduce([segment.level.values for segment in mine])
+    level = mine[0].level.values
+    for segment in mine[1:]:
+        # Not `maximum.reduce`, which copies all levels into one array first.
+        level = np.maximum(level, segment.level.values)
     inside = level > 0.0
     theirs = [segments[number].level.values > 0.0 for number in sorted(others)]
     for bone in anatomy.bones.values():

@@ -1,12 +1,13 @@
 """The options of a build, and its stages as they run."""
 
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding, OnFindings
+from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import Progress, no_progress
 
 __all__ = ["BuildOptions", "Stages"]
@@ -30,6 +31,8 @@ class BuildOptions:
         What `read_postoperative` gives, where it is known already.
     on_findings : callable or None
         Called with new findings at the end of each stage.
+    on_patient : callable or None
+        Called with the patient once it is built, before any model is solved.
     """
 
     progress: Progress | None = None
@@ -38,6 +41,7 @@ class BuildOptions:
     anatomy: Anatomy | None = None
     after: Postoperative | None = None
     on_findings: OnFindings | None = None
+    on_patient: Callable[[PatientModel], None] | None = None
 
 
 class Stages:

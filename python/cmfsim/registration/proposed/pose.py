@@ -89,13 +89,19 @@ def surface_samples(surface: SurfaceData, count: int, seed: int = 0) -> tuple[Fl
     generator = np.random.default_rng(seed)
     # One throw in each of as many equal shares of the area: evener than free throws.
     throws = (np.arange(count) + generator.random(count)) / count * total[-1]
-    chosen = np.minimum(np.searchsorted(total, throws, side="right"), len(total) - 1)
+    # Throws ascend: fewer places of triangles among them are looked up than the reverse.
+    ends = np.searchsorted(throws, total[:-1])
+    chosen = np.repeat(np.arange(len(total)), np.diff(ends, prepend=0, append=count))
     u, v = generator.random((2, count))
     over = u + v > 1.0
-    u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
-    a, b, c = corners[chosen].transpose(1, 0, 2)
-    points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    return points, normals[chosen] / doubled[chosen][:, None]
+    np.subtract(1.0, u, out=u, where=over)
+    np.subtract(1.0, v, out=v, where=over)
+    a, b, c = corners.transpose(1, 0, 2)
+    points = a[chosen]
+    points += u[:, None] * (b - a)[chosen]
+    points += v[:, None] * (c - a)[chosen]
+    units = normals / np.where(doubled > 0.0, doubled, 1.0)[:, None]
+    return points, units[chosen]
 
 
 def find_pose(bones: SurfaceData, average: SurfaceData, average_size: float = 1.0) -> Pose:
