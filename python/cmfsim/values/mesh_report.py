@@ -87,7 +87,7 @@ class MeshReport:
             )
         if self.dropped_parts:
             lines.append(
-                f"left out      {self.dropped_parts} parts of {self.dropped_volume:.1f} mm³ in all"
+                f"removed       {self.dropped_parts} parts of {self.dropped_volume:.1f} mm³ in all"
             )
         return "\n".join(lines)
 

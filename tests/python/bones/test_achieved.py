@@ -143,7 +143,7 @@ def test_the_real_mandible_is_found_where_it_was_taken():
     ("arguments", "pattern"),
     [
         ({"segments": {}}, "segments is empty"),
-        ({"postoperative": {"cranium": None}}, "no post-operative surface of jaw"),
+        ({"postoperative": {"cranium": None}}, "no post-operative surface: jaw"),
         ({"reference": "skull"}, "use one of cranium, jaw"),
         ({"centres": {"chin": (0, 0, 0)}}, "use one of cranium, jaw"),
         ({"alignment": np.diag([2.0, 2, 2, 1])}, "not rigid"),

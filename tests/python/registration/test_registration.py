@@ -180,7 +180,7 @@ def test_one_and_two_threads_give_the_same_bits():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s, t: (s[:3], t[:3]), "needs 4 landmarks"),
+        (lambda s, t: (s[:3], t[:3]), "needs at least 4 landmarks"),
         (lambda s, t: (s, t[:-1]), "target landmarks has 31 entries where 32"),
         (lambda s, t: (s * [1, 1, 0], t), "lie in one plane"),
         (lambda s, t: (s * [1, 0, 0], t), "lie in one line"),
