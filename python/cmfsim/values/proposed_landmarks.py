@@ -19,9 +19,9 @@ class ProposedSite:
     point : (3,) float64, mm
         On the surface of the bone or skin, in the frame of the head.
     error : float, mm
-        How far it is expected to lie from where a person would place it.
+        Expected distance from where a person would place it.
     doubt : str
-        Why it should be looked at first; empty where nothing speaks against it.
+        The reason to check it; empty if there is none.
     """
 
     point: Floats
@@ -31,7 +31,7 @@ class ProposedSite:
 
 @dataclass(frozen=True, eq=False)
 class ProposedLandmarks:
-    """Landmarks that were found without a person.
+    """Landmarks that were found automatically.
 
     Attributes
     ----------
@@ -41,11 +41,11 @@ class ProposedLandmarks:
     missing_skull, missing_skin : mapping of str to str
         The sites that were not found, with the reason.
     impossible_jaw : str
-        Why what is taken for the mandible cannot be one; empty where it can.
+        Why the bone taken for the mandible cannot be one; empty if it can.
     doubtful_jaw : str
-        All that speaks against it, doubts included; empty where nothing does.
+        Everything that speaks against it, including doubts; empty if nothing does.
     separation : mapping of str to (3,) float64, mm
-        What the jaws of an image can be separated by again.
+        Points from which the jaws of an image can be separated again.
     """
 
     skull: Mapping[str, ProposedSite]
