@@ -1,10 +1,8 @@
 //! Sparse symmetric matrices of 3×3 blocks in block rows: the system that every solver shares.
 
-use std::hint::black_box;
-
 use rayon::prelude::*;
 
-use crate::algebra::simd::{Kernel, LANES, add_products, widest};
+use crate::algebra::simd::{Kernel, LANES, add_products, whole_lanes, widest};
 
 /// A 3×3 block, row by row.
 pub type Block = [f64; 9];
@@ -123,8 +121,7 @@ impl BlockMatrix {
             add_products(&mut sums[1], [b[3], b[4], b[5], b[6]], head);
             add_products(&mut sums[2], [b[5], b[6], b[7], b[8]], tail);
         }
-        // Lanes that are dropped count as used: a compiler that knows better falls back to single numbers.
-        let sums = black_box(sums);
+        let sums = whole_lanes(sums);
         [
             sums[0][0] + sums[0][1] + sums[0][2],
             sums[1][0] + sums[1][1] + sums[1][2],

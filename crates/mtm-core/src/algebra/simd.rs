@@ -4,6 +4,8 @@
 //! limited by arithmetic instead of memory. Both versions compute the same sums in the same order, without
 //! fused multiply-adds, so their results are bitwise identical.
 
+use std::hint::black_box;
+
 use pulp::{Arch, Simd, WithSimd};
 
 /// Number of doubles that the kernels here add at once.
@@ -28,6 +30,12 @@ pub(crate) fn widest<K: Kernel>(kernel: K) -> K::Output {
         }
     }
     Arch::new().dispatch(Chosen(kernel))
+}
+
+/// `sums`, of which every lane counts as used: a compiler that drops some falls back to single numbers.
+#[inline(always)]
+pub(crate) fn whole_lanes<T>(sums: T) -> T {
+    black_box(sums)
 }
 
 /// `sum += a b`, lane by lane.
