@@ -12,6 +12,8 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 #[cfg(target_os = "linux")]
 use std::sync::Mutex;
+#[cfg(target_os = "linux")]
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 /// Size of a huge page on x86-64 and most arm64 systems, bytes.
 #[cfg(target_os = "linux")]
@@ -20,8 +22,10 @@ const HUGE_PAGE: usize = 2 << 20;
 #[cfg(target_os = "linux")]
 const LARGE: usize = HUGE_PAGE;
 
-/// Freed buffers that are kept at most, bytes.
+/// Freed buffers that are kept at most, bytes; or [`KEPT_SHARE`] of the large buffers in use, if that is more.
 pub const KEPT_BYTES: usize = 64 << 20;
+/// See [`KEPT_BYTES`]: Newton's method frees and requests hundreds of megabytes in every step.
+pub const KEPT_SHARE: f64 = 0.25;
 /// Number of freed buffers that are kept at most.
 #[cfg(target_os = "linux")]
 const KEPT_COUNT: usize = 16;
@@ -40,7 +44,7 @@ unsafe impl GlobalAlloc for HugePages {
         #[cfg(target_os = "linux")]
         if is_large(layout) {
             let length = rounded(layout.size());
-            return take_kept(length).unwrap_or_else(|| unsafe { map(length) });
+            return taken(take_kept(length).unwrap_or_else(|| unsafe { map(length) }), length);
         }
         unsafe { System.alloc(layout) }
     }
@@ -52,10 +56,10 @@ unsafe impl GlobalAlloc for HugePages {
             if let Some(pointer) = take_kept(length) {
                 // SAFETY: the buffer has this length, and is nobody else's.
                 unsafe { pointer.write_bytes(0, layout.size()) };
-                return pointer;
+                return taken(pointer, length);
             }
             // The kernel clears new pages.
-            return unsafe { map(length) };
+            return taken(unsafe { map(length) }, length);
         }
         unsafe { System.alloc_zeroed(layout) }
     }
@@ -63,7 +67,9 @@ unsafe impl GlobalAlloc for HugePages {
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         #[cfg(target_os = "linux")]
         if is_large(layout) {
-            keep(Buffer { start: pointer, length: rounded(layout.size()) });
+            let length = rounded(layout.size());
+            LIVE.fetch_sub(length, Relaxed);
+            keep(Buffer { start: pointer, length });
             return;
         }
         unsafe { System.dealloc(pointer, layout) }
@@ -128,6 +134,25 @@ impl Buffer {
     }
 }
 
+/// Large buffers in use, bytes.
+#[cfg(target_os = "linux")]
+static LIVE: AtomicUsize = AtomicUsize::new(0);
+
+/// `pointer`, whose `length` bytes are in use unless it is null.
+#[cfg(target_os = "linux")]
+fn taken(pointer: *mut u8, length: usize) -> *mut u8 {
+    if !pointer.is_null() {
+        LIVE.fetch_add(length, Relaxed);
+    }
+    pointer
+}
+
+/// Freed buffers that are kept now at most, bytes.
+#[cfg(target_os = "linux")]
+fn most_kept() -> usize {
+    KEPT_BYTES.max((KEPT_SHARE * LIVE.load(Relaxed) as f64) as usize)
+}
+
 /// The kept buffers, the oldest first; places without one have length 0.
 #[cfg(target_os = "linux")]
 static KEPT: Mutex<[Buffer; KEPT_COUNT]> = Mutex::new([Buffer::NONE; KEPT_COUNT]);
@@ -157,7 +182,8 @@ fn take_kept(length: usize) -> Option<*mut u8> {
 /// Keeps `freed` for a later request, and returns what is then too much to the system.
 #[cfg(target_os = "linux")]
 fn keep(freed: Buffer) {
-    if freed.length > KEPT_BYTES {
+    let most = most_kept();
+    if freed.length > most {
         return freed.unmap_from(0);
     }
     let kept = with_kept(|kept| {
@@ -165,7 +191,7 @@ fn keep(freed: Buffer) {
         // The first place is freed at least.
         let full = kept[KEPT_COUNT - 1].length > 0;
         let mut dropped = 0;
-        while excess > KEPT_BYTES || (full && dropped == 0) {
+        while excess > most || (full && dropped == 0) {
             excess -= kept[dropped].length;
             kept[dropped].unmap_from(0);
             kept[dropped] = Buffer::NONE;
@@ -249,13 +275,14 @@ mod tests {
             for &buffer in &many {
                 buffer.write_bytes(1, 8 * MB);
                 HugePages.dealloc(buffer, layout(8 * MB));
-                assert!(total() <= KEPT_BYTES);
+                assert!(total() <= most_kept());
             }
             assert_eq!(total(), KEPT_BYTES);
             let again = HugePages.alloc(layout(8 * MB));
             assert!(many[many.len() - 8..].contains(&again));
             HugePages.dealloc(again, layout(8 * MB));
-            let small: Vec<_> = (0..3 * KEPT_COUNT).map(|_| map(2 * MB)).collect();
+            let small: Vec<_> =
+                (0..3 * KEPT_COUNT).map(|_| HugePages.alloc(layout(2 * MB))).collect();
             for buffer in small {
                 HugePages.dealloc(buffer, layout(2 * MB));
             }
@@ -264,6 +291,16 @@ mod tests {
             let large = HugePages.alloc(layout(KEPT_BYTES + 1));
             HugePages.dealloc(large, layout(KEPT_BYTES + 1));
             assert_eq!(total(), 2 * MB * KEPT_COUNT);
+
+            // A share of what is in use.
+            let used = HugePages.alloc(layout(8 * KEPT_BYTES));
+            let large = HugePages.alloc(layout(2 * KEPT_BYTES));
+            HugePages.dealloc(large, layout(2 * KEPT_BYTES));
+            assert_eq!(HugePages.alloc(layout(2 * KEPT_BYTES)), large);
+            HugePages.dealloc(large, layout(2 * KEPT_BYTES));
+            HugePages.dealloc(used, layout(8 * KEPT_BYTES));
+            HugePages.dealloc(HugePages.alloc(layout(2 * MB)), layout(2 * MB));
+            assert!(total() <= KEPT_BYTES);
         }
     }
 }
