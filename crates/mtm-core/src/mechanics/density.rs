@@ -8,7 +8,7 @@
 //! Hyperelastic: a law of isotropic tissue for the isotropic stiffness nearest to C (Fedorov 1968), plus ½ e :
 //! (C − C_iso) : e for the fibre. At F = I the tangent is C.
 
-use nalgebra::{Cholesky, Matrix3, Matrix6, SymmetricEigen, Vector3};
+use nalgebra::{Cholesky, Matrix3, Matrix6, SVector, SymmetricEigen, Vector3};
 
 use crate::mechanics::hyperelastic::{HyperelasticLaw, PointResponse, Tangent, cofactor};
 use crate::mechanics::kinematics::Kinematics;
@@ -24,6 +24,8 @@ const LEAST_STRETCH_SUM: f64 = 1e-2;
 const DEFINITE_LIFT: f64 = 1e-10;
 /// Rows and columns of strain components in Voigt order.
 const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
+/// A deformation, row by row.
+type Mode = SVector<f64, 9>;
 /// Index in Voigt order of each entry of a tensor, row by row.
 const VOIGT: [usize; 9] = [0, 5, 4, 5, 1, 3, 4, 3, 2];
 
@@ -208,41 +210,46 @@ fn without_negative(tangent: &Tangent, kinematics: Kinematics) -> Tangent {
 }
 
 /// [`without_negative`] for isotropic tissue at `f`: in the principal axes its tangent consists of one block for
-/// the three stretches and one for each pair of axes (Smith, de Goes & Kim 2019).
+/// the three stretches and one for each pair of axes (Smith, de Goes & Kim 2019). Only the modes of negative
+/// curvature are changed: they are few, and a whole tangent in other axes costs more than all of them.
 fn without_negative_isotropic(
     tangent: &Tangent,
     f: &Matrix3<f64>,
     kinematics: Kinematics,
 ) -> Tangent {
     let polar = Polar::new(f);
-    let inner = carried(tangent, &polar.q.transpose(), &polar.v.transpose());
-    let mut kept = Tangent::zeros();
-    let mut block = Matrix3::from_fn(|i, j| inner[(4 * i, 4 * j)]);
+    // δF of a unit entry of A = Qᵀ δF V.
+    let mode =
+        |t: usize, u: usize| Mode::from_fn(|kl, _| polar.q[(kl / 3, t)] * polar.v[(kl % 3, u)]);
+    let mut kept = symmetric(tangent);
+    kept += Tangent::identity() * (DEFINITE_LIFT * kept.amax());
+    let mut replace = |value: f64, mode: Mode| {
+        let change = kept_curvature(value, kinematics) - value;
+        if change > 0.0 {
+            kept += mode * (mode * change).transpose();
+        }
+    };
+    let stretches: [Mode; 3] = std::array::from_fn(|i| mode(i, i));
+    let curved = stretches.map(|mode| tangent * mode);
+    let block = Matrix3::from_fn(|i, j| stretches[i].dot(&curved[j]));
     // Negative curvature usually comes from turns, not from stretches.
     if Cholesky::new(block).is_none() {
         let eigen = SymmetricEigen::new(block);
-        let values = eigen.eigenvalues.map(|value| kept_curvature(value, kinematics));
-        block =
-            eigen.eigenvectors * Matrix3::from_diagonal(&values) * eigen.eigenvectors.transpose();
-    }
-    for i in 0..3 {
-        for j in 0..3 {
-            kept[(4 * i, 4 * j)] = block[(i, j)];
+        for (&value, weights) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
+            let [a, b, c] = stretches;
+            replace(value, a * weights[0] + b * weights[1] + c * weights[2]);
         }
     }
-    for (a, b) in [(1, 3), (2, 6), (5, 7)] {
-        let (own, other, mixed) = (inner[(a, a)], inner[(b, b)], inner[(a, b)]);
+    for (i, j) in [(0, 1), (0, 2), (1, 2)] {
+        let (a, b) = (mode(i, j), mode(j, i));
+        let curved = tangent * b;
+        let (own, other, mixed) = (a.dot(&(tangent * a)), b.dot(&curved), a.dot(&curved));
         let t = if mixed == 0.0 { 0.0 } else { small_tangent(0.5 * (other - own) / mixed) };
-        // Eigenvalues and eigenvectors (1, −t) and (t, 1).
-        let (low, high) = (own - t * mixed, other + t * mixed);
-        let (low, high) = (kept_curvature(low, kinematics), kept_curvature(high, kinematics));
-        let size = 1.0 / (1.0 + t * t);
-        kept[(a, a)] = (low + t * t * high) * size;
-        kept[(b, b)] = (t * t * low + high) * size;
-        kept[(a, b)] = t * (high - low) * size;
-        kept[(b, a)] = kept[(a, b)];
+        let size = 1.0 / (1.0 + t * t).sqrt();
+        replace(own - t * mixed, (a - b * t) * size);
+        replace(other + t * mixed, (a * t + b) * size);
     }
-    carried(&kept, &polar.q, &polar.v)
+    kept
 }
 
 /// The isotropic stiffness nearest to `c` (Fedorov 1968): 9K = C_iijj, 30 μ = 3 C_ijij − C_iijj.
