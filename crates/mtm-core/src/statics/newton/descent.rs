@@ -5,9 +5,9 @@ use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::effort::Solve;
 use crate::statics::newton::step::{Step, by_tangent};
 use crate::statics::newton::{
-    Equilibrium, MAX_STEPS, Pose, TangentSolver, Target, lost, moved_by, reach,
+    Equilibrium, MAX_STEPS, Pose, TangentSolver, Target, along_slope, lost, moved_by, reach,
 };
-use crate::vector::add;
+use crate::vector::{add, dot};
 
 /// Share of the slope by which a step must decrease the energy (Armijo 1966).
 const DESCENT: f64 = 1e-4;
@@ -137,7 +137,10 @@ impl Equilibrium {
         while share >= SHORTEST {
             let mut next = at(share)?;
             if step.descends(&pose, &next, share) {
-                while kind == Definite && (1.0..LONGEST).contains(&share) {
+                while kind == Definite
+                    && (1.0..LONGEST).contains(&share)
+                    && still_falls(&step.rows, &next, on_walls)
+                {
                     share *= 2.0;
                     let further = at(share)?;
                     if further.merit >= next.merit - rounding(&pose, &next) {
@@ -175,6 +178,13 @@ fn left_after(lengths: &[f64], goal: f64) -> f64 {
     let before = longest(&earlier[earlier.len().saturating_sub(WINDOW)..]);
     let rate = (longest(last) / before).powf(1.0 / WINDOW as f64);
     if rate < 1.0 { longest(last) / (1.0 - rate) } else { f64::INFINITY }
+}
+
+/// Whether the merit of `pose` still falls along `rows`, without those `on_walls`, which go no further.
+fn still_falls(rows: &[[f64; 3]], pose: &Pose, on_walls: &[u32]) -> bool {
+    let held: f64 =
+        on_walls.iter().map(|&row| dot(rows[row as usize], pose.slope[row as usize])).sum();
+    along_slope(rows, pose) < held
 }
 
 /// Rounding error of the difference in energy of two states, N mm.
