@@ -19,6 +19,9 @@ use crate::vector::add;
 
 /// Nodes per parallel task.
 const NODES_PER_TASK: usize = 256;
+/// Change of any entry of F up to which a definite tangent is kept. Such a tangent is not that of the energy
+/// anyway, and after a few steps most tissue hardly moves.
+const LAG: f64 = 1e-3;
 
 /// Which tangent stiffness is computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,8 +39,10 @@ pub struct StrainEnergy {
     kinematics: Kinematics,
     /// Energy density of each tet, or of all of them.
     densities: Vec<Density>,
-    /// Memory of the last state and tangent: clearing new pages takes longer than computing forces.
+    /// Memory of the last state and matrix: clearing new pages takes longer than computing forces.
     scratch: Mutex<Scratch>,
+    /// Memory of the tangents of an earlier series.
+    freed: Mutex<PointTangents>,
 }
 
 /// Values of every tet, kept for their memory only.
@@ -45,10 +50,17 @@ pub struct StrainEnergy {
 struct Scratch {
     /// Internal force on each node of each tet, N.
     forces: Vec<[f64; 3]>,
-    /// Tangent of each quadrature point times its volume, N mm.
-    tangents: Vec<Tangent>,
     /// Tangent stiffness, N/mm.
     matrix: Option<BlockMatrix>,
+}
+
+/// Tangents of a series of states of one body, each near the one before.
+#[derive(Debug, Default)]
+pub(crate) struct PointTangents {
+    /// Tangent of each quadrature point times its volume, N mm.
+    values: Vec<Tangent>,
+    /// F of each quadrature point at its tangent; none unless they are definite ones.
+    at: Vec<Matrix3<f64>>,
 }
 
 /// Energy and internal forces of a state.
@@ -82,7 +94,8 @@ impl StrainEnergy {
                 }
             })
             .collect();
-        Self { tensors, kinematics, densities, scratch: Mutex::default() }
+        let (scratch, freed) = (Mutex::default(), Mutex::default());
+        Self { tensors, kinematics, densities, scratch, freed }
     }
 
     /// The kinematics.
@@ -179,65 +192,118 @@ impl StrainEnergy {
         Ok(EnergyState { energy: energy + averaged.map_or(0.0, |a| a.energy), forces })
     }
 
+    /// Begins a series of states, in the memory of an earlier one. What it finds does not depend on other series.
+    pub(crate) fn begin(&self) -> PointTangents {
+        let freed = &mut *self.freed.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut tangents = std::mem::take(freed);
+        tangents.at.clear();
+        tangents
+    }
+
+    /// Ends a series, whose memory the next one uses.
+    pub(crate) fn end(&self, tangents: PointTangents) {
+        *self.freed.lock().unwrap_or_else(PoisonError::into_inner) = tangents;
+    }
+
     /// Tangent stiffness under displacements of all nodes, N/mm, on the pattern of the tensors.
     ///
     /// # Errors
     /// Displacements of the wrong number, or not finite.
     pub fn stiffness(&self, u: &[[f64; 3]], kind: TangentKind) -> Result<BlockMatrix> {
         self.tensors.check_displacements(u)?;
-        let mut scratch = self.take_scratch();
-        let matrix = self.assembled(u, kind, &mut scratch);
+        let (mut scratch, mut tangents) = (self.take_scratch(), self.begin());
+        let matrix = self.assembled(u, kind, &mut tangents, scratch.matrix.take());
         self.keep_scratch(scratch);
+        self.end(tangents);
         Ok(matrix)
     }
 
-    /// The result of `read` for the tangent stiffness under displacements of all nodes.
+    /// The result of `read` for the tangent stiffness under displacements of all nodes, the next of a series.
     pub(crate) fn with_stiffness<T>(
         &self,
         u: &[[f64; 3]],
         kind: TangentKind,
+        tangents: &mut PointTangents,
         read: impl FnOnce(&BlockMatrix) -> T,
     ) -> Result<T> {
         self.tensors.check_displacements(u)?;
         let mut scratch = self.take_scratch();
-        let matrix = self.assembled(u, kind, &mut scratch);
+        let matrix = self.assembled(u, kind, tangents, scratch.matrix.take());
         let result = read(&matrix);
         scratch.matrix = Some(matrix);
         self.keep_scratch(scratch);
         Ok(result)
     }
 
-    /// The tangent stiffness, in the memory of `scratch` where that has some.
-    fn assembled(&self, u: &[[f64; 3]], kind: TangentKind, scratch: &mut Scratch) -> BlockMatrix {
+    /// The tangent stiffness, in the `memory` of an earlier one if there is one.
+    fn assembled(
+        &self,
+        u: &[[f64; 3]],
+        kind: TangentKind,
+        tangents: &mut PointTangents,
+        memory: Option<BlockMatrix>,
+    ) -> BlockMatrix {
         let nodes = self.nodes();
         let mesh = nodes.mesh();
         let averaged = self.averaged(u);
-        let n_points = nodes.n_points();
-        scratch.tangents.resize(mesh.n_tets() * n_points, Tangent::zeros());
-        scratch.tangents.par_chunks_mut(n_points).enumerate().for_each(|(t, own)| {
-            let pressure = averaged.as_ref().map_or(0.0, |a| a.pressures[t]);
-            let weight = mesh.volumes()[t] / n_points as f64;
-            let density = self.density(t);
-            for (out, f) in own.iter_mut().zip(self.gradients(t, u)) {
-                *out = weight
-                    * match kind {
-                        TangentKind::Definite => density.definite(&f, self.kinematics, pressure),
-                        TangentKind::Exact => density.tangent(&f, self.kinematics, pressure),
-                    };
-            }
-        });
+        self.find_tangents(u, averaged.as_ref(), kind, tangents);
         let pattern = self.tensors.matrix();
-        let mut matrix = scratch.matrix.take().unwrap_or_else(|| {
+        let mut matrix = memory.unwrap_or_else(|| {
             BlockMatrix::from_pattern(pattern.row_start.clone(), pattern.columns.clone())
         });
         matrix.row_tasks().into_par_iter().for_each(|task| {
-            widest(Fill { nodes, tangents: &scratch.tangents, task });
+            widest(Fill { nodes, tangents: &tangents.values, task });
         });
         if let (Some(patches), Some(averaged)) = (self.tensors.patches(), &averaged) {
             let gradients = patches.gradients(mesh, |t| averaged.slopes[t]);
             patches.add_to(mesh, &gradients, &mut matrix);
         }
         matrix
+    }
+
+    /// The `tangents` at displacements `u`. Definite ones are kept where F has hardly changed; with pressures,
+    /// which change everywhere, none are.
+    fn find_tangents(
+        &self,
+        u: &[[f64; 3]],
+        averaged: Option<&Averaged>,
+        kind: TangentKind,
+        tangents: &mut PointTangents,
+    ) {
+        let n_points = self.nodes().n_points();
+        let volumes = self.nodes().mesh().volumes();
+        let n = volumes.len() * n_points;
+        let PointTangents { values, at } = tangents;
+        values.resize(n, Tangent::zeros());
+        let found = |t: usize, f: &Matrix3<f64>| {
+            let pressure = averaged.map_or(0.0, |a| a.pressures[t]);
+            let density = self.density(t);
+            let tangent = match kind {
+                TangentKind::Definite => density.definite(f, self.kinematics, pressure),
+                TangentKind::Exact => density.tangent(f, self.kinematics, pressure),
+            };
+            volumes[t] / n_points as f64 * tangent
+        };
+        if kind == TangentKind::Exact || averaged.is_some() {
+            at.clear();
+            values.par_chunks_mut(n_points).enumerate().for_each(|(t, own)| {
+                for (out, f) in own.iter_mut().zip(self.gradients(t, u)) {
+                    *out = found(t, &f);
+                }
+            });
+            return;
+        }
+        // Nothing is near NaN.
+        at.resize(n, Matrix3::repeat(f64::NAN));
+        let own = values.par_chunks_mut(n_points).zip(at.par_chunks_mut(n_points));
+        own.enumerate().for_each(|(t, (values, at))| {
+            for ((out, at), f) in values.iter_mut().zip(at).zip(self.gradients(t, u)) {
+                let is_near = at.iter().zip(&f).all(|(a, b)| (a - b).abs() <= LAG);
+                if !is_near {
+                    (*out, *at) = (found(t, &f), f);
+                }
+            }
+        });
     }
 
     fn averaged(&self, u: &[[f64; 3]]) -> Option<Averaged> {
@@ -330,5 +396,47 @@ fn left_contracted(tangent: &Tangent, g: [f64; 3]) -> [Block; 3] {
 fn add_contracted(block: &mut Block, left: &[Block; 3], g: [f64; 3]) {
     for (i, entry) in block.iter_mut().enumerate() {
         *entry += left[0][i] * g[0] + left[1][i] * g[1] + left[2][i] * g[2];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mechanics::material::Elastic;
+    use crate::mechanics::tissue::Tissue;
+    use crate::mesh::TetMesh;
+
+    fn values(body: &StrainEnergy, u: &[[f64; 3]], series: &mut PointTangents) -> Vec<Block> {
+        let read = |matrix: &BlockMatrix| {
+            (0..matrix.n_rows()).flat_map(|row| matrix.row(row).1.to_vec()).collect()
+        };
+        body.with_stiffness(u, TangentKind::Definite, series, read).expect("four nodes")
+    }
+
+    #[test]
+    fn definite_tangents_of_a_series_are_kept_only_where_the_tet_hardly_moves() {
+        let nodes = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let mesh = Arc::new(TetMesh::new(nodes, vec![[0, 1, 2, 3]]).expect("one tet"));
+        let tissue = Tissue::isotropic(&[Elastic { young: 1.0, poisson: 0.46 }]).expect("tissue");
+        let tensors = Arc::new(MassTensors::new(mesh, Arc::new(tissue)).expect("tensors"));
+        let body = StrainEnergy::new(tensors, Kinematics::NEO_HOOKEAN);
+        let at = |x: f64| vec![[0.0; 3], [x, 0.1, 0.0], [0.0; 3], [0.0, 0.0, -0.2]];
+        let fresh = |x: f64| values(&body, &at(x), &mut PointTangents::default());
+
+        let mut series = body.begin();
+        assert_eq!(values(&body, &at(0.1), &mut series), fresh(0.1));
+        let near = values(&body, &at(0.1 + 0.5 * LAG), &mut series);
+        assert_eq!(near, fresh(0.1), "kept");
+        // Steps add up: the tangent is that of a place within the lag, not of the last state.
+        let moved = values(&body, &at(0.1 + 1.5 * LAG), &mut series);
+        assert_eq!(moved, fresh(0.1 + 1.5 * LAG));
+        assert_ne!(moved, near);
+        // Exact tangents are never kept, and none of another series is.
+        let exact = body.with_stiffness(&at(0.1), TangentKind::Exact, &mut series, |_| ());
+        exact.expect("four nodes");
+        let after = values(&body, &at(0.1 + 0.5 * LAG), &mut series);
+        assert_eq!(after, fresh(0.1 + 0.5 * LAG));
+        body.end(series);
+        assert_eq!(values(&body, &at(0.1), &mut body.begin()), fresh(0.1));
     }
 }

@@ -10,6 +10,7 @@ mod sliding;
 mod step;
 mod tangents;
 
+use std::cell::RefCell;
 use std::sync::{Arc, OnceLock};
 
 use crate::algebra::blocks::BlockMatrix;
@@ -18,8 +19,8 @@ use crate::algebra::constraints::Constraint;
 use crate::algebra::multigrid::Multigrid;
 use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
-use crate::mechanics::strain_energy::StrainEnergy;
 use crate::mechanics::strain_energy::TangentKind::{self, Exact};
+use crate::mechanics::strain_energy::{PointTangents, StrainEnergy};
 use crate::mechanics::tensors::MassTensors;
 use crate::statics::effort::Solve;
 use crate::statics::iterative::Extremes;
@@ -110,6 +111,8 @@ struct Target<'a> {
     scale: f64,
     /// The hierarchy that the steps towards it share.
     hierarchy: &'a SharedHierarchy,
+    /// The tangents that they share.
+    tangents: &'a RefCell<PointTangents>,
 }
 
 /// A state, with the data from which the next step starts.
@@ -203,12 +206,27 @@ impl Equilibrium {
         slide: Option<&Slide<'_>>,
         solve: &mut Solve<'_>,
     ) -> Result<Solved> {
+        let tangents = RefCell::new(self.energy.begin());
+        let solved = self.solve_with(&tangents, (prescribed, loads), slide, solve);
+        self.energy.end(tangents.into_inner());
+        solved
+    }
+
+    /// [`solve`](Self::solve) with the tangents of its own.
+    fn solve_with(
+        &self,
+        tangents: &RefCell<PointTangents>,
+        (prescribed, loads): (&[[f64; 3]], Option<&[[f64; 3]]>),
+        slide: Option<&Slide<'_>>,
+        solve: &mut Solve<'_>,
+    ) -> Result<Solved> {
         let clock = Clock::new();
         let scale = solve.scale;
         let shared = SharedHierarchy::starting(&self.at_rest);
         let hierarchy = &shared;
         let conditions = RowConditions::default;
-        let target = || Target { prescribed, loads, conditions: conditions(), scale, hierarchy };
+        let target =
+            || Target { prescribed, loads, conditions: conditions(), scale, hierarchy, tangents };
         let mut u = vec![[0.0; 3]; prescribed.len()];
         let settled = |u: &[[f64; 3]], contact: ContactState| Solved {
             rows: self.reduction.rows(u),

@@ -113,7 +113,7 @@ impl Equilibrium {
         options.contact.allowed = allowed;
         let positions = self.reduction.rows(self.tensors.element_nodes().positions());
         target.hierarchy.serve(kind == Definite, |multigrid| {
-            let (matrix, mut b) = self.tangent(pose, kind, start.change)?;
+            let (matrix, mut b) = self.tangent((pose, target), kind, start.change)?;
             // K (x − u) = −slope: the contact conditions apply to x, the whole displacement.
             for (b, f) in b.iter_mut().zip(matrix.multiply(&here)) {
                 *b = add(*b, f);

@@ -19,12 +19,13 @@ impl Equilibrium {
     /// side if the other nodes move by `change`.
     pub(super) fn tangent(
         &self,
-        pose: &Pose,
+        (pose, target): (&Pose, &Target<'_>),
         kind: TangentKind,
         change: Option<&[[f64; 3]]>,
     ) -> Result<(BlockMatrix, Vec<[f64; 3]>)> {
         let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
-        let matrix = self.energy.with_stiffness(&pose.u, kind, |full| {
+        let tangents = &mut target.tangents.borrow_mut();
+        let matrix = self.energy.with_stiffness(&pose.u, kind, tangents, |full| {
             if let Some(change) = change {
                 for (b, f) in b.iter_mut().zip(self.reduction.rows(&full.multiply(change))) {
                     *b = sub(*b, f);
@@ -48,7 +49,7 @@ impl Equilibrium {
     ) -> Result<Vec<[f64; 3]>> {
         let &Moves { constraints, change } = moves;
         target.hierarchy.serve(kind == Definite, |kept| {
-            let (mut matrix, b) = self.tangent(pose, kind, change)?;
+            let (mut matrix, b) = self.tangent((pose, target), kind, change)?;
             for (row, spring) in &target.conditions.springs {
                 matrix.add_to_diagonal(*row, spring.axis, spring.stiffness);
             }
