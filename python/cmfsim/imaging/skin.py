@@ -23,7 +23,6 @@ from cmfsim.imaging.morphology import (
     reached,
     resampled_to,
     shrunk,
-    sizes_of,
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.working_grid import Working, coarse_of
@@ -272,12 +271,12 @@ def _standing_out(
     rest: Mask, around: Volume, spacing: NDArray[np.float64], volume: float, reach: float
 ) -> Mask:
     """The pieces above a volume (mm³) or farther out than a reach (mm)."""
-    labels, count = label(rest)
-    if not count:
+    labels, sizes = label(rest)
+    if len(sizes) == 1:
         return rest
-    large = sizes_of(labels, count) * float(np.prod(spacing)) > volume
+    large = sizes * float(np.prod(spacing)) > volume
     numbers = labels.T[rest.T]
-    farthest = np.full(count + 1, -np.inf)
+    farthest = np.full(len(sizes), -np.inf)
     np.maximum.at(farthest, numbers, -around.T[rest.T])
     large |= farthest > reach
     large[0] = False

@@ -18,7 +18,6 @@ from cmfsim.imaging.morphology import (
     label,
     opened,
     resampled_to,
-    sizes_of,
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.values.finding import Finding
@@ -233,13 +232,12 @@ def _head_box(
     coarse, steps, _ = coarse_of(values, spacing, 4.0)
     tissue: Mask = np.asfortranarray(coarse * scale.slope + scale.offset > TISSUE)
     core = opened(tissue, OPENING, steps)
-    labels, count = label(core)
-    if not count:
+    labels, sizes = label(core)
+    if len(sizes) == 1:
         raise ImageInputError(
             f"the image contains nothing thicker than {2 * OPENING:g} mm above {TISSUE:g} HU: no "
             "head"
         )
-    sizes = sizes_of(labels, count)
     head = labels == np.argmax(sizes)
     # What the opening took (nose, ears, chin) lies within this of what it left.
     margin = 2.0 * OPENING + MARGIN
