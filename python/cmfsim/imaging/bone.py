@@ -1,5 +1,6 @@
 """Bone with the hollows that it encloses, teeth and metal."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,8 +90,10 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
     solid &= under > options.least_skin
     solid, findings = _without_islands(solid, work, options)
-    cavity = _cranial_cavity(solid, skin, work)
-    mask = _enclosed(hu, solid, cavity, under, work=work, options=options)
+    with ThreadPoolExecutor(1) as beside:
+        walls = beside.submit(_walls, hu, solid, under, work, options)
+        cavity = _cranial_cavity(solid, skin, work)
+        mask = _enclosed(walls.result(), solid, cavity, under, work=work, options=options)
     surface = hu
     if options.bone_threshold is None:
         surface, mask = at_half_height(hu, mask, threshold, BONE_SCALE, work.spacing)
@@ -175,8 +178,15 @@ def _enclosed_by_skull(cavity: Mask, wall: Mask) -> bool:
     return bounded >= LEAST_BOUNDED * int(np.count_nonzero(rim))
 
 
+def _walls(hu: Volume, solid: Mask, under: Volume, work: Working, options: SegmentOptions) -> Mask:
+    """Bone and what is partly bone, closed: the walls of hollows."""
+    seal = options.least_bone - (1.0 - SEAL_PART) * (options.least_bone - SOFT)
+    walls = solid | ((hu > seal) & (under > 2.0 * options.least_skin))
+    return closed(walls, options.closing, work.spacing)
+
+
 def _enclosed(
-    hu: Volume,
+    walls: Mask,
     solid: Mask,
     cavity: Mask | None,
     under: Volume,
@@ -185,11 +195,8 @@ def _enclosed(
     options: SegmentOptions,
 ) -> Mask:
     """Bone with marrow, sinuses and the cranial cavity."""
-    seal = options.least_bone - (1.0 - SEAL_PART) * (options.least_bone - SOFT)
-    walls = solid | ((hu > seal) & (under > 2.0 * options.least_skin))
-    walls = closed(walls, options.closing, work.spacing)
     if cavity is not None:
-        walls |= cavity
+        walls = walls | cavity
     labels, sizes = label(~walls)
     outer = np.zeros(len(sizes), dtype=bool)
     outer[labels.T[under.T < 0.0]] = True
