@@ -175,8 +175,8 @@ def sheet_departure(
     points = as_rows("nodes", nodes, 3)
     if not len(points):
         return 0.0, 0.0, 0.0
-    on_bone, _, _ = _core.Surface(bone.vertices, bone.triangles).closest(points)
-    on_sheet, _, _ = _core.Surface(sheet.vertices, sheet.triangles).closest(on_bone)
+    on_bone, _, _ = bone.searched.closest(points)
+    on_sheet, _, _ = sheet.searched.closest(on_bone)
     away = np.linalg.norm(on_sheet - on_bone, axis=1)
     return float(away.mean()), float(np.percentile(away, 95.0)), float(away.max())
 
