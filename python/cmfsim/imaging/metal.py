@@ -228,8 +228,8 @@ def without_streaks(
     if bone:
         near = depth(np.asfortranarray(metal.mask[:, :, metal.layers]), spacing)
         rest &= (near < -NEAR_METAL) & (near > -FAR_FROM_METAL)
-    labels, count = label(rest, corners=True)
-    farthest = np.zeros(count + 1)
+    labels, sizes = label(rest, corners=True)
+    farthest = np.zeros(len(sizes))
     np.maximum.at(farthest, labels[rest], -around[rest])
     cleaned[:, :, metal.layers] &= ~((farthest > reach)[labels] & rest)
     return cleaned
