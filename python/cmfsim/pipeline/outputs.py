@@ -37,7 +37,7 @@ from cmfsim.io.predictions import (
 )
 from cmfsim.io.skin_errors import skin_errors_file, write_skin_errors
 from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
-from cmfsim.io.summaries import write_summary
+from cmfsim.io.summaries import hashes_of, write_summary
 from cmfsim.pictures import (
     Picture,
     band_picture,
@@ -262,7 +262,7 @@ def write_results(
         if evaluation is not None and compared is not None:
             values = {**compared, "files": written.files}
             sealed = [n for n in written.files if n not in {EVALUATION_FILE, REPORT_FILE}]
-            write_summary(fresh / EVALUATION_FILE, values, sealed)
+            write_summary(fresh / EVALUATION_FILE, values, hashes_of(fresh, sealed))
         own = [written.report] if written.report is not None else []
         of_models = [f"{w.place}/{n}".lstrip("/") for w in written.predictions for n in w.files]
         return list(dict.fromkeys([*of_models, *written.files, *own]))
