@@ -32,7 +32,7 @@ __all__ = ["segment_head"]
 
 _LOG = logging.getLogger(__name__)
 
-# Number of things found in parallel with the jaw.
+# Number of things found in parallel with others.
 THREADS = 2
 # A child's face in a narrow image is larger than this, cm³.
 LEAST_HEAD = 250.0
@@ -91,17 +91,17 @@ def segment_head(
     all_findings: list[Finding] = [*findings, *cupping]
     say("metal")
     metal = find_metal(work, options)
-    say("skin")
-    skin = find_skin(work, metal, options)
-    _check_head(work, skin.mask)
-    say("bone")
-    # The couch and the air around the head need no more work, here or later.
-    work, metal = work.part(skin.box), metal_within(metal, skin.box)
-    smooth, noisy = without_noise(metal.hu)
-    metal = replace(metal, hu=smooth)
-    bone = find_bone(work, metal, skin, options)
-    # Where the bone is and which of it is the jaw are found without each other.
     with ThreadPoolExecutor(THREADS) as beside:
+        say("skin")
+        skin = find_skin(work, metal, options, beside)
+        _check_head(work, skin.mask)
+        say("bone")
+        # The couch and the air around the head need no more work, here or later.
+        work, metal = work.part(skin.box), metal_within(metal, skin.box)
+        smooth, noisy = without_noise(metal.hu)
+        metal = replace(metal, hu=smooth)
+        bone = find_bone(work, metal, skin, options)
+        # Where the bone is and which of it is the jaw are found without each other.
         level = beside.submit(bone_level, bone, options)
         noticed = beside.submit(_noticed, work, skin, bone, options)
         bones, teeth, jaws = _bones(work, bone, skin, points, level, options=options, say=say)
@@ -152,7 +152,8 @@ def _bones(
             "cranium": np.minimum(level, -jaws.side),
             "mandible": np.minimum(level, jaws.side),
         }
-    bones = {name: work.image(part) for name, part in parts.items()}
+    with ThreadPoolExecutor(THREADS) as pool:
+        bones = dict(zip(parts, pool.map(work.image, parts.values()), strict=True))
     dense = teeth_level(bone, work, jaws.occlusal_height)
     return bones, None if dense is None else work.image(dense), jaws.findings
 
