@@ -17,6 +17,9 @@ use crate::running::interruptible;
 
 const MESH: ErrorKind = ErrorKind::Mesh;
 
+/// The labels of an image, and the sizes of its pieces.
+type LabelledImage<'py> = (Bound<'py, PyArray3<i32>>, Bound<'py, PyArray1<isize>>);
+
 /// Mesh of the tissue in a label image or inside a level image, and a dict of figures about it.
 ///
 /// `values`: (nx, ny, nz); bool or integers are labels (non-zero is tissue), real numbers a level
@@ -101,7 +104,7 @@ pub fn label_image<'py>(
     py: Python<'py>,
     mask: &Bound<'py, PyAny>,
     corners: bool,
-) -> PyResult<(Bound<'py, PyArray3<i32>>, Bound<'py, PyArray1<isize>>)> {
+) -> PyResult<LabelledImage<'py>> {
     let (shape, inside) = arrays::labels(mask, Named("mask", MESH))?;
     let grid = Grid::new(shape, [1.0; 3], [0.0; 3]).map_err(Failure)?;
     let joined = if corners { Joined::Corners } else { Joined::Faces };

@@ -3,17 +3,21 @@
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding, OnFindings
-from cmfsim.values.musculature import Musculature
 from cmfsim.values.progress import Progress, no_progress
+
+if TYPE_CHECKING:
+    # A case without muscles loads nothing of them.
+    from cmfsim.values.musculature import Musculature
 
 __all__ = ["BuildOptions", "OnMuscles", "Stages"]
 
 # What is called with the muscles of a patient and the segments of the bones.
-OnMuscles = Callable[[Musculature, Sequence[BoneSegment]], None]
+OnMuscles = Callable[["Musculature", Sequence[BoneSegment]], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
