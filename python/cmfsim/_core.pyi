@@ -40,6 +40,7 @@ __all__ = [
     "__version__",
     "distance_image",
     "icp",
+    "label_image",
     "part_mesh",
     "rigid_fit",
     "rigid_matrix",
@@ -481,6 +482,9 @@ def stuff_image(
 def distance_image(
     targets: ArrayLike, spacing: tuple[float, float, float], *, within: float = ...
 ) -> NDArray[np.float32]: ...
+def label_image(
+    mask: ArrayLike, *, corners: bool = ...
+) -> tuple[NDArray[np.int32], NDArray[np.intp]]: ...
 def signed_distance_image(
     surface: Surface,
     shape: tuple[int, int, int],

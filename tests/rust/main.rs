@@ -25,6 +25,7 @@ mod mechanics {
     mod patch;
 }
 mod meshing {
+    mod pieces;
     mod stuffing;
 }
 mod muscles {

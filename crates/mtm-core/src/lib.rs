@@ -23,7 +23,7 @@
 //! | `algebra` | block matrices, Cholesky, conjugate gradients, multigrid |
 //! | `mechanics` | materials, mass tensors, strain energy and its laws |
 //! | `boundary` | node kinds, segments, plans |
-//! | `meshing` | tetrahedra from label images, cracks, signed distances |
+//! | `meshing` | tetrahedra from label images, cracks, signed distances, connected pieces |
 //! | `muscles` | fibre directions and the share of muscle in each tet |
 //! | `registration` | rigid fits, ICP, thin-plate splines |
 //! | `contact` | sliding nodes, their surfaces and the contact solver |
@@ -107,6 +107,7 @@ pub use mechanics::tensors::{EdgeTensors, MassTensors, tet_tensor};
 pub use mechanics::tissue::{TetMaterial, Tissue};
 pub use mesh::{MeshQuality, TetMesh};
 pub use meshing::crack::{Parted, part};
+pub use meshing::pieces::{Joined, Pieces, pieces};
 pub use meshing::signed_distance::signed_distance;
 pub use meshing::stuffing::distance::squared_distance;
 pub use meshing::stuffing::level::{Grid, LevelImage};

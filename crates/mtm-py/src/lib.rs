@@ -40,7 +40,9 @@ mod _core {
     use crate::statics::{PyPlanOperator, PySolution, PyStaticSolver};
 
     #[pymodule_export]
-    use crate::stuffing::{distance_image, part_mesh, signed_distance_image, stuff_image};
+    use crate::stuffing::{
+        distance_image, label_image, part_mesh, signed_distance_image, stuff_image,
+    };
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use mtm_core::{
-    ErrorKind, Grid, Halvings, LevelImage, Stuffed, StuffingOptions, part, signed_distance,
-    squared_distance, stuff,
+    ErrorKind, Grid, Halvings, Joined, LevelImage, Stuffed, StuffingOptions, part, pieces,
+    signed_distance, squared_distance, stuff,
 };
-use numpy::{PyArray2, PyArray3};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -16,6 +16,9 @@ use crate::geometry::{PySurface, PyTetMesh};
 use crate::running::interruptible;
 
 const MESH: ErrorKind = ErrorKind::Mesh;
+
+/// The labels of an image, and the sizes of its pieces.
+type LabelledImage<'py> = (Bound<'py, PyArray3<i32>>, Bound<'py, PyArray1<isize>>);
 
 /// Mesh of the tissue in a label image or inside a level image, and a dict of figures about it.
 ///
@@ -91,6 +94,23 @@ pub fn distance_image<'py>(
         Ok(squared.into_iter().map(f32::sqrt).collect())
     })?;
     arrays::volume(py, shape, distances)
+}
+
+/// Number of each voxel's connected piece, (nx, ny, nz) int32, from 1 on in the order of their first voxels and 0
+/// outside the mask, and the number of voxels of each piece, (count + 1,) intp, that of 0 being 0.
+#[pyfunction]
+#[pyo3(signature = (mask, *, corners=false))]
+pub fn label_image<'py>(
+    py: Python<'py>,
+    mask: &Bound<'py, PyAny>,
+    corners: bool,
+) -> PyResult<LabelledImage<'py>> {
+    let (shape, inside) = arrays::labels(mask, Named("mask", MESH))?;
+    let grid = Grid::new(shape, [1.0; 3], [0.0; 3]).map_err(Failure)?;
+    let joined = if corners { Joined::Corners } else { Joined::Faces };
+    let found = interruptible(py, move |_| Ok(pieces(&grid, &inside, joined)))?;
+    let sizes: Vec<isize> = found.sizes.into_iter().map(|n| n as isize).collect();
+    Ok((found.labels.into_pyarray(py).reshape(shape)?, sizes.into_pyarray(py)))
 }
 
 /// Signed distance to a surface on a grid, (nx, ny, nz) float32, mm: positive inside, clipped at ±band.

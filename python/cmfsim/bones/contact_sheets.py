@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
 from cmfsim.errors import CaseInputError, third_party
-from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
+from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
 from cmfsim.values.checks import Floats, as_positive, as_rows
 from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
 from cmfsim.values.image_data import ImageData
@@ -175,8 +175,8 @@ def sheet_departure(
     points = as_rows("nodes", nodes, 3)
     if not len(points):
         return 0.0, 0.0, 0.0
-    on_bone, _, _ = _core.Surface(bone.vertices, bone.triangles).closest(points)
-    on_sheet, _, _ = _core.Surface(sheet.vertices, sheet.triangles).closest(on_bone)
+    on_bone, _, _ = bone.searched.closest(points)
+    on_sheet, _, _ = sheet.searched.closest(on_bone)
     away = np.linalg.norm(on_sheet - on_bone, axis=1)
     return float(away.mean()), float(np.percentile(away, 95.0)), float(away.max())
 
@@ -401,9 +401,9 @@ def _depth(solid: Mask, near: Floats) -> NDArray[np.float32]:
     depth = np.empty(solid.shape, dtype=np.float32)
     for side, sign in ((solid, 1.0), (~solid, -1.0)):
         distance, other = ndimage.distance_transform_edt(side, return_indices=True)
-        beyond = -sign * near[tuple(other)]
+        beyond = -sign * near[tuple(along[side] for along in other)]
         rest = np.where((beyond >= 0.0) & (beyond <= SPACING), beyond, 0.5 * SPACING)
-        depth[side] = sign * np.maximum(distance * SPACING - rest, 0.0)[side]
+        depth[side] = sign * np.maximum(distance[side] * SPACING - rest, 0.0)
     return depth
 
 
@@ -423,8 +423,13 @@ def _smallest_radius(level: NDArray[Any], zone: Mask) -> float:
             index[axis] = part
             near[tuple(index)] |= change
     near &= zone
-    if not near.any():
+    low, high = block_of(near)
+    if not (high > low).all():
         return np.inf
+    # Both derivatives reach two voxels.
+    low, high = np.maximum(low - 2, 0), np.minimum(high + 2, near.shape)
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    level, near = level[box], near[box]
     first: list[Floats] = list(np.gradient(np.asarray(level, dtype=np.float64), SPACING))
     second: list[list[Floats]] = [list(np.gradient(g, SPACING)) for g in first]
     g = np.stack([d[near] for d in first], axis=-1)

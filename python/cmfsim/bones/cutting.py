@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmfsim import _core
 from cmfsim.bones.planes import Cut, Procedure
 from cmfsim.bones.procedures import PROCEDURES, place_procedure
 from cmfsim.bones.segment_checks import check_segments
@@ -359,15 +360,13 @@ def _join_crumbs(
     """
     ndimage = third_party("scipy.ndimage", "bones are cut", "imaging")
     block = np.ones((3, 3, 3), dtype=np.int8)
-    labels, count = ndimage.label(piece > 0.0, block)
-    if count < 2:
+    labels, sizes = _core.label_image(piece > 0.0, corners=True)
+    if len(sizes) < 3:
         return [], []
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    sizes[0] = 0
     largest = int(np.argmax(sizes))
     moved, kept = [], []
     boxes = ndimage.find_objects(labels)
-    for label in range(1, count + 1):
+    for label in range(1, len(sizes)):
         if label == largest:
             continue
         around = tuple(

@@ -17,6 +17,7 @@ from typing import Any
 
 from cmfsim.cli.case_commands import print_findings
 from cmfsim.cli.exit_codes import BAD_INPUT, CLOSED, DONE, FAILED
+from cmfsim.cli.memory import keep_freed_memory
 from cmfsim.cli.notices import FindingsError
 from cmfsim.cli.parsing import make_parser
 from cmfsim.cli.terminal import ProgressHandler, print_error
@@ -44,6 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     2
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments is None:
+        # The process is this command's; a caller's stays as it is.
+        keep_freed_memory()
     _open_closed_streams()
     try:
         code = _command(words)

@@ -70,8 +70,8 @@ def predict(options: argparse.Namespace) -> int:
         )
         written = write_results(
             case.output,
-            lambda on_patient: _timed(
-                _at_least_one(predicted(on_patient=on_patient), failed), before
+            lambda on_muscles: _timed(
+                _at_least_one(predicted(on_muscles=on_muscles), failed), before
             ),
             models,
             stage=progress.stage,

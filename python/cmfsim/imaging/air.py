@@ -4,7 +4,7 @@ import numpy as np
 
 from cmfsim.imaging.bone import Bone
 from cmfsim.imaging.levels import level_of
-from cmfsim.imaging.morphology import Volume, label, sizes_of
+from cmfsim.imaging.morphology import Volume, label
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import SKIN_SCALE, Skin
 from cmfsim.imaging.working_grid import Working
@@ -17,8 +17,8 @@ LEAST_AIR = 200.0
 
 def air_level(work: Working, skin: Skin, bone: Bone, options: SegmentOptions) -> Volume | None:
     """The level of hollows that no bone encloses; None if there are none."""
-    labels, count = label(skin.hollow & ~bone.mask)
-    large = sizes_of(labels, count) * float(np.prod(work.spacing)) > LEAST_AIR
+    labels, sizes = label(skin.hollow & ~bone.mask)
+    large = sizes * float(np.prod(work.spacing)) > LEAST_AIR
     if not large.any():
         return None
     return level_of(-work.hu, -options.skin_threshold, SKIN_SCALE, large[labels])

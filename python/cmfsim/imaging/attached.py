@@ -165,9 +165,9 @@ def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
     mirrored = _mirrored(around, spacing, behind, out)
     alone = reached(out & (mirrored < -NEARLY_ONE_SIDED), mirrored < -ONE_SIDED)
     found: Mask = dense | alone | far
-    labels, count = label(found, corners=True)
+    labels, sizes = label(found, corners=True)
     things = []
-    for piece in range(1, count + 1):
+    for piece in range(1, len(sizes)):
         voxels = np.argwhere(labels == piece)
         volume = len(voxels) * float(np.prod(spacing))
         size = (np.ptp(voxels, axis=0) + 1) * spacing
@@ -200,10 +200,10 @@ def _airway(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
     thick = np.bincount(around[walls & _thick(mask, spacing)], minlength=count + 1)
     is_airy = (areas <= AIRWAY_AREA) & (thick >= SHALLOW * walled)
     is_airy[0] = False
-    pieces, pieces_count = label(np.asfortranarray(is_airy[labels]))
+    pieces, sizes = label(np.asfortranarray(is_airy[labels]))
     is_deep = (is_airy & (thick >= DEEP * walled))[labels]
     is_airway = [False]
-    for piece, block in enumerate(images.find_objects(pieces, pieces_count), 1):
+    for piece, block in enumerate(images.find_objects(pieces, len(sizes) - 1), 1):
         levels = (is_deep[block] & (pieces[block] == piece)).any(axis=(0, 1))
         is_airway.append(bool(np.count_nonzero(levels) * spacing[2] >= AIRWAY_LENGTH))
     return chosen(np.array(is_airway), pieces)

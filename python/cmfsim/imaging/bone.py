@@ -1,5 +1,6 @@
 """Bone with the hollows that it encloses, teeth and metal."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,6 @@ from cmfsim.imaging.morphology import (
     grown,
     label,
     resampled_to,
-    sizes_of,
     watershed,
 )
 from cmfsim.imaging.options import SegmentOptions
@@ -90,8 +90,10 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
     solid &= under > options.least_skin
     solid, findings = _without_islands(solid, work, options)
-    cavity = _cranial_cavity(solid, skin, work)
-    mask = _enclosed(hu, solid, cavity, under, work=work, options=options)
+    with ThreadPoolExecutor(1) as beside:
+        walls = beside.submit(_walls, hu, solid, under, work, options)
+        cavity = _cranial_cavity(solid, skin, work)
+        mask = _enclosed(walls.result(), solid, cavity, under, work=work, options=options)
     surface = hu
     if options.bone_threshold is None:
         surface, mask = at_half_height(hu, mask, threshold, BONE_SCALE, work.spacing)
@@ -106,13 +108,13 @@ def bone_level(bone: Bone, options: SegmentOptions) -> Volume:
 def _without_islands(
     solid: Mask, work: Working, options: SegmentOptions
 ) -> tuple[Mask, list[Finding]]:
-    labels, count = label(solid, corners=True)
-    if not count:
+    labels, sizes = label(solid, corners=True)
+    if len(sizes) == 1:
         raise ImageInputError(
             f"no bone above {options.least_bone:g} HU inside the skin: check that this is a CT "
             "in HU; if it is not, set bone_threshold"
         )
-    volumes = sizes_of(labels, count) * float(np.prod(work.spacing))
+    volumes = sizes * float(np.prod(work.spacing))
     kept = volumes > min(options.island, float(volumes.max()) - 1e-9)
     dropped = float(volumes[~kept].sum())
     kept_mask = chosen(kept, labels)
@@ -121,8 +123,8 @@ def _without_islands(
         findings.append(
             Finding.note(
                 "bone-islands",
-                f"{count - np.count_nonzero(kept)} pieces of bone below {options.island:g} mm³ "
-                f"each, {dropped / 1000.0:.1f} cm³ together, were dropped",
+                f"{len(sizes) - 1 - np.count_nonzero(kept)} pieces of bone below "
+                f"{options.island:g} mm³ each, {dropped / 1000.0:.1f} cm³ together, were dropped",
                 where="bone",
                 why="they are thin bone, calcified vessels or noise, and are treated as soft "
                 "tissue",
@@ -144,11 +146,10 @@ def _cranial_cavity(solid: Mask, skin: Skin, work: Working) -> Mask | None:
     rim[1:-1, 1:-1, 1:-1] = False
     sealed = closed(wide, 4.0, steps) | (rim & head)
     room = depth(np.asfortranarray(~sealed), steps)
-    labels, count = label(room > CAVITY_RADIUS)
-    if count < 2:
+    labels, sizes = label(room > CAVITY_RADIUS)
+    if len(sizes) < 3:
         return None
     outer = np.unique(labels[~head & (labels > 0)])
-    sizes = sizes_of(labels, count)
     sizes[outer] = 0
     brain = int(np.argmax(sizes))
     if not sizes[brain] or not len(outer):
@@ -177,8 +178,15 @@ def _enclosed_by_skull(cavity: Mask, wall: Mask) -> bool:
     return bounded >= LEAST_BOUNDED * int(np.count_nonzero(rim))
 
 
+def _walls(hu: Volume, solid: Mask, under: Volume, work: Working, options: SegmentOptions) -> Mask:
+    """Bone and what is partly bone, closed: the walls of hollows."""
+    seal = options.least_bone - (1.0 - SEAL_PART) * (options.least_bone - SOFT)
+    walls = solid | ((hu > seal) & (under > 2.0 * options.least_skin))
+    return closed(walls, options.closing, work.spacing)
+
+
 def _enclosed(
-    hu: Volume,
+    walls: Mask,
     solid: Mask,
     cavity: Mask | None,
     under: Volume,
@@ -187,14 +195,10 @@ def _enclosed(
     options: SegmentOptions,
 ) -> Mask:
     """Bone with marrow, sinuses and the cranial cavity."""
-    seal = options.least_bone - (1.0 - SEAL_PART) * (options.least_bone - SOFT)
-    walls = solid | ((hu > seal) & (under > 2.0 * options.least_skin))
-    walls = closed(walls, options.closing, work.spacing)
     if cavity is not None:
-        walls |= cavity
-    labels, count = label(~walls)
-    sizes = sizes_of(labels, count)
-    outer = np.zeros(count + 1, dtype=bool)
+        walls = walls | cavity
+    labels, sizes = label(~walls)
+    outer = np.zeros(len(sizes), dtype=bool)
     outer[labels.T[under.T < 0.0]] = True
     if not outer[1:].any():
         outer[np.argmax(sizes)] = True

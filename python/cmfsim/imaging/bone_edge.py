@@ -5,6 +5,8 @@ for compact bone, and makes it thicker all round by a third of a voxel. Half the
 is where the surface is, whatever the blur (Spoor, Zonneveld & Macho 1993).
 """
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,8 @@ BLUR = 2.0
 HIGHEST = 0.5 * (SOFT + 1400.0)
 # Values are looked up this far apart along a line, voxels.
 SAMPLE = 0.5
+# Number of distances that are looked up at a time.
+THREADS = 2
 
 
 def at_half_height(
@@ -50,11 +54,16 @@ def at_half_height(
     inwards = gradient / np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
     own = values[voxels]
     densest = own.copy()
-    for far in np.arange(SAMPLE, BLUR + 0.5 * SAMPLE, SAMPLE):
+    sampled = ndimage().map_coordinates
+
+    def values_at(far: float) -> NDArray[np.float32]:
         places = index + inwards * (far * spacing.max() / spacing)[:, None]
-        np.maximum(
-            densest, ndimage().map_coordinates(hu, places, order=1, mode="nearest"), out=densest
-        )
+        found: NDArray[np.float32] = sampled(hu, places, order=1, mode="nearest")
+        return found
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        for found in pool.map(values_at, np.arange(SAMPLE, BLUR + 0.5 * SAMPLE, SAMPLE)):
+            np.maximum(densest, found, out=densest)
     half = np.clip(0.5 * (SOFT + densest), threshold, max(HIGHEST, threshold))
     lowered = hu.copy(order="F")
     lowered.T.reshape(-1)[voxels] = own - (half - np.float32(threshold)).astype(np.float32)

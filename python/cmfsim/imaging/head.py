@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +15,9 @@ from cmfsim.imaging.bone import Bone, bone_level, find_bone, teeth_level
 from cmfsim.imaging.coverage import view_findings
 from cmfsim.imaging.cupping import without_cupping
 from cmfsim.imaging.intensity import weak_bone
-from cmfsim.imaging.jaw import part_jaws
+from cmfsim.imaging.jaw import Jaws, part_jaws
 from cmfsim.imaging.metal import find_metal, metal_within
-from cmfsim.imaging.morphology import Mask
+from cmfsim.imaging.morphology import Mask, Volume
 from cmfsim.imaging.noise import without_noise
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skin import Skin, find_skin
@@ -32,6 +32,8 @@ __all__ = ["segment_head"]
 
 _LOG = logging.getLogger(__name__)
 
+# Number of things found in parallel with others.
+THREADS = 2
 # A child's face in a narrow image is larger than this, cm³.
 LEAST_HEAD = 250.0
 
@@ -89,18 +91,20 @@ def segment_head(
     all_findings: list[Finding] = [*findings, *cupping]
     say("metal")
     metal = find_metal(work, options)
-    say("skin")
-    skin = find_skin(work, metal, options)
-    _check_head(work, skin.mask)
-    say("bone")
-    # The couch and the air around the head need no more work, here or later.
-    work, metal = work.part(skin.box), metal_within(metal, skin.box)
-    smooth, noisy = without_noise(metal.hu)
-    metal = replace(metal, hu=smooth)
-    bone = find_bone(work, metal, skin, options)
-    with ThreadPoolExecutor(1) as beside:
+    with ThreadPoolExecutor(THREADS) as beside:
+        say("skin")
+        skin = find_skin(work, metal, options, beside)
+        _check_head(work, skin.mask)
+        say("bone")
+        # The couch and the air around the head need no more work, here or later.
+        work, metal = work.part(skin.box), metal_within(metal, skin.box)
+        smooth, noisy = without_noise(metal.hu)
+        metal = replace(metal, hu=smooth)
+        bone = find_bone(work, metal, skin, options)
+        # Where the bone is and which of it is the jaw are found without each other.
+        level = beside.submit(bone_level, bone, options)
         noticed = beside.submit(_noticed, work, skin, bone, options)
-        bones, teeth, jaws = _bones(work, bone, skin, points, options=options, say=say)
+        bones, teeth, jaws = _bones(work, bone, skin, points, level, options=options, say=say)
         say("air")
         hollow = air_level(work, skin, bone, options)
         all_findings += [
@@ -129,24 +133,27 @@ def _bones(
     bone: Bone,
     skin: Skin,
     points: Mapping[str, Floats] | None,
+    bone_values: "Future[Volume]",
     *,
     options: SegmentOptions,
     say: Progress,
 ) -> tuple[dict[str, ImageData], ImageData | None, Sequence[Finding]]:
     """The levels of bones and teeth, and the findings on how the jaws were separated."""
+    if options.part_jaws:
+        say("jaw")
+        jaws = part_jaws(work, bone, points)
+    else:
+        jaws = Jaws(None, None, None, ())
     # A smoothed rim may not carry bone past the skin.
-    level = np.minimum(bone_level(bone, options), skin.level)
-    if not options.part_jaws:
-        return {"skull": work.image(level)}, None, ()
-    say("jaw")
-    jaws = part_jaws(work, bone, points)
+    level = np.minimum(bone_values.result(), skin.level)
     parts = {"skull": level}
     if jaws.side is not None:
         parts = {
             "cranium": np.minimum(level, -jaws.side),
             "mandible": np.minimum(level, jaws.side),
         }
-    bones = {name: work.image(part) for name, part in parts.items()}
+    with ThreadPoolExecutor(THREADS) as pool:
+        bones = dict(zip(parts, pool.map(work.image, parts.values()), strict=True))
     dense = teeth_level(bone, work, jaws.occlusal_height)
     return bones, None if dense is None else work.image(dense), jaws.findings
 

@@ -151,9 +151,9 @@ def _touching(mask: Mask, other: Mask) -> Mask:
     """The pieces of a mask that a face joins to another mask."""
     if not mask.any():
         return mask
-    labels, count = label(mask)
+    labels, sizes = label(mask)
     near = ndimage().binary_dilation(other)
-    touches = np.zeros(count + 1, dtype=bool)
+    touches = np.zeros(len(sizes), dtype=bool)
     touches[np.unique(labels[near & mask])] = True
     touches[0] = False
     return touches[labels]

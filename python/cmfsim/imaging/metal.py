@@ -17,7 +17,6 @@ from cmfsim.imaging.morphology import (
     label,
     opened,
     simpleitk,
-    sizes_of,
 )
 from cmfsim.imaging.options import METAL, SegmentOptions
 from cmfsim.imaging.working_grid import Working
@@ -97,8 +96,8 @@ def find_metal(work: Working, options: SegmentOptions) -> Metal:
     nothing = Metal(None, slice(0, 0), work.hu, noticed)
     if np.count_nonzero(bright) * volume < LEAST_METAL:
         return nothing
-    labels, count = label(bright, corners=True)
-    large = sizes_of(labels, count) * volume >= LEAST_METAL
+    labels, sizes = label(bright, corners=True)
+    large = sizes * volume >= LEAST_METAL
     if not large.any():
         return nothing
     mask: Mask = large[labels]
@@ -229,8 +228,8 @@ def without_streaks(
     if bone:
         near = depth(np.asfortranarray(metal.mask[:, :, metal.layers]), spacing)
         rest &= (near < -NEAR_METAL) & (near > -FAR_FROM_METAL)
-    labels, count = label(rest, corners=True)
-    farthest = np.zeros(count + 1)
+    labels, sizes = label(rest, corners=True)
+    farthest = np.zeros(len(sizes))
     np.maximum.at(farthest, labels[rest], -around[rest])
     cleaned[:, :, metal.layers] &= ~((farthest > reach)[labels] & rest)
     return cleaned

@@ -36,7 +36,6 @@ __all__ = [
     "shrunk",
     "simpleitk",
     "simplex",
-    "sizes_of",
     "smoothed",
     "sparse",
     "watershed",
@@ -202,30 +201,22 @@ def grown(mask: Mask) -> Mask:
     return wide
 
 
-def label(mask: Mask, *, corners: bool = False) -> tuple[NDArray[np.int32], int]:
-    """Connected pieces numbered from 1, and how many; joined over faces, or corners too."""
-    scipy = ndimage()
-    structure = scipy.generate_binary_structure(3, 3) if corners else None
-    # scipy walks C order: the transposed view has it.
-    labels = np.empty(mask.T.shape, dtype=np.int32)
-    count = scipy.label(mask.T, structure, output=labels)
-    return labels.T, int(count)
+def label(mask: Mask, *, corners: bool = False) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+    """Connected pieces numbered from 1, and how many voxels each has, that of 0 given as 0.
 
-
-def sizes_of(labels: NDArray[np.int32], count: int) -> NDArray[np.intp]:
-    """How many voxels each label has; that of 0 is given as 0."""
-    sizes = np.zeros(count + 1, dtype=np.intp)
-    # Counting makes long integers of the labels: of a layer at a time they stay in the cache.
-    for layer in labels.T:
-        sizes += np.bincount(layer.ravel(), minlength=count + 1)
-    sizes[0] = 0
-    return sizes
+    They are joined over faces, or over corners too.
+    """
+    if not mask.size:
+        return np.zeros(mask.shape, dtype=np.int32), np.zeros(1, dtype=np.intp)
+    # The core walks C order: the transposed view has it.
+    labels, sizes = _core.label_image(mask.T, corners=corners)
+    return labels.T, sizes
 
 
 def chosen(wanted: Mask, labels: NDArray[np.int32]) -> Mask:
     """The voxels whose label is wanted; `wanted` has an entry for each label."""
     voxels = np.empty(labels.T.shape, dtype=bool)
-    # As `sizes_of`; every label has its entry, so that none is clipped.
+    # A layer at a time stays in the cache; every label has its entry, so that none is clipped.
     for layer, found in zip(labels.T, voxels, strict=True):
         np.take(wanted, layer, out=found, mode="clip")
     return voxels.T
@@ -233,17 +224,17 @@ def chosen(wanted: Mask, labels: NDArray[np.int32]) -> Mask:
 
 def largest(mask: Mask) -> Mask:
     """The largest connected piece."""
-    labels, count = label(mask)
-    if count <= 1:
+    labels, sizes = label(mask)
+    if len(sizes) <= 2:
         return mask
-    piece: Mask = labels == np.argmax(sizes_of(labels, count))
+    piece: Mask = labels == np.argmax(sizes)
     return piece
 
 
 def reached(mask: Mask, seeds: Mask) -> Mask:
     """The connected pieces of the mask that hold a seed."""
-    labels, count = label(mask)
-    hit = np.zeros(count + 1, dtype=bool)
+    labels, sizes = label(mask)
+    hit = np.zeros(len(sizes), dtype=bool)
     hit[labels.T[(seeds & mask).T]] = True
     hit[0] = False
     return chosen(hit, labels)
@@ -254,8 +245,8 @@ def filled(mask: Mask) -> Mask:
 
     The bottom and the top are no way out: trachea and neck are cut there.
     """
-    labels, count = label(~mask)
-    outside = np.zeros(count + 1, dtype=bool)
+    labels, sizes = label(~mask)
+    outside = np.zeros(len(sizes), dtype=bool)
     for face in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         outside[np.unique(face)] = True
     outside[0] = False

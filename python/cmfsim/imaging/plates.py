@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.imaging.morphology import Mask, Volume, label, ndimage, sizes_of, smoothed
+from cmfsim.imaging.morphology import Mask, Volume, label, ndimage, smoothed
 from cmfsim.values.checks import Floats
 
 __all__ = ["STEP", "find_plates"]
@@ -71,8 +71,8 @@ def find_plates(level: Volume, spacing: NDArray[np.float64], behind: int) -> lis
     part = np.concatenate([np.repeat(part[:, :, :1], below, axis=2), part], axis=2)
     skin = _skin(np.asfortranarray(part), spacing, behind - first, below)
     wall = ndimage().binary_dilation(skin.steps, np.ones((3, 3, 3), dtype=bool))
-    labels, count = label(np.asfortranarray(skin.shell & ~wall), corners=True)
-    areas = sizes_of(labels, count) * float(np.prod(spacing)) ** (2.0 / 3.0)
+    labels, sizes = label(np.asfortranarray(skin.shell & ~wall), corners=True)
+    areas = sizes * float(np.prod(spacing)) ** (2.0 / 3.0)
     blocks = ndimage().find_objects(labels)
     found = []
     for piece in np.flatnonzero((areas > LEAST_AREA) & (areas < MOST_AREA)):

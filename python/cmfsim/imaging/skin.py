@@ -1,5 +1,6 @@
 """The outer surface of the head: what lies with it taken away, what opens into it closed."""
 
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,6 @@ from cmfsim.imaging.morphology import (
     reached,
     resampled_to,
     shrunk,
-    sizes_of,
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.working_grid import Working, coarse_of
@@ -82,7 +82,8 @@ class Skin:
     ----------
     box : tuple of slice
         The block; outside it nothing is head.
-    level : (nx, ny, nz) float32
+    level_to_come : future of (nx, ny, nz) float32
+        Computed while other things are found by the mask.
     mask : (nx, ny, nz) bool
     hollow : (nx, ny, nz) bool
         Inside and below the skin's threshold.
@@ -90,14 +91,19 @@ class Skin:
     """
 
     box: Block
-    level: Volume
+    level_to_come: "Future[Volume]"
     mask: Mask
     hollow: Mask
     findings: tuple[Finding, ...]
 
+    @property
+    def level(self) -> Volume:
+        """The level, (nx, ny, nz) float32, once it is there."""
+        return self.level_to_come.result()
 
-def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
-    """The skin of the head on the working grid.
+
+def find_skin(work: Working, metal: Metal, options: SegmentOptions, beside: Executor) -> Skin:
+    """The skin of the head on the working grid; its level is left to the executor.
 
     Errors
     ------
@@ -126,15 +132,21 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions) -> Skin:
     if not solid.any():
         raise ImageInputError("the image contains no head above the skin's threshold")
     mask, hollow = _with_hollows(solid, work)
-    level = level_of(metal.hu, options.skin_threshold, SKIN_SCALE, mask)
-    # Where a rest was cut off in contact, the surface is that of the distance.
-    rim = ~hollow & ~shrunk(mask)
-    np.minimum(level, np.clip(near, -1.0, 1.0), out=level, where=rim)
+    level = beside.submit(_level, metal.hu, options.skin_threshold, near, mask, hollow)
     findings = []
     table = np.count_nonzero(removed | more) * float(np.prod(steps))
     if table > LARGEST_EAR / 5.0:
         findings.append(_rest_removed(table))
     return Skin(box, level, mask, hollow, tuple(findings))
+
+
+def _level(hu: Volume, threshold: float, near: Volume, mask: Mask, hollow: Mask) -> Volume:
+    """The level of the skin: by the image, or by the distance where a rest was cut off."""
+    level = level_of(hu, threshold, SKIN_SCALE, mask)
+    # Where a rest was cut off in contact, the surface is that of the distance.
+    rim = ~hollow & ~shrunk(mask)
+    np.minimum(level, np.clip(near, -1.0, 1.0), out=level, where=rim)
+    return level
 
 
 def _box(
@@ -272,12 +284,12 @@ def _standing_out(
     rest: Mask, around: Volume, spacing: NDArray[np.float64], volume: float, reach: float
 ) -> Mask:
     """The pieces above a volume (mm³) or farther out than a reach (mm)."""
-    labels, count = label(rest)
-    if not count:
+    labels, sizes = label(rest)
+    if len(sizes) == 1:
         return rest
-    large = sizes_of(labels, count) * float(np.prod(spacing)) > volume
+    large = sizes * float(np.prod(spacing)) > volume
     numbers = labels.T[rest.T]
-    farthest = np.full(count + 1, -np.inf)
+    farthest = np.full(len(sizes), -np.inf)
     np.maximum.at(farthest, numbers, -around.T[rest.T])
     large |= farthest > reach
     large[0] = False

@@ -1,5 +1,6 @@
 """The grid that the segmentation works on: the head's part of the image, no finer than needed."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,6 @@ from cmfsim.imaging.morphology import (
     label,
     opened,
     resampled_to,
-    sizes_of,
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.values.finding import Finding
@@ -122,21 +122,35 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     hu = np.empty(part.shape, dtype=np.float32, order="F")
     np.multiply(part, np.float32(scale.slope), out=hu, casting="unsafe")
     hu += np.float32(scale.offset)
-    if options.rescale is None:
-        check_is_ct(*coarse_of(hu, bins, MODALITY_STEP)[:2])
+    with ThreadPoolExecutor(1) as beside:
+        checked = None
+        if options.rescale is None:
+            checked = beside.submit(check_is_ct, *coarse_of(hu, bins, MODALITY_STEP)[:2])
+        hu, target, more = _on_target(hu, bins, options)
+        if checked is not None:
+            checked.result()
+    findings.extend(more)
     origin = image.origin + shift + low * bins
-    target = _target(bins, hu.shape, options)
-    if not np.array_equal(target, bins):
-        if (target > 1.01 * bins).any():
-            findings.append(_coarsened(target, options))
-        steps = np.floor((np.array(hu.shape) - 1) * bins / target + 1e-6)
-        shape = tuple(int(n) + 1 for n in steps)
-        hu = resampled_to(hu, bins, np.zeros(3), shape, target)
-    np.clip(hu, LOWEST, HIGHEST, out=hu)
     saturation = saturation_of(image.values, float(np.prod(spacing)), scale)
     if field is not None:
         field = field.scaled(spacing[:2], image.origin[:2])
     return Working(hu, target, origin, border, spacing, saturation, field), tuple(findings)
+
+
+def _on_target(
+    hu: Volume, bins: NDArray[np.float64], options: SegmentOptions
+) -> tuple[Volume, NDArray[np.float64], tuple[Finding, ...]]:
+    """HU in the range that matters on voxels of the working size, and a finding if coarse."""
+    findings: tuple[Finding, ...] = ()
+    target = _target(bins, hu.shape, options)
+    if not np.array_equal(target, bins):
+        if (target > 1.01 * bins).any():
+            findings = (_coarsened(target, options),)
+        steps = np.floor((np.array(hu.shape) - 1) * bins / target + 1e-6)
+        shape = tuple(int(n) + 1 for n in steps)
+        hu = resampled_to(hu, bins, np.zeros(3), shape, target)
+    np.clip(hu, LOWEST, HIGHEST, out=hu)
+    return hu, target, findings
 
 
 def coarse_of(
@@ -233,13 +247,12 @@ def _head_box(
     coarse, steps, _ = coarse_of(values, spacing, 4.0)
     tissue: Mask = np.asfortranarray(coarse * scale.slope + scale.offset > TISSUE)
     core = opened(tissue, OPENING, steps)
-    labels, count = label(core)
-    if not count:
+    labels, sizes = label(core)
+    if len(sizes) == 1:
         raise ImageInputError(
             f"the image contains nothing thicker than {2 * OPENING:g} mm above {TISSUE:g} HU: no "
             "head"
         )
-    sizes = sizes_of(labels, count)
     head = labels == np.argmax(sizes)
     # What the opening took (nose, ears, chin) lies within this of what it left.
     margin = 2.0 * OPENING + MARGIN

@@ -22,7 +22,7 @@ from cmfsim.io.metrics import (
 )
 from cmfsim.io.prediction_schema import PREDICTION, is_prediction_file
 from cmfsim.io.results import write_result
-from cmfsim.io.summaries import checked_file, read_summary, write_summary
+from cmfsim.io.summaries import checked_file, hashes_of, read_summary, write_summary
 from cmfsim.io.surfaces import write_surface
 from cmfsim.io.vtk import write_tets, write_triangles
 from cmfsim.values.prediction import MODELS, Prediction
@@ -257,14 +257,18 @@ def fill_prediction(
     write_result(fresh / names[3], result)
     parts = _write_parts(fresh, prediction)
     names.extend(f"{name}.vtp" for name in parts)
+    # While pictures are drawn.
+    sealed = hashes_of(fresh, names)
     if draw is not None:
-        names.extend(draw(fresh))
+        more = list(draw(fresh))
+        sealed |= hashes_of(fresh, more)
+        names.extend(more)
     summary = {"case_key": "", **prediction.summary, "parts": parts}
     own = [TIMINGS_FILE, PREDICTION_FILE]
     summary["files"] = [*names, *own]
     # Timings are for people: what comes after the prediction is added to them.
     write_timings(fresh, prediction.summary["timings"])
-    write_summary(fresh / PREDICTION_FILE, summary, sealed=names)
+    write_summary(fresh / PREDICTION_FILE, summary, sealed)
     return [*names, *own]
 
 

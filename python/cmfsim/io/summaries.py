@@ -10,7 +10,7 @@ import json
 import math
 import os
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -24,6 +24,7 @@ __all__ = [
     "file_of",
     "finding",
     "flag",
+    "hashes_of",
     "listing",
     "mapping",
     "number",
@@ -52,7 +53,9 @@ CHUNK = 1 << 20
 Check = Callable[[str, object], None]
 
 
-def write_summary(path: Path, values: Mapping[str, Any], sealed: Sequence[str] = ()) -> None:
+def write_summary(
+    path: Path, values: Mapping[str, Any], sealed: Mapping[str, str] | None = None
+) -> None:
     """Writes a summary with the hashes of files next to it, and its own.
 
     Parameters
@@ -60,15 +63,15 @@ def write_summary(path: Path, values: Mapping[str, Any], sealed: Sequence[str] =
     path : Path
     values : mapping
         Plain values.
-    sealed : sequence of str
-        Names of the files in the same folder that it answers for.
+    sealed : mapping of str to str, optional
+        The files in the same folder that it answers for: their `hashes_of`.
 
     Raises
     ------
     ValueError
         NaN or infinity among the values.
     """
-    content = {**values, "sha256": {name: _hash_of(path.parent / name) for name in sealed}}
+    content = {**values, "sha256": dict(sealed or {})}
     # As a reader will have it: tuples are lists, keys are texts.
     content = json.loads(json.dumps(content, allow_nan=False))
     content["digest"] = _digest(content)
@@ -169,6 +172,11 @@ def _digest(content: Mapping[str, Any]) -> str:
     except (ValueError, RecursionError) as error:  # 1e400 is read as infinity
         raise CaseInputError(f"contains a value that no summary contains ({error})") from error
     return hashlib.sha256(plain.encode()).hexdigest()
+
+
+def hashes_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """The SHA-256 of files in a folder, by their names."""
+    return {name: _hash_of(folder / name) for name in names}
 
 
 def _hash_of(path: Path) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
-from cmfsim.errors import MeshInputError, third_party
+from cmfsim.errors import MeshInputError
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats, as_number, as_point, as_positive
 from cmfsim.values.finding import Finding
@@ -155,7 +155,6 @@ def _without_hollows(
     level: Levels, bone: Levels, grid: ImageData, region: TissueRegion
 ) -> Iterator[Finding]:
     """Takes from `level` what only openings narrower than a foramen join to the outer tissue."""
-    ndimage = third_party("scipy.ndimage", "tissue is told from hollows", "imaging", MeshInputError)
     sx, sy, sz = (float(s) for s in grid.spacing)
     spacing = (sx, sy, sz)
     tissue: Mask = level > 0.0
@@ -167,10 +166,10 @@ def _without_hollows(
     # roomy, so that the way along the skin stays open whatever its thickness.
     shallow = grid.values < 1.0
     open_tissue = tissue & (~closed | shallow)
-    labels, count = ndimage.label(open_tissue)
-    if count == 0:
+    labels, sizes = _core.label_image(open_tissue)
+    if len(sizes) == 1:
         return
-    touches = np.zeros(count + 1, dtype=bool)
+    touches = np.zeros(len(sizes), dtype=bool)
     touches[labels[open_tissue & shallow]] = True
     touches[0] = False
     hollow: Mask = open_tissue & ~touches[labels]

@@ -25,7 +25,14 @@ from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.tissue_data import MIXINGS, TissueData
 
-__all__ = ["INSIDE_TESTS", "Mixture", "MuscleVolume", "equivalent_material"]
+__all__ = [
+    "INSIDE_TESTS",
+    "Mixture",
+    "MuscleVolume",
+    "PreparedMuscles",
+    "equivalent_material",
+    "prepared_muscles",
+]
 
 INSIDE_TESTS = ("winding", "normal")
 # Fraction of a closed muscle that may be outside the mesh before a finding reports it.
@@ -40,6 +47,42 @@ class HasMuscles(Protocol):
     @property
     def muscles(self) -> Sequence[MuscleSurface]:
         """The muscles."""
+
+
+# What muscles are given as.
+Muscles = HasMuscles | Sequence[MuscleSurface | SurfaceData | Surface]
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedMuscles:
+    """Muscles with what is found on them before a mesh is known.
+
+    Attributes
+    ----------
+    named : mapping of str to MuscleSurface, SurfaceData or Surface
+    ready : sequence of (Surface, MuscleFibres)
+        Of each, in the same order.
+    """
+
+    named: Mapping[str, MuscleSurface | SurfaceData | Surface]
+    ready: Sequence[tuple[Surface, MuscleFibres]]
+
+
+def prepared_muscles(muscles: Muscles) -> PreparedMuscles:
+    """The muscles with their search trees and fibres, to be sampled in a mesh later.
+
+    Parameters
+    ----------
+    muscles : Musculature, morphed template, or sequence of MuscleSurface, SurfaceData or Surface
+
+    Raises
+    ------
+    MeshError
+        (also `ValueError`) As `equivalent_material`.
+    """
+    named = _named(muscles)
+    with ThreadPoolExecutor() as pool:  # most of the work is the core's, without the GIL
+        return PreparedMuscles(named, tuple(pool.map(_ready, named, named.values())))
 
 
 @dataclass(frozen=True)
@@ -144,7 +187,7 @@ class Mixture:
 
 def equivalent_material(
     mesh: TetMesh,
-    muscles: HasMuscles | Sequence[MuscleSurface | SurfaceData | Surface],
+    muscles: Muscles | PreparedMuscles,
     *,
     preset: str = "kim2010",
     samples: int = 64,
@@ -168,7 +211,7 @@ def equivalent_material(
     mesh : TetMesh
     muscles : Musculature, morphed template, or sequence of MuscleSurface, SurfaceData or Surface
         Without a name they are called "muscle_0", "muscle_1", ... Without any muscle, the tissue is
-        homogeneous fat, with a finding.
+        homogeneous fat, with a finding. Also the result of `prepared_muscles`.
     preset : str
         One of `PRESETS`: constants of fat and muscle (Table 1).
     samples : int
@@ -221,10 +264,13 @@ def equivalent_material(
     given = TissueModuli() if moduli is None else moduli
     check_instance("moduli", given, TissueModuli)
     start = time.perf_counter()
-    named = _named(muscles)
-    check_muscle_names(given, list(named))
-    with ThreadPoolExecutor() as pool:  # most of the work is the core's, without the GIL
-        ready = list(pool.map(_ready, named, named.values()))
+    if isinstance(muscles, PreparedMuscles):
+        prepared = muscles
+        check_muscle_names(given, list(prepared.named))
+    else:
+        check_muscle_names(given, list(_named(muscles)))
+        prepared = prepared_muscles(muscles)
+    named, ready = prepared.named, prepared.ready
     surfaces_done = time.perf_counter()
     shares = _core.sample_muscles(mesh, ready, samples=samples, seed=seed, inside=inside)
     tissue_start = time.perf_counter()
@@ -299,9 +345,7 @@ def _report(mixture: Mixture, mesh: TetMesh) -> None:
     _log.info("muscle in %d of %d tets, %d points", held, mesh.n_tets, points)
 
 
-def _named(
-    muscles: HasMuscles | Sequence[MuscleSurface | SurfaceData | Surface],
-) -> dict[str, MuscleSurface | SurfaceData | Surface]:
+def _named(muscles: Muscles) -> dict[str, MuscleSurface | SurfaceData | Surface]:
     """The muscles by their names, which differ."""
     named: dict[str, MuscleSurface | SurfaceData | Surface] = {}
     listed = getattr(muscles, "muscles", muscles)
@@ -332,16 +376,12 @@ def _ready(
     """The surface and the fibres of a muscle, ready for the core."""
     try:
         if isinstance(muscle, MuscleSurface):
-            surface = _surface(muscle.surface)
+            surface = muscle.surface.searched
             return surface, MuscleFibres(surface, muscle.kind, muscle.boxes, muscle.course)
-        surface = muscle if isinstance(muscle, Surface) else _surface(muscle)
+        surface = muscle if isinstance(muscle, Surface) else muscle.searched
         return surface, MuscleFibres(surface)
     except MeshError as error:
         raise MeshInputError(f"muscle {name!r}: {error}") from error
-
-
-def _surface(data: SurfaceData) -> Surface:
-    return Surface(data.vertices, data.triangles, crease_angle=data.crease_angle)
 
 
 def _findings(

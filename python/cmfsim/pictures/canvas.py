@@ -63,6 +63,8 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
 MARGIN = 1.04
 TEXT_SIZE = 9
 LEGEND_ROW = 26  # pixels
+# Of zlib: level 6 takes three times as long for files that are 4 to 11 % smaller.
+PNG_LEVEL = 4
 # Mean width of a letter of this size, pixels, as VTK draws them: the widest of many lines.
 LETTER = 9.5
 # What draws nothing into a small window. Where OpenGL is missing VTK ends the process instead of
@@ -309,7 +311,7 @@ def _png(image: NDArray[np.uint8]) -> bytes:
     return (
         b"\x89PNG\r\n\x1a\n"
         + chunk(b"IHDR", head)
-        + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6))
+        + chunk(b"IDAT", zlib.compress(rows.tobytes(), PNG_LEVEL))
         + chunk(b"IEND", b"")
     )
 

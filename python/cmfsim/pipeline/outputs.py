@@ -37,7 +37,7 @@ from cmfsim.io.predictions import (
 )
 from cmfsim.io.skin_errors import skin_errors_file, write_skin_errors
 from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
-from cmfsim.io.summaries import write_summary
+from cmfsim.io.summaries import hashes_of, write_summary
 from cmfsim.pictures import (
     Picture,
     band_picture,
@@ -47,12 +47,13 @@ from cmfsim.pictures import (
     plan_picture,
     prediction_picture,
 )
+from cmfsim.pipeline.building.stages import OnMuscles
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.painting import Painter
 from cmfsim.pipeline.planning_page import PAGE_FILE, page_state
 from cmfsim.report import Document, Figure, case_document, render_page
+from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.musculature import Musculature
-from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import joined_surface
@@ -68,10 +69,8 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-# Predictions, or what gives them and calls a function with the patient before it solves any.
-Predictions = (
-    Iterable[Prediction] | Callable[[Callable[[PatientModel], None]], Iterable[Prediction]]
-)
+# Predictions, or what gives them and calls a function with the muscles before it solves any.
+Predictions = Iterable[Prediction] | Callable[[OnMuscles], Iterable[Prediction]]
 
 # Pictures of a case's report, in the folder of its prediction and in its own.
 PREDICTION_PICTURES = ("prediction", "band", "plan", "muscles")
@@ -171,13 +170,13 @@ class _Drawing:
         """The folder of a model's prediction."""
         return "" if len(self._models) == 1 else model
 
-    def begin_early(self, patient: PatientModel) -> None:
-        """Begins the muscles of the first model that shows them: they need no solution."""
+    def begin_early(self, muscles: Musculature, segments: Sequence[BoneSegment]) -> None:
+        """Begins the muscles of the first model that shows them, once: they need no solution."""
         model = next((m for m in self._models if m.startswith("M") and self._wanted(m)), None)
-        if model is not None and patient.muscles is not None:
+        if model is not None and model not in self._early:
             folder = self._fresh / self.place(model)
             folder.mkdir(exist_ok=True)
-            picture = _muscles_picture(patient.muscles, patient)
+            picture = _muscles_picture(muscles, segments)
             self._early[model] = self._painter.begin(picture, folder / MUSCLES)
 
     def begin(self, prediction: Prediction) -> dict[str, "Future[None]"]:
@@ -214,7 +213,7 @@ def write_results(
         The case's output folder: predictions of several models lie in a folder for each.
     predictions : iterable of Prediction, or callable
         Written one by one, as each is solved. A callable gives them; it takes a function to be
-        called with the patient before any is solved, which begins the picture of the muscles.
+        called with the muscles before any is solved, which begins their picture.
     models : sequence of str
         That were asked for, whether or not all could be predicted.
     stage : callable
@@ -262,7 +261,7 @@ def write_results(
         if evaluation is not None and compared is not None:
             values = {**compared, "files": written.files}
             sealed = [n for n in written.files if n not in {EVALUATION_FILE, REPORT_FILE}]
-            write_summary(fresh / EVALUATION_FILE, values, sealed)
+            write_summary(fresh / EVALUATION_FILE, values, hashes_of(fresh, sealed))
         own = [written.report] if written.report is not None else []
         of_models = [f"{w.place}/{n}".lstrip("/") for w in written.predictions for n in w.files]
         return list(dict.fromkeys([*of_models, *written.files, *own]))
@@ -365,18 +364,18 @@ def _drawn(begun: Mapping[str, "Future[None]"]) -> list[str]:
 
 def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Picture]]:
     if prediction.muscles is not None:
-        yield MUSCLES, _muscles_picture(prediction.muscles, prediction.patient)
+        yield MUSCLES, _muscles_picture(prediction.muscles, prediction.patient.segments)
     yield "plan.png", plan_picture(prediction)
     yield "prediction.png", prediction_picture(prediction)
     if prediction.band is not None:
         yield "band.png", band_picture(prediction)
 
 
-def _muscles_picture(muscles: Musculature, patient: PatientModel) -> Picture:
+def _muscles_picture(muscles: Musculature, segments: Sequence[BoneSegment]) -> Picture:
     return partial(
         picture_muscles,
         musculature=Musculature(muscles.muscles),
-        skull=joined_surface([segment.surface for segment in patient.segments]),
+        skull=joined_surface([segment.surface for segment in segments]),
     )
 
 

@@ -1,7 +1,7 @@
 """One case from its files to the predicted face."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
@@ -9,7 +9,7 @@ from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.building.case_model import model_of
 from cmfsim.pipeline.building.inputs import case_key, input_hashes, plan_key
 from cmfsim.pipeline.building.postoperative import Postoperative
-from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.building.stages import BuildOptions, OnMuscles
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.band_options import BandOptions
@@ -87,7 +87,7 @@ def predict_models(  # noqa: PLR0913 (options by name)
     after: Postoperative | None = None,
     failed: dict[str, CmfsimError] | None = None,
     on_findings: OnFindings | None = None,
-    on_patient: Callable[[PatientModel], None] | None = None,
+    on_muscles: OnMuscles | None = None,
     band: BandOptions | None = None,
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, which is built once.
@@ -110,8 +110,9 @@ def predict_models(  # noqa: PLR0913 (options by name)
         recorded here with its error, and the others continue.
     on_findings : callable, optional
         Called with new findings of each stage and each solution.
-    on_patient : callable, optional
-        Called with the patient once it is built, before any model is solved.
+    on_muscles : callable, optional
+        Called with the muscles and the segments of bone once both are known, and perhaps again
+        before any model is solved.
     band : BandOptions, optional
         As for `predict`.
 
@@ -138,7 +139,7 @@ def predict_models(  # noqa: PLR0913 (options by name)
         anatomy=anatomy,
         after=after,
         on_findings=on_findings,
-        on_patient=on_patient,
+        on_muscles=on_muscles,
     )
     yield from predictions_of(as_case(case), named_models(models), options, failed, band=band)
 
@@ -156,8 +157,8 @@ def predictions_of(
         # Before a case is built for a minute.
         band.check(models)
     patient = build_patient(case, models, options)
-    if options.on_patient is not None:
-        options.on_patient(patient)
+    if options.on_muscles is not None and patient.muscles is not None:
+        options.on_muscles(patient.muscles, patient.segments)
     known = set(patient.findings)
     for model in models:
         if options.progress is not None:

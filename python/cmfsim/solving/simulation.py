@@ -14,7 +14,6 @@ from cmfsim._core import (
     MassTensors,
     Solution,
     StaticSolver,
-    Surface,
     SurfaceMotion,
     TetMesh,
     Tissue,
@@ -22,7 +21,7 @@ from cmfsim._core import (
 )
 from cmfsim.values.finding import Finding
 from cmfsim.values.scene import Scene, SceneResult
-from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface
 from cmfsim.values.tissue_data import TissueData
 
 __all__ = ["scene_plan", "scene_solver", "solve_scene", "solved_scene"]
@@ -75,14 +74,14 @@ def _boundary(scene: Scene) -> Boundary:
         one_sided["touching"] = [(touch.nodes, touch.triangles) for touch in scene.touching]
     if scene.obstacles:
         one_sided["obstacles"] = [
-            (obstacle.nodes, obstacle.segment, _surface(obstacle.surface))
+            (obstacle.nodes, obstacle.segment, obstacle.surface.searched)
             for obstacle in scene.obstacles
         ]
     return Boundary(
         fixed=scene.fixed,
         joined={name: s.joined for name, s in segments if np.size(s.joined)},
         sliding=sliding,
-        contact={name: _surface(s.contact) for name, s in segments if s.contact is not None},
+        contact={name: s.contact.searched for name, s in segments if s.contact is not None},
         gap={name: s.gap for name, s in segments if name in sliding},
         conflicts=scene.conflicts,
         **one_sided,
@@ -113,7 +112,7 @@ def scene_plan(scene: Scene) -> dict[str, NDArray[np.float64] | SurfaceMotion]:
     plan: dict[str, NDArray[np.float64] | SurfaceMotion] = {}
     for name, motion in scene.plan.items():
         if isinstance(motion, MovedSurface):
-            plan[name] = SurfaceMotion(_surface(motion.surface), motion.moved_vertices)
+            plan[name] = SurfaceMotion(motion.surface.searched, motion.moved_vertices)
         else:
             plan[name] = motion
     return plan
@@ -303,7 +302,3 @@ def _tissue(data: TissueData) -> Tissue:
     if data.kind == "stiffness":
         return Tissue.from_stiffness(arrays["stiffness"])
     return Tissue.preset(data.preset, arrays["fraction"], arrays.get("fibre"), mixing=data.mixing)
-
-
-def _surface(data: SurfaceData) -> Surface:
-    return Surface(data.vertices, data.triangles, crease_angle=data.crease_angle)

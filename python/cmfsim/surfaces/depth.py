@@ -33,7 +33,7 @@ def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
     places = as_rows("points", points, 3)
     depth = np.full(len(places), np.inf)
     for bone in bones:
-        closest, _, _ = Surface(bone.vertices, bone.triangles).closest(places)
+        closest, _, _ = bone.searched.closest(places)
         depth = np.minimum(depth, np.linalg.norm(closest - places, axis=1))
     if len(depth) and not np.isfinite(depth).all():
         raise MeshInputError(

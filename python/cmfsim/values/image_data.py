@@ -109,24 +109,33 @@ class ImageData(Frozen):
         """
         places = as_rows("points", points, 3)
         found = np.empty(len(places))
+        contiguous = self.values.flags.c_contiguous or self.values.flags.f_contiguous
+        values = self.values if contiguous else np.ascontiguousarray(self.values)
+        flat = values.ravel(order="K")
+        # What one step along each axis adds to a voxel's number in the order of memory.
+        steps = np.array(values.strides) // values.itemsize
         # Some thousand points at a time: their weights stay in the cache.
         for begin in range(0, len(places), AT_A_TIME):
             part = slice(begin, begin + AT_A_TIME)
-            found[part] = self._trilinear(places[part])
+            found[part] = self._trilinear(places[part], flat, steps)
         return found
 
-    def _trilinear(self, points: Floats) -> Floats:
-        shape = np.array(self.values.shape)
-        place = np.clip((points - self.lowest) / self.spacing, 0.0, shape - 1.0)
-        low = np.minimum(place.astype(np.intp), np.maximum(shape - 2, 0))
-        part = place - low
-        high = np.minimum(low + 1, shape - 1)
-        # Along each axis: the voxels on both sides of a point, each with its weight.
-        sides = [
-            ((before, 1.0 - share), (after, share))
-            for before, after, share in zip(low.T, high.T, part.T, strict=True)
-        ]
-        total = np.zeros(len(place))
+    def _trilinear(self, points: Floats, flat: NDArray[Any], steps: NDArray[np.intp]) -> Floats:
+        # Along each axis: what both sides of a point add to a voxel's number, each with its weight.
+        sides = []
+        for axis, step in enumerate(steps):
+            last = self.values.shape[axis] - 1
+            place = points[:, axis] - self.lowest[axis]
+            place /= self.spacing[axis]
+            np.clip(place, 0.0, float(last), out=place)
+            low = np.minimum(place.astype(np.intp), max(last - 1, 0))
+            after = place - low
+            high = np.minimum(low + 1, last)
+            sides.append(((low * step, 1.0 - after), (high * step, after)))
+        total = np.zeros(len(points))
         for (k, w), (j, v), (i, u) in itertools.product(*reversed(sides)):
-            total += u * v * w * self.values[i, j, k]
+            part = u * v
+            part *= w
+            part *= flat.take(i + j + k)
+            total += part
         return total

@@ -1,11 +1,14 @@
 """Triangle surfaces, several as one, and surfaces before and after a motion."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, Indices, as_index_rows, as_number, as_rows
 from cmfsim.values.frozen import Frozen
@@ -44,6 +47,15 @@ class SurfaceData(Frozen):
         object.__setattr__(self, "vertices", places)
         object.__setattr__(self, "triangles", corners)
         object.__setattr__(self, "crease_angle", as_number("crease_angle", crease_angle))
+
+    @cached_property
+    def searched(self) -> Surface:
+        """The surface of the core, made once: its search tree takes longer than most searches."""
+        return Surface(self.vertices, self.triangles, crease_angle=self.crease_angle)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields alone: the core's surface stays where it was made."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 def joined_surface(surfaces: Sequence[SurfaceData]) -> SurfaceData:

@@ -333,3 +333,20 @@ def test_a_boundary_gives_back_what_it_was_given():
     assert boundary.gap["a"].tolist() == [0.1, 0.2]
     assert boundary.gap["c"] == "rest"
     assert boundary.gap["d"].tolist() == [0.0, 0.0]
+
+
+def test_pieces_have_scipys_numbers_in_any_order_of_memory() -> None:
+    ndimage = pytest.importorskip("scipy.ndimage", reason="needs scipy")
+    random = np.random.default_rng(5)
+    for share in (0.0, 0.1, 0.3, 0.6, 1.0):
+        mask = random.random((9, 12, 7)) < share
+        for corners in (False, True):
+            structure = ndimage.generate_binary_structure(3, 3 if corners else 1)
+            wanted, count = ndimage.label(mask, structure)
+            sizes = np.bincount(wanted.ravel(), minlength=count + 1)
+            sizes[0] = 0
+            for given in (mask, np.asfortranarray(mask), mask[:, ::-1][:, ::-1]):
+                labels, found = cmfsim._core.label_image(given, corners=corners)
+                assert labels.dtype == np.int32
+                assert np.array_equal(labels, wanted)
+                assert np.array_equal(found, sizes)

@@ -9,6 +9,7 @@ import cmfsim
 import meshes
 import real_heads
 from angles import angle_of_lines
+from cmfsim.muscles.equivalent import prepared_muscles
 
 # Table 1 of Kim et al. (2010): fat, then muscle along and across.
 FAT = (0.003, 0.46)
@@ -270,3 +271,12 @@ def test_open_atlas_muscles_are_bridged():
     spread = np.sqrt(inside.mean() * (1 - inside.mean()) / len(points)) * np.prod(high - low)
     volume = mixture.volumes["muscle_0"]
     assert volume.inside == pytest.approx(expected, abs=4.0 * np.hypot(spread, volume.error))
+
+
+def test_prepared_muscles_give_the_same_mixture():
+    muscles = [cuboid([1.2, 1.3, -1.0], [3.7, 3.1, 9.0]), cuboid([2.0, 0.5, 1.0], [5.0, 2.0, 4.0])]
+    given = cmfsim.equivalent_material(block(), muscles)
+    prepared = cmfsim.equivalent_material(block(), prepared_muscles(muscles))
+    assert np.array_equal(given.fraction, prepared.fraction)
+    assert np.array_equal(given.fibre, prepared.fibre)
+    assert list(given.volumes) == list(prepared.volumes)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, as_point
@@ -156,7 +155,7 @@ def _bearers(
     places = np.array([p for arch in arches.values() for p in (arch.tip, arch.left, arch.right)])
     distances = []
     for segment in segments:
-        closest, _, _ = Surface(segment.surface.vertices, segment.surface.triangles).closest(places)
+        closest, _, _ = segment.surface.searched.closest(places)
         distances.append(np.linalg.norm(closest - places, axis=1))
     nearest = np.argmin(distances, axis=0).reshape(len(arches), 3)
     bearers = {jaw: set(near.tolist()) for jaw, near in zip(arches, nearest, strict=True)}

@@ -124,7 +124,7 @@ def classify_nodes(  # noqa: PLR0913 (options by name)
     if not len(triangles):
         raise CaseInputError("the mesh has no boundary triangles")
     border = _Boundary(points, triangles)
-    surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
+    surfaces = [s.surface.searched for s in segments]
     nearest, near = _on_bones(border, surfaces, options)
     on_bone = nearest >= 0
     on_plane = _on_planes(border, anatomy, fixed_planes or {}, options)

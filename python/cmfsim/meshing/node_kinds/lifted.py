@@ -5,7 +5,6 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim._core import Surface
 from cmfsim.meshing.node_kinds.options import KindOptions
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import as_rows
@@ -62,10 +61,7 @@ def lifted_tissue(
     fixed = kinds.nodes("fixed")
     on_cranium = fixed[kinds.segment[fixed] == kinds.segments.index(CRANIUM)]
     places = as_rows("nodes", nodes, 3)[on_cranium]
-    found = {
-        name: Surface(surfaces[name].vertices, surfaces[name].triangles).closest(places)
-        for name in (MAXILLA, CRANIUM)
-    }
+    found = {name: surfaces[name].searched.closest(places) for name in (MAXILLA, CRANIUM)}
     closest, _, _ = found[MAXILLA]
     _, normals, _ = found[CRANIUM]
     near = np.linalg.norm(closest - places, axis=1) < reach

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import Surface
 from cmfsim.errors import third_party
 from cmfsim.meshing.node_kinds.arches import DentalArches
 from cmfsim.meshing.node_kinds.options import KindOptions
@@ -110,7 +109,7 @@ def _in_arch(
 
 
 def _on_sheet(points: Floats, sheet: SurfaceData) -> NDArray[np.bool_]:
-    closest, _, _ = Surface(sheet.vertices, sheet.triangles).closest(points)
+    closest, _, _ = sheet.searched.closest(points)
     near: NDArray[np.bool_] = np.linalg.norm(closest - points, axis=1) <= SHEET_DEPTH
     return near
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim._core import Surface, TetMesh
+from cmfsim._core import TetMesh
 from cmfsim.doctor import SizedMotion, check_motion_size
 from cmfsim.doctor.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
 from cmfsim.errors import CaseInputError
@@ -27,7 +27,7 @@ def misplaced(
     segments: tuple[BoneSegment, ...],
 ) -> list[Finding]:
     """Findings about landmarks that do not lie on the bones and the skin that were segmented."""
-    surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
+    surfaces = [s.surface.searched for s in segments]
     findings: list[Finding] = []
     for key, places in landmarks.items():
         where = case.where(f"landmarks.{key}")

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -179,7 +179,12 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         from cmfsim.pipeline.building.muscles import placed_muscles, with_muscles  # noqa: PLC0415
 
         placing = beside.submit(placed_muscles, case.name, case.muscles, head.skull, head.anatomy)
-        patient, mesh = _without_muscles(head, stages, kinds, options, tissue)
+
+        def show(bones: PlannedBones) -> None:
+            if options.on_muscles is not None and placing.done():
+                options.on_muscles(placing.result().muscles, bones.segments)
+
+        patient, mesh = _without_muscles(head, stages, kinds, options, tissue, show=show)
         stages.begin("placing and sampling the muscles")
         return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
 
@@ -190,10 +195,14 @@ def _without_muscles(
     kinds: KindOptions,
     options: BuildOptions,
     meshed: "Future[MeshedTissue]",
+    *,
+    show: Callable[[PlannedBones], None] = lambda _: None,
 ) -> tuple[PatientModel, TetMesh]:
     bones, procedures = _bones(head, stages, options.after)
     tissue = _tissue(head, stages, bones, kinds, meshed)
+    show(bones)
     nodes = nodes_of(head, stages, bones, tissue, kinds)
+    show(bones)
     return assembled(head, stages, bones, nodes, procedures), nodes.mesh
 
 

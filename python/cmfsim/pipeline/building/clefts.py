@@ -93,7 +93,7 @@ def cleft_tets(
     # A point is at most so much nearer to anything than the nearest corner of its tet.
     radius = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
     reach = width + float(radius.max())
-    surfaces = [Surface(s.surface.vertices, s.surface.triangles) for s in segments]
+    surfaces = [s.surface.searched for s in segments]
     about = [_least_at_corners(nodes, tets, surface, reach) - radius for surface in surfaces]
     names = [segment.name for segment in segments]
     for one in (i for i, name in enumerate(names) if name in moved):

@@ -217,7 +217,7 @@ def _obstacles(
     if arches is None:
         return []
     bearers = [segments[number] for number in sorted(arches.bearers[jaw])]
-    bones = [Surface(s.surface.vertices, s.surface.triangles) for s in bearers]
+    bones = [s.surface.searched for s in bearers]
     found = []
     for lip, region in regions.items():
         ids = region.nodes

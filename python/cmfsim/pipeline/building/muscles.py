@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 from cmfsim._core import TetMesh
 from cmfsim.errors import LandmarkInputError
-from cmfsim.muscles.equivalent import equivalent_material
+from cmfsim.muscles.equivalent import PreparedMuscles, equivalent_material, prepared_muscles
 from cmfsim.muscles.fitting import MuscleFit, fit_muscles
 from cmfsim.muscles.mixing import MODULI_CODES
 from cmfsim.muscles.template import MuscleTemplate
@@ -29,12 +29,15 @@ class PlacedMuscles:
     muscles : MorphedMusculature
         Where they are used: fitted, if that helps.
     fit : MuscleFit or None
+    prepared : PreparedMuscles
+        The same muscles with what a mesh is sampled by.
     seconds : mapping of str to float
         Of each step.
     """
 
     muscles: MorphedMusculature
     fit: MuscleFit | None
+    prepared: PreparedMuscles
     seconds: Mapping[str, float]
 
 
@@ -58,12 +61,16 @@ def placed_muscles(
     begun = time.perf_counter()
     muscles = MuscleTemplate.load(given.template).morph(skull, smoothing=given.smoothing)
     seconds = {"placing the muscles": time.perf_counter() - begun}
-    if not given.fit:
-        return PlacedMuscles(muscles, None, seconds)
-    fit = fit_muscles(muscles, anatomy)
-    seconds["fitting the muscles"] = fit.seconds
-    # A head in which muscles lie right already is left alone.
-    return PlacedMuscles(fit.musculature if fit.helps else muscles, fit, seconds)
+    fit = None
+    if given.fit:
+        fit = fit_muscles(muscles, anatomy)
+        seconds["fitting the muscles"] = fit.seconds
+        # A head in which muscles lie right already is left alone.
+        muscles = fit.musculature if fit.helps else muscles
+    begun = time.perf_counter()
+    prepared = prepared_muscles(muscles)
+    seconds["preparing the muscles"] = time.perf_counter() - begun
+    return PlacedMuscles(muscles, fit, prepared, seconds)
 
 
 def with_muscles(
@@ -113,13 +120,14 @@ def with_muscles(
         timings = dict(found.seconds)
     else:
         found = placed()
-        timings = {[*found.seconds][-1]: time.perf_counter() - begun}
+        step = "placing" if found.fit is None else "fitting"
+        timings = {f"{step} the muscles": time.perf_counter() - begun}
     muscles, fit = found.muscles, found.fit
     begun = time.perf_counter()
     scene = patient.scene
     mixture = equivalent_material(
         TetMesh(scene.nodes, scene.tets) if mesh is None else mesh,
-        muscles,
+        found.prepared,
         preset=given.preset,
         mixing=given.mixing,
         samples=given.samples,

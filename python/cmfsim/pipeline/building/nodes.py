@@ -1,5 +1,9 @@
 """The kind of each node of the soft tissue, and the remaining tets."""
 
+from concurrent.futures import ThreadPoolExecutor
+
+from cmfsim._core import TetMesh
+from cmfsim.io import Case
 from cmfsim.meshing import report_of_part
 from cmfsim.meshing.node_kinds import DentalArches, KindOptions, classify_nodes, lifted_tissue
 from cmfsim.pipeline.building.attached_bodies import held_part
@@ -12,6 +16,8 @@ from cmfsim.pipeline.building.parts import Head, Nodes, Tissue
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.pipeline.building.tissue_ends import end_findings
 from cmfsim.pipeline.building.tissue_mesh import end_planes
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NodeKinds
 
 __all__ = ["made_contacts", "nodes_of"]
 
@@ -21,7 +27,7 @@ def nodes_of(
 ) -> Nodes:
     """What the nodes of the tissue do: joined, sliding, fixed or free, with contact and lips."""
     case, anatomy, mesh, report = head.case, head.anatomy, tissue.mesh, tissue.report
-    moved = [*dict.fromkeys([*cut_segments(case), *bones.motions])]
+    moved = _moved(case, bones)
     contacts = tissue.contacts
     stages.add(contacts.findings)
     stages.begin("classifying nodes")
@@ -59,22 +65,36 @@ def nodes_of(
             segments=bones.segments,
         )
         kinds = lips.kinds
-    if mesh.n_tets < whole or lips.regions:
-        report = report_of_part(mesh, report)
-    found = end_findings(
+    with ThreadPoolExecutor(1) as beside:
+        counted = None
+        if mesh.n_tets < whole or lips.regions:
+            counted = beside.submit(report_of_part, mesh, report)
+        stages.add(_noticed(head, bones, tissue, mesh, kinds))
+        stages.drop_repeated()
+        lifted = lifted_tissue(mesh.nodes, kinds, bones.segments, moved, options)
+        report = report if counted is None else counted.result()
+    return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
+
+
+def _moved(case: Case, bones: PlannedBones) -> list[str]:
+    """The names of the segments that are cut or planned to move."""
+    return [*dict.fromkeys([*cut_segments(case), *bones.motions])]
+
+
+def _noticed(
+    head: Head, bones: PlannedBones, tissue: Tissue, mesh: TetMesh, kinds: NodeKinds
+) -> list[Finding]:
+    """Where the tissue ends next to bone that moves, and segments that hold none of it."""
+    ends = end_findings(
         mesh.nodes,
         mesh.boundary_triangles(),
         kinds,
-        anatomy,
+        head.anatomy,
         tissue.region,
         segments=bones.segments,
-        moved=moved,
+        moved=_moved(head.case, bones),
     )
-    stages.add(found)
-    stages.add(untouched(case, mesh, kinds, bones))
-    stages.drop_repeated()
-    lifted = lifted_tissue(mesh.nodes, kinds, bones.segments, moved, options)
-    return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
+    return [*ends, *untouched(head.case, mesh, kinds, bones)]
 
 
 def made_contacts(

@@ -1,16 +1,23 @@
 """The options of a build, and its stages as they run."""
 
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from cmfsim.pipeline.building.postoperative import Postoperative
-from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding, OnFindings
-from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import Progress, no_progress
 
-__all__ = ["BuildOptions", "Stages"]
+if TYPE_CHECKING:
+    # A case without muscles loads nothing of them.
+    from cmfsim.values.musculature import Musculature
+
+__all__ = ["BuildOptions", "OnMuscles", "Stages"]
+
+# What is called with the muscles of a patient and the segments of the bones.
+OnMuscles = Callable[["Musculature", Sequence[BoneSegment]], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,8 +38,9 @@ class BuildOptions:
         What `read_postoperative` gives, where it is known already.
     on_findings : callable or None
         Called with new findings at the end of each stage.
-    on_patient : callable or None
-        Called with the patient once it is built, before any model is solved.
+    on_muscles : callable or None
+        Called with the muscles and the segments of bone once both are known, and perhaps again
+        before any model is solved.
     """
 
     progress: Progress | None = None
@@ -41,7 +49,7 @@ class BuildOptions:
     anatomy: Anatomy | None = None
     after: Postoperative | None = None
     on_findings: OnFindings | None = None
-    on_patient: Callable[[PatientModel], None] | None = None
+    on_muscles: OnMuscles | None = None
 
 
 class Stages:

@@ -63,6 +63,11 @@ class HeadSurfaces:
         """Points on the skin; none without it."""
         return np.zeros((0, 3)) if self.skin is None else _points(self.skin)
 
+    def draw(self) -> None:
+        """Draws the points of all surfaces, which are kept."""
+        for points in (self.upper_points, self.lower_points, self.skin_points):
+            points.setflags(write=False)
+
 
 def detect(head: HeadSurfaces, pose: Pose, *, skin: bool = True) -> Detected:
     """The sites of a head that lies in a known pose: of cranium, mandible and, if asked, skin."""

@@ -1,6 +1,6 @@
 """The pose of a head of unknown place: its plane of symmetry, and the frame of an average head."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -195,19 +195,14 @@ def _fitted(
     upright = np.stack([left, np.cross(up, left), up])
     begin, turned = (points - centre) @ upright.T, normals @ upright.T
     starts = _starts(begin, average.vertices, average_size)
-    few = slice(None, None, 6)
-    tried = [
-        _similarity((begin[few], turned[few]), surface, start, FIRST_ROUNDS) for start in starts
-    ]
-    tried.sort(key=lambda result: result[0])
-    best = min(
-        (
-            _similarity((begin[few], turned[few]), surface, (linear, offset), ROUGH_ROUNDS)
-            for _, linear, offset in tried[:MOST_STARTS]
-        ),
-        key=lambda result: result[0],
-    )
-    rms, linear, offset = _similarity((begin, turned), surface, best[1:], FINE_ROUNDS)
+    few = begin[::6], turned[::6]
+    tried = _similarities(few, surface, starts, FIRST_ROUNDS)
+    tried.sort(key=lambda fit: fit.distance)
+    followed = [(fit.linear, fit.offset) for fit in tried[:MOST_STARTS]]
+    rough = _similarities(few, surface, followed, ROUGH_ROUNDS)
+    best = min(rough, key=lambda fit: fit.distance)
+    (fine,) = _similarities((begin, turned), surface, [(best.linear, best.offset)], FINE_ROUNDS)
+    rms, linear, offset = fine.distance, fine.linear, fine.offset
     scale = float(np.cbrt(np.linalg.det(linear)))
     residual = rms
     if residual > WORST_FIT:
@@ -292,7 +287,9 @@ def _planar_fit(source: Floats, target: Floats, weight: Floats) -> tuple[Floats,
 def distance_from(points: Floats, normals: Floats, template: SurfaceData) -> float:
     """How far points of a head lie from a template's bone after the best small similarity, mm."""
     surface = Surface(template.vertices, template.triangles)
-    return _similarity((points, normals), surface, (np.eye(3), np.zeros(3)), FINE_ROUNDS)[0]
+    start = np.eye(3), np.zeros(3)
+    (fit,) = _similarities((points, normals), surface, [start], FINE_ROUNDS)
+    return fit.distance
 
 
 def _starts(points: Floats, target: Floats, average_size: float) -> Iterator[tuple[Floats, Floats]]:
@@ -316,29 +313,68 @@ def _starts(points: Floats, target: Floats, average_size: float) -> Iterator[tup
                 yield linear, shift - linear @ middle
 
 
-def _similarity(
-    samples: Samples, surface: Surface, start: tuple[Floats, Floats], rounds: int
-) -> tuple[float, Floats, Floats]:
-    """Distance in the patient's mm, and the similarity in the plane x = 0 that fits best."""
-    (points, normals), (linear, offset) = samples, start
-    kept_rms, share = np.inf, 1.0
-    face_normals = _face_normals(surface)
-    for _ in range(rounds):
-        scale = float(np.cbrt(np.linalg.det(linear)))
-        moved = points @ linear.T + offset
-        near, _, triangles = surface.closest(moved)
+@dataclass
+class _Similarity:
+    """A similarity in the plane x = 0 as it is fitted.
+
+    Attributes
+    ----------
+    linear : (3, 3) float64
+    offset : (3,) float64, mm
+    distance : float, mm
+        Of the points from the surface in the last round, in the patient's size; infinite where
+        too few pairs are left.
+    """
+
+    linear: Floats
+    offset: Floats
+    distance: float = np.inf
+    is_lost: bool = False
+
+    def step(self, samples: Samples, near: Floats, faces: Floats) -> None:
+        """Fits once more to the surface's points nearest to the moved ones and their normals."""
+        points, normals = samples
+        scale = float(np.cbrt(np.linalg.det(self.linear)))
+        moved = points @ self.linear.T + self.offset
         gaps = np.linalg.norm(near - moved, axis=1)
-        turned = normals @ linear.T / scale
-        agree = (turned * face_normals[triangles]).sum(axis=1) > LEAST_AGREEMENT
+        turned = normals @ self.linear.T / scale
+        agree = (turned * faces).sum(axis=1) > LEAST_AGREEMENT
         close = gaps <= np.quantile(gaps, 1.0 - POSE_TRIM)
         kept = close & agree
-        share = float(kept.sum() / close.sum())
-        kept_rms = float(np.sqrt((np.minimum(gaps, MOST_GAP)[close] ** 2).mean())) / scale
         if kept.sum() < LEAST_PAIRS:
-            return np.inf, linear, offset
-        step, move = _step_to_planes(moved[kept], near[kept], face_normals[triangles[kept]])
-        linear, offset = step @ linear, step @ offset + move
-    return kept_rms / max(share, 0.1), linear, offset
+            self.distance, self.is_lost = np.inf, True
+            return
+        share = float(kept.sum() / close.sum())
+        rms = float(np.sqrt((np.minimum(gaps, MOST_GAP)[close] ** 2).mean())) / scale
+        self.distance = rms / max(share, 0.1)
+        step, move = _step_to_planes(moved[kept], near[kept], faces[kept])
+        self.linear, self.offset = step @ self.linear, step @ self.offset + move
+
+
+def _similarities(
+    samples: Samples,
+    surface: Surface,
+    starts: Iterable[tuple[Floats, Floats]],
+    rounds: int,
+) -> list[_Similarity]:
+    """The similarities in the plane x = 0 that fit best, from each of several starts.
+
+    In each round the points of all of them are looked up at once.
+    """
+    fits = [_Similarity(linear, offset) for linear, offset in starts]
+    face_normals = _face_normals(surface)
+    points = samples[0]
+    for _ in range(rounds):
+        going = [fit for fit in fits if not fit.is_lost]
+        if not going:
+            break
+        moved = [points @ fit.linear.T + fit.offset for fit in going]
+        near, _, triangles = surface.closest(np.concatenate(moved))
+        for fit, places, hit in zip(
+            going, np.split(near, len(going)), np.split(triangles, len(going)), strict=True
+        ):
+            fit.step(samples, places, face_normals[hit])
+    return fits
 
 
 def _face_normals(surface: Surface) -> Floats:

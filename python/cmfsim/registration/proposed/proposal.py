@@ -1,6 +1,7 @@
 """Proposed landmarks of a head: found by definition, corrected by templates, judged one by one."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
 import numpy as np
@@ -85,7 +86,11 @@ def landmarks_from(
         )
     parts = _surfaces(bones, skin)
     average = templates[0]
-    pose = find_pose(parts.upper, average.bones["cranium"])
+    # Points on all surfaces are drawn while the pose is found.
+    with ThreadPoolExecutor(1) as beside:
+        drawn = beside.submit(parts.draw)
+        pose = find_pose(parts.upper, average.bones["cranium"])
+        drawn.result()
     for _ in range(LEVEL_ROUNDS):
         pose = levelled(pose, detect(parts, pose, skin=False).skull, average.skull)
     found = detect(parts, pose)

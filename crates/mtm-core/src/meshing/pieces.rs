@@ -1,0 +1,136 @@
+//! Connected pieces of a mask on a grid, by runs of voxels along the last axis.
+//!
+//! Runs that touch are joined in a forest (Rosenfeld & Pfaltz 1966; He et al. 2008 for runs): what is visited more
+//! than once are runs, not voxels.
+
+use super::stuffing::level::Grid;
+
+/// The voxels that make two of them one piece.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Joined {
+    /// Those that share a face.
+    Faces,
+    /// Those that share a face, an edge or a corner.
+    Corners,
+}
+
+/// The connected pieces of a mask.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Pieces {
+    /// Number of each voxel's piece, from 1 on in the order of their first voxels; 0 outside the mask.
+    pub labels: Vec<i32>,
+    /// Number of voxels of each piece; that of 0 is 0.
+    pub sizes: Vec<usize>,
+}
+
+/// Voxels `first..past` of a line.
+struct Run {
+    first: usize,
+    past: usize,
+}
+
+/// The connected pieces of the voxels that are inside, in C order.
+///
+/// `inside` has an entry for each voxel of the grid.
+pub fn pieces(grid: &Grid, inside: &[bool], joined: Joined) -> Pieces {
+    let [nx, ny, nz] = grid.shape;
+    let mut runs: Vec<Run> = Vec::new();
+    // The runs of line (i, j) are starts[i ny + j]..starts[i ny + j + 1].
+    let mut starts = vec![0; nx * ny + 1];
+    let mut parents: Vec<usize> = Vec::new();
+    for (line, voxels) in inside.chunks(nz).enumerate() {
+        add_runs(voxels, &mut runs);
+        parents.extend(parents.len()..runs.len());
+        starts[line + 1] = runs.len();
+        let (i, j) = (line / ny, line % ny);
+        let before = |di: usize, j: usize| (i >= di && j < ny).then(|| (i - di) * ny + j);
+        // Lines before this one that share a face with it, or an edge.
+        let near = match joined {
+            Joined::Faces => [before(1, j), before(0, j.wrapping_sub(1)), None, None],
+            Joined::Corners => [
+                before(1, j.wrapping_sub(1)),
+                before(1, j),
+                before(1, j + 1),
+                before(0, j.wrapping_sub(1)),
+            ],
+        };
+        let reach = usize::from(joined == Joined::Corners);
+        for other in near.into_iter().flatten() {
+            let ends = (starts[line]..runs.len(), starts[other]..starts[other + 1]);
+            join_lines(&runs, ends, reach, &mut parents);
+        }
+    }
+    numbered(&runs, &starts, &mut parents, nz)
+}
+
+/// Adds the runs of one line.
+fn add_runs(voxels: &[bool], runs: &mut Vec<Run>) {
+    let mut from = 0;
+    while let Some(first) = voxels[from..].iter().position(|&v| v).map(|n| from + n) {
+        let past = voxels[first..].iter().position(|&v| !v).map_or(voxels.len(), |n| first + n);
+        runs.push(Run { first, past });
+        from = past;
+    }
+}
+
+/// Joins the runs of two lines that overlap when each reaches `reach` voxels past its ends.
+fn join_lines(
+    runs: &[Run],
+    (mine, theirs): (std::ops::Range<usize>, std::ops::Range<usize>),
+    reach: usize,
+    parents: &mut [usize],
+) {
+    let (mut a, mut b) = (mine.start, theirs.start);
+    while a < mine.end && b < theirs.end {
+        if runs[a].past + reach <= runs[b].first {
+            a += 1;
+        } else if runs[b].past + reach <= runs[a].first {
+            b += 1;
+        } else {
+            join(parents, a, b);
+            if runs[a].past < runs[b].past {
+                a += 1;
+            } else {
+                b += 1;
+            }
+        }
+    }
+}
+
+/// The first run of a piece; the ways there are halved.
+fn root(parents: &mut [usize], mut run: usize) -> usize {
+    while parents[run] != run {
+        parents[run] = parents[parents[run]];
+        run = parents[run];
+    }
+    run
+}
+
+/// Makes the piece whose first run comes later a part of the other.
+fn join(parents: &mut [usize], a: usize, b: usize) {
+    let (a, b) = (root(parents, a), root(parents, b));
+    parents[a.max(b)] = a.min(b);
+}
+
+/// The pieces numbered in the order of their first runs.
+fn numbered(runs: &[Run], starts: &[usize], parents: &mut [usize], nz: usize) -> Pieces {
+    let mut numbers = vec![0_i32; runs.len()];
+    let mut sizes = vec![0];
+    for (run, Run { first, past }) in runs.iter().enumerate() {
+        let first_run = root(parents, run);
+        if first_run == run {
+            numbers[run] = sizes.len() as i32;
+            sizes.push(0);
+        } else {
+            numbers[run] = numbers[first_run];
+        }
+        sizes[numbers[run] as usize] += past - first;
+    }
+    let mut labels = vec![0_i32; (starts.len() - 1) * nz];
+    for (line, voxels) in labels.chunks_mut(nz).enumerate() {
+        for run in starts[line]..starts[line + 1] {
+            voxels[runs[run].first..runs[run].past].fill(numbers[run]);
+        }
+    }
+    Pieces { labels, sizes }
+}

@@ -1,0 +1,35 @@
+"""How the C library keeps the memory that a command frees."""
+
+import ctypes
+import sys
+
+__all__ = ["keep_freed_memory"]
+
+# Parameters of mallopt, from glibc's malloc.h.
+TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8
+# Freed memory that is kept for the next arrays, bytes: about five images of a head on the working
+# grid. With more, the largest amount in use grows as well.
+KEPT = 256 << 20
+# Blocks that get a mapping of their own from this size on, bytes: none.
+LARGEST = (1 << 31) - 1
+
+
+def keep_freed_memory() -> None:
+    """Lets large arrays reuse the memory of earlier ones, where the C library is glibc.
+
+    By default each array of an image is mapped from the kernel and given back: clearing its pages
+    takes as long as the work on them, above all in a virtual machine. One arena serves all threads,
+    so that they share what is kept. Other C libraries keep their own ways.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    library = ctypes.CDLL(None)
+    # musl has neither.
+    if not (hasattr(library, "gnu_get_libc_version") and hasattr(library, "mallopt")):
+        return
+    for parameter, value in (
+        (ARENA_MAX, 1),
+        (MMAP_THRESHOLD, LARGEST),
+        (TRIM_THRESHOLD, KEPT),
+    ):
+        library.mallopt(parameter, value)
