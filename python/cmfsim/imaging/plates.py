@@ -42,10 +42,10 @@ BESIDE = 2
 # A rim is there where skin faces away from the piece by so much more than the face around it,
 # degrees: that of a pit faces inwards.
 OUTWARDS = 20.0
-# Along its border a piece faces inwards by so much at least, on average, degrees: a pad's upper
-# edge is convex, and the face around it leans to the step beyond. Skin beside a fold, as between
-# jaw and neck, faces outwards instead.
-EDGE = -0.8
+# Along its border a piece faces outwards by no more than this on average, degrees. A pad's upper edge
+# is convex, and the face around it leans to the step beyond: −19 to 0. Skin beside a fold is concave:
+# 5 at noses, 18 between jaw and neck.
+EDGE = 1.0
 # The part of a piece's border that has such a rim, at least: that of pads of 60 mm whose rim meets
 # lips or folds is 0.7, that of faces without one 0.5 at most.
 LEAST_RIM = 0.62
@@ -95,22 +95,6 @@ class _Skin:
         return slope
 
 
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """What a step surrounds.
-
-    Attributes
-    ----------
-    rim : float
-        The part of its border that has a step which faces outwards.
-    voxels : (n, 3) intp
-        Of the piece and its step.
-    """
-
-    rim: float
-    voxels: NDArray[np.intp]
-
-
 def find_plates(level: Volume, spacing: NDArray[np.float64], behind: int) -> list[NDArray[np.intp]]:
     """The voxels, (n, 3) each, of pieces of the skin that stand out within a step.
 
@@ -131,17 +115,20 @@ def find_plates(level: Volume, spacing: NDArray[np.float64], behind: int) -> lis
     part = np.concatenate([np.repeat(part[:, :, :1], below, axis=2), part], axis=2)
     skin = _skin(np.asfortranarray(part), spacing, behind - first, below)
     slopes = {wide: skin.slope(wide) for wide in (WIDE, NEAR)}
-    found: list[_Piece] = []
+    found: list[NDArray[np.intp]] = []
     for (wide, widened), angles in STEEP.items():
         height = np.linalg.norm(slopes[wide], axis=-1)
         for angle in angles:
             steps = skin.shell & (height > np.sin(np.radians(angle)))
             found += _surrounded(skin, steps, widened, slopes[WIDE])
-    return [piece.voxels + [0, first, -below] for piece in _apart(found, skin.shell.shape)]
+    shift = np.array([0, first, -below], dtype=np.intp)
+    return [voxels + shift for voxels in _apart(found, skin.shell.shape)]
 
 
-def _surrounded(skin: _Skin, steps: Mask, widened: int, slope: NDArray[np.float32]) -> list[_Piece]:
-    """The pieces of the shell between steps whose rim faces outwards."""
+def _surrounded(
+    skin: _Skin, steps: Mask, widened: int, slope: NDArray[np.float32]
+) -> list[NDArray[np.intp]]:
+    """The voxels, with those of its rim, of each piece of the shell that a rim surrounds."""
     wall = ndimage().binary_dilation(steps, CUBE, iterations=widened)
     labels, count = label(np.asfortranarray(skin.shell & ~wall), corners=True)
     areas = sizes_of(labels, count) * float(np.prod(skin.spacing)) ** (2.0 / 3.0)
@@ -157,14 +144,12 @@ def _surrounded(skin: _Skin, steps: Mask, widened: int, slope: NDArray[np.float3
         beside = ndimage().binary_dilation(within, CUBE, iterations=reach) & shell & ~within
         border = within & ndimage().binary_dilation(beside | skin.cut_off[box], CUBE)
         outwards = _outwards(within, beside | border, slope[box], skin.spacing)
-        if outwards[border].mean() > np.sin(np.radians(EDGE)):
+        if not border.any() or outwards[border].mean() > np.sin(np.radians(EDGE)):
             continue
         rim = beside & (outwards > np.sin(np.radians(OUTWARDS)))
         near = ndimage().binary_dilation(rim, CUBE, iterations=reach)
-        share = np.count_nonzero(near & border) / max(np.count_nonzero(border), 1)
-        if share > LEAST_RIM:
-            start = np.array([b.start for b in box])
-            pieces.append(_Piece(share, np.argwhere(within | rim) + start))
+        if near[border].mean() > LEAST_RIM:
+            pieces.append(np.argwhere(within | rim) + np.array([b.start for b in box]))
     return pieces
 
 
@@ -181,15 +166,15 @@ def _outwards(
     return outwards
 
 
-def _apart(pieces: list[_Piece], shape: tuple[int, ...]) -> list[_Piece]:
+def _apart(pieces: list[NDArray[np.intp]], shape: tuple[int, ...]) -> list[NDArray[np.intp]]:
     """The largest of those that overlap."""
     taken = np.zeros(shape, dtype=bool)
     kept = []
-    for piece in sorted(pieces, key=lambda p: len(p.voxels), reverse=True):
-        at = tuple(piece.voxels.T)
+    for voxels in sorted(pieces, key=len, reverse=True):
+        at = tuple(voxels.T)
         if not taken[at].any():
-            kept.append(piece)
-        taken[at] = True
+            kept.append(voxels)
+            taken[at] = True
     return kept
 
 
