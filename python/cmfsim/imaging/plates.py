@@ -42,9 +42,9 @@ BESIDE = 2
 # A rim is there where skin faces away from the piece by so much more than the face around it,
 # degrees: that of a pit faces inwards.
 OUTWARDS = 20.0
-# Along its border a piece faces outwards by no more than this on average, degrees. A pad's upper edge
-# is convex, and the face around it leans to the step beyond: −19 to 0. Skin beside a fold is concave:
-# 5 at noses, 18 between jaw and neck.
+# Along its border a piece faces outwards by no more than this on average, degrees. A pad's upper
+# edge is convex, and the face around it leans to the step beyond: −19 to 0. Skin beside a fold is
+# concave: 5 at noses, 18 between jaw and neck.
 EDGE = 1.0
 # The part of a piece's border that has such a rim, at least: that of pads of 60 mm whose rim meets
 # lips or folds is 0.7, that of faces without one 0.5 at most.
