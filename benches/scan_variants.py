@@ -89,6 +89,14 @@ def _filled(image: ImageData, **options: Any) -> ImageData:
     return effects.with_metal_scanned(image, [pieces], **options)
 
 
+def _filled_noisily(image: ImageData, sigma: float) -> ImageData:
+    """Amalgam on an extended scale, in a scan of a low dose."""
+    noise = np.random.default_rng(0).normal(0.0, sigma, image.values.shape)
+    filled = _filled(image, top=effects.EXTENDED)
+    noisy = np.round(filled.values + noise).clip(-1024, effects.EXTENDED)
+    return filled.with_values(noisy.astype(np.int32))
+
+
 def _braced(image: ImageData, **options: Any) -> ImageData:
     rows = [(x, z) for x in np.arange(-21.0, 22.0, 7.0) for z in (379.0, 364.0)]
     pieces = [
@@ -167,6 +175,8 @@ VARIANTS: Mapping[str, Variant] = {
     "brackets and wire of steel": Variant(_braced),
     "brackets, up to 30000 HU": Variant(lambda i: _braced(i, top=effects.EXTENDED)),
     "plates of titanium": Variant(_plated),
+    "amalgam and noise of 100 HU": Variant(lambda i: _filled_noisily(i, 100.0)),
+    "amalgam and noise of 150 HU": Variant(lambda i: _filled_noisily(i, 150.0)),
     "noise of 60 HU": Variant(lambda i: variants.with_noise(i, 60.0)),
     "noise of 150 HU": Variant(lambda i: variants.with_noise(i, 150.0)),
     "200 HU too high": Variant(_shifted(200.0)),

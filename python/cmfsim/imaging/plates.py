@@ -1,10 +1,12 @@
-"""Things that lie flat on the face: pads, dressings, plates. Their rim is a step all round.
+"""Things that lie flat on the face: pads, dressings, plates. Their rim is a step nearly all round.
 
-A face has steps at nose, lips, lids and ears, but none that closes round a piece of skin. What a
-step down surrounds is no part of a face, whatever its density, and on whichever side it lies.
+A face has steps at nose, lips, lids and ears, but none that goes most of the way round a piece of
+skin and faces away from it. What such a step surrounds is no part of a face, whatever its density,
+and on whichever side it lies.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,40 +21,82 @@ STEP = 1.6
 # The skin's own direction is that of its level after the first Gaussian, the direction of the face
 # around it that of the head's inside after the second, mm.
 FINE, WIDE = 1.2, 7.0
-# Skin that is turned against the face around it by more than this is a step, degrees: that of a pad
-# of 3 mm is by some 30.
-STEEP = 25.0
-# The neck is taken to go on below the image for so much, as a multiple of the wide Gaussian.
-BELOW = 2.5
+# A rim that lies in a fold of the face differs less from the face around it than from the skin just
+# beside it: that of this Gaussian, mm.
+NEAR = 4.5
+# Skin that is turned against the face around it by more than one of these is a step, degrees: low
+# ones close a rim that is weak in places, high ones do not take a small pad for all step. Voxels
+# that steps are widened by, which closes gaps of a rim.
+STEEP = {
+    (WIDE, 1): (17.0, 20.0, 25.0, 32.0, 40.0),
+    (WIDE, 2): (17.0, 20.0, 25.0),
+    (NEAR, 1): (17.0, 20.0, 25.0),
+    (NEAR, 2): (20.0, 25.0),
+}
+# The neck is taken to go on below the image for so much, mm.
+BELOW = 17.5
 # What a step may surround, without the step itself, mm²: pads 18 to 90 mm across.
 LEAST_AREA, MOST_AREA = 60.0, 8000.0
-# Voxels beside a piece in which its step is looked for.
-BESIDE = 3
-# How far the step faces away from the middle of what it surrounds, as the mean cosine at least: the
-# rim of a pit faces inwards.
-LEAST_OUTWARDS = 0.4
+# Voxels beside a piece in which its step is looked for, beyond those that it was widened by.
+BESIDE = 2
+# A rim is there where skin faces away from the piece by so much more than the face around it,
+# degrees: that of a pit faces inwards.
+OUTWARDS = 20.0
+# Along its border a piece faces outwards by no more than this on average, degrees. A pad's upper
+# edge is convex, and the face around it leans to the step beyond: −19 to 0. Skin beside a fold is
+# concave: 5 at noses, 18 between jaw and neck.
+EDGE = 1.0
+# The part of a piece's border that has such a rim, at least: that of pads of 60 mm whose rim meets
+# lips or folds is 0.7, that of faces without one 0.5 at most.
+LEAST_RIM = 0.62
+# Gaussian by which a piece's border gets a direction, voxels.
+BORDER = 2.0
+CUBE = np.ones((3, 3, 3), dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
 class _Skin:
-    """The voxels of the surface of the face, on a part of the grid.
+    """The voxels just inside the surface of the face, on a part of the grid.
 
     Attributes
     ----------
-    shell : (nx, ny, nz) bool
-    steps : (nx, ny, nz) bool
-        Those of the shell where it is a step.
-    slope : (nx, ny, nz, 3) float32
-        The part of the skin's own direction that lies along the face around it.
+    level : (nx, ny, nz) float32
+    shell, cut_off : (nx, ny, nz) bool
+        Those that are looked at, and those beyond, where the face ends.
+    spacing : (3,) float64, mm
     """
 
+    level: Volume
     shell: Mask
-    steps: Mask
-    slope: NDArray[np.float32]
+    cut_off: Mask
+    spacing: NDArray[np.float64]
+
+    @cached_property
+    def index(self) -> NDArray[np.intp]:
+        """The voxels of the shell, (n, 3)."""
+        return np.argwhere(self.shell)
+
+    @cached_property
+    def own(self) -> Floats:
+        """The skin's own direction there."""
+        return _directions(smoothed(self.level, FINE, self.spacing), self.index, self.spacing)
+
+    def slope(self, wide: float) -> NDArray[np.float32]:
+        """The part of the skin's own direction along the face around it, (nx, ny, nz, 3)."""
+        inside = self.level > 0.0
+        around = _directions(smoothed(inside, wide, self.spacing), self.index, self.spacing)
+        cosine = (self.own * around).sum(axis=1, keepdims=True)
+        # Skin that is turned away by more than a right angle is a step as high as any.
+        along = self.own - np.minimum(cosine, 1.0) * around
+        lengths = np.linalg.norm(along, axis=1, keepdims=True)
+        along = np.where(cosine < 0.0, along / np.maximum(lengths, 1e-9), along)
+        slope = np.zeros((*self.shell.shape, 3), dtype=np.float32)
+        slope[tuple(self.index.T)] = along
+        return slope
 
 
 def find_plates(level: Volume, spacing: NDArray[np.float64], behind: int) -> list[NDArray[np.intp]]:
-    """The voxels, (n, 3) each, of pieces of the skin that stand out within a step all round.
+    """The voxels, (n, 3) each, of pieces of the skin that stand out within a step.
 
     Parameters
     ----------
@@ -66,25 +110,72 @@ def find_plates(level: Volume, spacing: NDArray[np.float64], behind: int) -> lis
     if not len(rows) or rows[0] >= behind:
         return []
     first = max(int(rows[0]) - 4, 0)
-    below = int(np.ceil(BELOW * WIDE / spacing[2]))
+    below = int(np.ceil(BELOW / spacing[2]))
     part = level[:, first : behind + 4]
     part = np.concatenate([np.repeat(part[:, :, :1], below, axis=2), part], axis=2)
     skin = _skin(np.asfortranarray(part), spacing, behind - first, below)
-    wall = ndimage().binary_dilation(skin.steps, np.ones((3, 3, 3), dtype=bool))
+    slopes = {wide: skin.slope(wide) for wide in (WIDE, NEAR)}
+    found: list[NDArray[np.intp]] = []
+    for (wide, widened), angles in STEEP.items():
+        height = np.linalg.norm(slopes[wide], axis=-1)
+        for angle in angles:
+            steps = skin.shell & (height > np.sin(np.radians(angle)))
+            found += _surrounded(skin, steps, widened, slopes[WIDE])
+    shift = np.array([0, first, -below], dtype=np.intp)
+    return [voxels + shift for voxels in _apart(found, skin.shell.shape)]
+
+
+def _surrounded(
+    skin: _Skin, steps: Mask, widened: int, slope: NDArray[np.float32]
+) -> list[NDArray[np.intp]]:
+    """The voxels, with those of its rim, of each piece of the shell that a rim surrounds."""
+    wall = ndimage().binary_dilation(steps, CUBE, iterations=widened)
     labels, sizes = label(np.asfortranarray(skin.shell & ~wall), corners=True)
-    areas = sizes * float(np.prod(spacing)) ** (2.0 / 3.0)
+    areas = sizes * float(np.prod(skin.spacing)) ** (2.0 / 3.0)
     blocks = ndimage().find_objects(labels)
-    found = []
-    for piece in np.flatnonzero((areas > LEAST_AREA) & (areas < MOST_AREA)):
+    reach = BESIDE + widened
+    pieces = []
+    for number in np.flatnonzero((areas > LEAST_AREA) & (areas < MOST_AREA)):
         # With room for what lies beside it.
-        box = tuple(slice(max(b.start - BESIDE, 0), b.stop + BESIDE) for b in blocks[piece - 1])
-        within = labels[box] == piece
-        rim = ndimage().binary_dilation(within, np.ones((3, 3, 3), dtype=bool), iterations=BESIDE)
-        rim &= skin.steps[box]
-        if _outwards(within, rim, skin.slope[box], spacing) > LEAST_OUTWARDS:
-            start = np.array([b.start for b in box]) + [0, first, -below]
-            found.append(np.argwhere(within | rim) + start)
-    return found
+        block = blocks[number - 1]
+        box = tuple(slice(max(b.start - reach - 1, 0), b.stop + reach + 1) for b in block)
+        within = labels[box] == number
+        shell = skin.shell[box]
+        beside = ndimage().binary_dilation(within, CUBE, iterations=reach) & shell & ~within
+        border = within & ndimage().binary_dilation(beside | skin.cut_off[box], CUBE)
+        outwards = _outwards(within, beside | border, slope[box], skin.spacing)
+        if not border.any() or outwards[border].mean() > np.sin(np.radians(EDGE)):
+            continue
+        rim = beside & (outwards > np.sin(np.radians(OUTWARDS)))
+        near = ndimage().binary_dilation(rim, CUBE, iterations=reach)
+        if near[border].mean() > LEAST_RIM:
+            pieces.append(np.argwhere(within | rim) + np.array([b.start for b in box]))
+    return pieces
+
+
+def _outwards(
+    within: Mask, where: Mask, slope: NDArray[np.float32], spacing: NDArray[np.float64]
+) -> Volume:
+    """How far skin faces away from a piece, against the face around it; as a sine, 0 elsewhere."""
+    piece = ndimage().gaussian_filter(within.astype(np.float32), BORDER)
+    index = np.argwhere(where)
+    away = _directions(piece, index, spacing)
+    outwards = np.zeros(within.shape, dtype=np.float32)
+    at = tuple(index.T)
+    outwards[at] = (slope[at] * away).sum(axis=1)
+    return outwards
+
+
+def _apart(pieces: list[NDArray[np.intp]], shape: tuple[int, ...]) -> list[NDArray[np.intp]]:
+    """The largest of those that overlap."""
+    taken = np.zeros(shape, dtype=bool)
+    kept = []
+    for voxels in sorted(pieces, key=len, reverse=True):
+        at = tuple(voxels.T)
+        if not taken[at].any():
+            kept.append(voxels)
+            taken[at] = True
+    return kept
 
 
 def _skin(level: Volume, spacing: NDArray[np.float64], last: int, below: int) -> _Skin:
@@ -95,19 +186,11 @@ def _skin(level: Volume, spacing: NDArray[np.float64], last: int, below: int) ->
         along, out = np.moveaxis(inside, axis, 0), np.moveaxis(shell, axis, 0)
         out[1:] |= along[1:] & ~along[:-1]
         out[:-1] |= along[:-1] & ~along[1:]
+    whole = shell.copy()
     # A head that is cut off is closed by steps.
     shell[:, last:] = shell[:, :, : below + 1] = shell[:, :, -2:] = False
     shell[:2] = shell[-2:] = False
-    index = np.argwhere(shell)
-    own = _directions(smoothed(level, FINE, spacing), index, spacing)
-    around = _directions(smoothed(inside, WIDE, spacing), index, spacing)
-    cosine = (own * around).sum(axis=1)
-    at = tuple(index.T)
-    steps = np.zeros_like(inside)
-    steps[at] = cosine < np.cos(np.radians(STEEP))
-    slope = np.zeros((*inside.shape, 3), dtype=np.float32)
-    slope[at] = own - cosine[:, None] * around
-    return _Skin(shell, steps, slope)
+    return _Skin(level, shell, whole & ~shell, spacing)
 
 
 def _directions(values: Volume, index: NDArray[np.intp], spacing: NDArray[np.float64]) -> Floats:
@@ -119,15 +202,3 @@ def _directions(values: Volume, index: NDArray[np.intp], spacing: NDArray[np.flo
         after[:, axis] = np.minimum(after[:, axis] + 1, size - 1)
         fall[:, axis] = (values[tuple(before.T)] - values[tuple(after.T)]) / step
     return np.asarray(fall / np.maximum(np.linalg.norm(fall, axis=1), 1e-12)[:, None])
-
-
-def _outwards(
-    within: Mask, rim: Mask, slope: NDArray[np.float32], spacing: NDArray[np.float64]
-) -> float:
-    """The mean cosine between where a rim faces along the face and the way to it; −1 of none."""
-    if not rim.any():
-        return -1.0
-    away = (np.argwhere(rim) - np.argwhere(within).mean(axis=0)) * spacing
-    faces = slope[rim].astype(np.float64)
-    lengths = np.linalg.norm(away, axis=1) * np.linalg.norm(faces, axis=1)
-    return float(((away * faces).sum(axis=1) / np.maximum(lengths, 1e-12)).mean())
