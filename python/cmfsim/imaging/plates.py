@@ -142,13 +142,15 @@ def _surrounded(
         within = labels[box] == number
         shell = skin.shell[box]
         beside = ndimage().binary_dilation(within, CUBE, iterations=reach) & shell & ~within
-        border = within & ndimage().binary_dilation(beside | skin.cut_off[box], CUBE)
+        ends = ndimage().binary_dilation(skin.cut_off[box], CUBE)
+        border = within & (ends | ndimage().binary_dilation(beside, CUBE))
         outwards = _outwards(within, beside | border, slope[box], skin.spacing)
         if not border.any() or outwards[border].mean() > np.sin(np.radians(EDGE)):
             continue
         rim = beside & (outwards > np.sin(np.radians(OUTWARDS)))
         near = ndimage().binary_dilation(rim, CUBE, iterations=reach)
-        if near[border].mean() > LEAST_RIM:
+        # Where the face ends, what lies beyond is not known to be lower.
+        if (near & ~ends)[border].mean() > LEAST_RIM:
             pieces.append(np.argwhere(within | rim) + np.array([b.start for b in box]))
     return pieces
 

@@ -51,6 +51,11 @@ def test_the_made_head_is_found_within_its_voxels(head, anatomy):
     assert dice(found, truth) > 0.9
 
 
+def test_the_made_head_has_nothing_on_its_skin(anatomy):
+    # Its neck is cut off right below the fold under the jaw: no rim is seen there.
+    assert "skin-attachment" not in codes(anatomy)
+
+
 def test_the_couch_is_removed_and_said(anatomy):
     assert "rest-removed" in codes(anatomy)
     assert anatomy.skin.values[:, (anatomy.skin.axes()[1] > 112.0).ravel()].max() <= 0.0
