@@ -19,9 +19,9 @@ use crate::vector::add;
 
 /// Nodes per parallel task.
 const NODES_PER_TASK: usize = 256;
-/// Change of any entry of F up to which a definite tangent is kept. Such a tangent is not that of the energy
+/// Change of any entry of F up to which a definite tangent may be kept. Such a tangent is not that of the energy
 /// anyway, and after a few steps most tissue hardly moves.
-const LAG: f64 = 1e-3;
+pub(crate) const LAG: f64 = 1e-3;
 
 /// Which tangent stiffness is computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,6 +57,8 @@ struct Scratch {
 /// Tangents of a series of states of one body, each near the one before.
 #[derive(Debug, Default)]
 pub(crate) struct PointTangents {
+    /// Change of any entry of F up to which a definite tangent is kept.
+    lag: f64,
     /// Tangent of each quadrature point times its volume, N mm.
     values: Vec<Tangent>,
     /// F of each quadrature point at its tangent; none unless they are definite ones.
@@ -193,10 +195,13 @@ impl StrainEnergy {
     }
 
     /// Begins a series of states, in the memory of an earlier one. What it finds does not depend on other series.
-    pub(crate) fn begin(&self) -> PointTangents {
+    ///
+    /// `lag`: the change of any entry of F up to which a definite tangent is kept.
+    pub(crate) fn begin(&self, lag: f64) -> PointTangents {
         let freed = &mut *self.freed.lock().unwrap_or_else(PoisonError::into_inner);
         let mut tangents = std::mem::take(freed);
         tangents.at.clear();
+        tangents.lag = lag;
         tangents
     }
 
@@ -211,7 +216,7 @@ impl StrainEnergy {
     /// Displacements of the wrong number, or not finite.
     pub fn stiffness(&self, u: &[[f64; 3]], kind: TangentKind) -> Result<BlockMatrix> {
         self.tensors.check_displacements(u)?;
-        let (mut scratch, mut tangents) = (self.take_scratch(), self.begin());
+        let (mut scratch, mut tangents) = (self.take_scratch(), self.begin(0.0));
         let matrix = self.assembled(u, kind, &mut tangents, scratch.matrix.take());
         self.keep_scratch(scratch);
         self.end(tangents);
@@ -273,7 +278,8 @@ impl StrainEnergy {
         let n_points = self.nodes().n_points();
         let volumes = self.nodes().mesh().volumes();
         let n = volumes.len() * n_points;
-        let PointTangents { values, at } = tangents;
+        let PointTangents { values, at, lag } = tangents;
+        let lag = *lag;
         values.resize(n, Tangent::zeros());
         let found = |t: usize, f: &Matrix3<f64>| {
             let pressure = averaged.map_or(0.0, |a| a.pressures[t]);
@@ -298,7 +304,7 @@ impl StrainEnergy {
         let own = values.par_chunks_mut(n_points).zip(at.par_chunks_mut(n_points));
         own.enumerate().for_each(|(t, (values, at))| {
             for ((out, at), f) in values.iter_mut().zip(at).zip(self.gradients(t, u)) {
-                let is_near = at.iter().zip(&f).all(|(a, b)| (a - b).abs() <= LAG);
+                let is_near = at.iter().zip(&f).all(|(a, b)| (a - b).abs() <= lag);
                 if !is_near {
                     (*out, *at) = (found(t, &f), f);
                 }
@@ -423,7 +429,7 @@ mod tests {
         let at = |x: f64| vec![[0.0; 3], [x, 0.1, 0.0], [0.0; 3], [0.0, 0.0, -0.2]];
         let fresh = |x: f64| values(&body, &at(x), &mut PointTangents::default());
 
-        let mut series = body.begin();
+        let mut series = body.begin(LAG);
         assert_eq!(values(&body, &at(0.1), &mut series), fresh(0.1));
         let near = values(&body, &at(0.1 + 0.5 * LAG), &mut series);
         assert_eq!(near, fresh(0.1), "kept");
@@ -437,6 +443,6 @@ mod tests {
         let after = values(&body, &at(0.1 + 0.5 * LAG), &mut series);
         assert_eq!(after, fresh(0.1 + 0.5 * LAG));
         body.end(series);
-        assert_eq!(values(&body, &at(0.1), &mut body.begin()), fresh(0.1));
+        assert_eq!(values(&body, &at(0.1), &mut body.begin(LAG)), fresh(0.1));
     }
 }

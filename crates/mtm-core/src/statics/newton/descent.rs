@@ -28,7 +28,7 @@ const LONGER: f64 = 8.0;
 const NEAR_REST: f64 = 0.05;
 /// Ratio of moduli above which stiff parts that turn on soft ones make single steps short far from the solution:
 /// on a bar with bands of 1e6 times the modulus, a step of 0.02 mm was followed by one of 0.14 mm.
-const STIFF_PARTS: f64 = 500.0;
+pub(super) const STIFF_PARTS: f64 = 500.0;
 /// Steps over which convergence is judged with such parts.
 const WINDOW: usize = 3;
 /// Length of a step relative to the one before, or to the error asked for, below which the step counts as the

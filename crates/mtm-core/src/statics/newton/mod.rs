@@ -20,7 +20,7 @@ use crate::algebra::multigrid::Multigrid;
 use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::mechanics::strain_energy::TangentKind::{self, Exact};
-use crate::mechanics::strain_energy::{PointTangents, StrainEnergy};
+use crate::mechanics::strain_energy::{LAG, PointTangents, StrainEnergy};
 use crate::mechanics::tensors::MassTensors;
 use crate::statics::effort::Solve;
 use crate::statics::iterative::Extremes;
@@ -206,7 +206,9 @@ impl Equilibrium {
         slide: Option<&Slide<'_>>,
         solve: &mut Solve<'_>,
     ) -> Result<Solved> {
-        let tangents = RefCell::new(self.energy.begin());
+        // Stiff parts that turn on soft ones move by more than their own change of shape shows.
+        let lag = if self.tissue.contrast > descent::STIFF_PARTS { 0.0 } else { LAG };
+        let tangents = RefCell::new(self.energy.begin(lag));
         let solved = self.solve_with(&tangents, (prescribed, loads), slide, solve);
         self.energy.end(tangents.into_inner());
         solved
