@@ -33,6 +33,11 @@ STEEP = {
     (NEAR, 1): (17.0, 20.0, 25.0),
     (NEAR, 2): (20.0, 25.0),
 }
+# In voxels larger than the first, mm, noses have rims of few voxels: only such steps are looked for,
+# and this part of a border must have a rim.
+COARSE = 2.0
+STEEP_COARSE = {(WIDE, 1): (25.0,)}
+LEAST_RIM_COARSE = 0.9
 # The neck is taken to go on below the image for so much, mm.
 BELOW = 17.5
 # What a step may surround, without the step itself, mm²: pads 18 to 90 mm across.
@@ -116,7 +121,8 @@ def find_plates(level: Volume, spacing: NDArray[np.float64], behind: int) -> lis
     skin = _skin(np.asfortranarray(part), spacing, behind - first, below)
     slopes = {wide: skin.slope(wide) for wide in (WIDE, NEAR)}
     found: list[NDArray[np.intp]] = []
-    for (wide, widened), angles in STEEP.items():
+    is_coarse = float(np.max(spacing)) > COARSE
+    for (wide, widened), angles in (STEEP_COARSE if is_coarse else STEEP).items():
         height = np.linalg.norm(slopes[wide], axis=-1)
         for angle in angles:
             steps = skin.shell & (height > np.sin(np.radians(angle)))
@@ -150,7 +156,8 @@ def _surrounded(
         rim = beside & (outwards > np.sin(np.radians(OUTWARDS)))
         near = ndimage().binary_dilation(rim, CUBE, iterations=reach)
         # Where the face ends, what lies beyond is not known to be lower.
-        if (near & ~ends)[border].mean() > LEAST_RIM:
+        is_coarse = float(np.max(skin.spacing)) > COARSE
+        if (near & ~ends)[border].mean() > (LEAST_RIM_COARSE if is_coarse else LEAST_RIM):
             pieces.append(np.argwhere(within | rim) + np.array([b.start for b in box]))
     return pieces
 
