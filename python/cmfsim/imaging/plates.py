@@ -33,8 +33,8 @@ STEEP = {
     (NEAR, 1): (17.0, 20.0, 25.0),
     (NEAR, 2): (20.0, 25.0),
 }
-# In voxels larger than the first, mm, noses have rims of few voxels: only such steps are looked for,
-# and this part of a border must have a rim.
+# In voxels larger than the first, mm, noses have rims of few voxels: only such steps are looked
+# for, and this part of a border must have a rim.
 COARSE = 2.0
 STEEP_COARSE = {(WIDE, 1): (25.0,)}
 LEAST_RIM_COARSE = 0.9

@@ -5,7 +5,8 @@ use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::effort::Solve;
 use crate::statics::newton::step::{Step, by_tangent};
 use crate::statics::newton::{
-    Equilibrium, MAX_STEPS, Pose, TangentSolver, Target, along_slope, lost, moved_by, reach,
+    Equilibrium, MAX_STEPS, Pose, STIFF_PARTS, TangentSolver, Target, along_slope, lost, moved_by,
+    reach,
 };
 use crate::vector::{add, dot};
 
@@ -26,9 +27,6 @@ const LONGER: f64 = 8.0;
 /// Length of a step over all displacements, below which conjugate gradients use the exact tangent: at rest it
 /// is positive definite, and further away they would detect indefiniteness only by chance.
 const NEAR_REST: f64 = 0.05;
-/// Ratio of moduli above which stiff parts that turn on soft ones make single steps short far from the solution:
-/// on a bar with bands of 1e6 times the modulus, a step of 0.02 mm was followed by one of 0.14 mm.
-pub(super) const STIFF_PARTS: f64 = 500.0;
 /// Steps over which convergence is judged with such parts.
 const WINDOW: usize = 3;
 /// Length of a step relative to the one before, or to the error asked for, below which the step counts as the
