@@ -119,20 +119,21 @@ def find_plates(level: Volume, spacing: NDArray[np.float64], behind: int) -> lis
     part = level[:, first : behind + 4]
     part = np.concatenate([np.repeat(part[:, :, :1], below, axis=2), part], axis=2)
     skin = _skin(np.asfortranarray(part), spacing, behind - first, below)
-    slopes = {wide: skin.slope(wide) for wide in (WIDE, NEAR)}
-    found: list[NDArray[np.intp]] = []
     is_coarse = float(np.max(spacing)) > COARSE
-    for (wide, widened), angles in (STEEP_COARSE if is_coarse else STEEP).items():
+    steep, least_rim = (STEEP_COARSE, LEAST_RIM_COARSE) if is_coarse else (STEEP, LEAST_RIM)
+    slopes = {wide: skin.slope(wide) for wide in {wide for wide, _ in steep}}
+    found: list[NDArray[np.intp]] = []
+    for (wide, widened), angles in steep.items():
         height = np.linalg.norm(slopes[wide], axis=-1)
         for angle in angles:
             steps = skin.shell & (height > np.sin(np.radians(angle)))
-            found += _surrounded(skin, steps, widened, slopes[WIDE])
+            found += _surrounded(skin, steps, widened, slopes[WIDE], least_rim)
     shift = np.array([0, first, -below], dtype=np.intp)
     return [voxels + shift for voxels in _apart(found, skin.shell.shape)]
 
 
 def _surrounded(
-    skin: _Skin, steps: Mask, widened: int, slope: NDArray[np.float32]
+    skin: _Skin, steps: Mask, widened: int, slope: NDArray[np.float32], least_rim: float
 ) -> list[NDArray[np.intp]]:
     """The voxels, with those of its rim, of each piece of the shell that a rim surrounds."""
     wall = ndimage().binary_dilation(steps, CUBE, iterations=widened)
@@ -156,8 +157,7 @@ def _surrounded(
         rim = beside & (outwards > np.sin(np.radians(OUTWARDS)))
         near = ndimage().binary_dilation(rim, CUBE, iterations=reach)
         # Where the face ends, what lies beyond is not known to be lower.
-        is_coarse = float(np.max(skin.spacing)) > COARSE
-        if (near & ~ends)[border].mean() > (LEAST_RIM_COARSE if is_coarse else LEAST_RIM):
+        if (near & ~ends)[border].mean() > least_rim:
             pieces.append(np.argwhere(within | rim) + np.array([b.start for b in box]))
     return pieces
 
