@@ -23,6 +23,7 @@ mod mechanics {
     mod convergence;
     mod elements;
     mod patch;
+    mod squeezed;
 }
 mod meshing {
     mod pieces;

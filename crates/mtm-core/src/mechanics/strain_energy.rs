@@ -1,6 +1,8 @@
 //! Strain energy of a body under large rotation: its value, its first derivative (the internal forces) and its
 //! second derivative (the tangent stiffness), on the pattern of the tensors.
 
+mod part;
+
 use std::sync::{Arc, Mutex, PoisonError};
 
 use nalgebra::{Matrix3, Vector3};
@@ -16,6 +18,8 @@ use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::nodal_pressure::split;
 use crate::mechanics::tensors::MassTensors;
 use crate::vector::add;
+
+pub(crate) use part::Part;
 
 /// Nodes per parallel task.
 const NODES_PER_TASK: usize = 256;
@@ -148,31 +152,17 @@ impl StrainEnergy {
     pub fn state(&self, u: &[[f64; 3]]) -> Result<EnergyState> {
         self.tensors.check_displacements(u)?;
         let nodes = self.nodes();
-        let mesh = nodes.mesh();
         let averaged = self.averaged(u);
-        let share = 1.0 / nodes.n_points() as f64;
         let n_own = nodes.of_tet(0).len();
         let mut scratch = self.take_scratch();
-        scratch.forces.resize(mesh.n_tets() * n_own, [0.0; 3]);
+        scratch.forces.resize(nodes.mesh().n_tets() * n_own, [0.0; 3]);
         let energies: Vec<f64> = scratch
             .forces
             .par_chunks_mut(n_own)
             .enumerate()
             .map(|(t, own)| {
                 let pressure = averaged.as_ref().map_or(0.0, |a| a.pressures[t]);
-                let (density, geometry) = (self.density(t), mesh.geometry(t));
-                let weight = share * geometry.volume;
-                let mut energy = 0.0;
-                own.fill([0.0; 3]);
-                for (point, f) in self.gradients(t, u).enumerate() {
-                    let found = density.response(&f, self.kinematics, pressure);
-                    energy += found.energy;
-                    let stress = found.stress * weight;
-                    for (force, g) in own.iter_mut().zip(nodes.gradients(&geometry, point).0) {
-                        *force = (Vector3::from(*force) + stress * Vector3::from(g)).into();
-                    }
-                }
-                energy * weight
+                self.respond(t, u, pressure, own)
             })
             .collect();
         let forces = (0..nodes.n_nodes())
@@ -192,6 +182,34 @@ impl StrainEnergy {
         self.keep_scratch(scratch);
         let energy: f64 = energies.iter().sum();
         Ok(EnergyState { energy: energy + averaged.map_or(0.0, |a| a.energy), forces })
+    }
+
+    /// Energy of tet `t`, N mm; `forces` become the internal forces on its nodes, N.
+    fn respond(&self, t: usize, u: &[[f64; 3]], pressure: f64, forces: &mut [[f64; 3]]) -> f64 {
+        let nodes = self.nodes();
+        let (density, geometry) = (self.density(t), nodes.mesh().geometry(t));
+        let weight = geometry.volume / nodes.n_points() as f64;
+        let mut energy = 0.0;
+        forces.fill([0.0; 3]);
+        for (point, f) in self.gradients(t, u).enumerate() {
+            let found = density.response(&f, self.kinematics, pressure);
+            energy += found.energy;
+            let stress = found.stress * weight;
+            for (force, g) in forces.iter_mut().zip(nodes.gradients(&geometry, point).0) {
+                *force = (Vector3::from(*force) + stress * Vector3::from(g)).into();
+            }
+        }
+        energy * weight
+    }
+
+    /// Tangent at a quadrature point of tet `t` times its volume, N mm.
+    fn tangent(&self, t: usize, f: &Matrix3<f64>, kind: TangentKind, pressure: f64) -> Tangent {
+        let (density, nodes) = (self.density(t), self.nodes());
+        let tangent = match kind {
+            TangentKind::Definite => density.definite(f, self.kinematics, pressure),
+            TangentKind::Exact => density.tangent(f, self.kinematics, pressure),
+        };
+        nodes.mesh().volumes()[t] / nodes.n_points() as f64 * tangent
     }
 
     /// Begins a series of states, in the memory of an earlier one. What it finds does not depend on other series.
@@ -276,19 +294,13 @@ impl StrainEnergy {
         tangents: &mut PointTangents,
     ) {
         let n_points = self.nodes().n_points();
-        let volumes = self.nodes().mesh().volumes();
-        let n = volumes.len() * n_points;
+        let n = self.nodes().mesh().n_tets() * n_points;
         let PointTangents { values, at, lag } = tangents;
         let lag = *lag;
         values.resize(n, Tangent::zeros());
         let found = |t: usize, f: &Matrix3<f64>| {
             let pressure = averaged.map_or(0.0, |a| a.pressures[t]);
-            let density = self.density(t);
-            let tangent = match kind {
-                TangentKind::Definite => density.definite(f, self.kinematics, pressure),
-                TangentKind::Exact => density.tangent(f, self.kinematics, pressure),
-            };
-            volumes[t] / n_points as f64 * tangent
+            self.tangent(t, f, kind, pressure)
         };
         if kind == TangentKind::Exact || averaged.is_some() {
             at.clear();

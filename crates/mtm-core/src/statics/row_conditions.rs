@@ -2,11 +2,11 @@
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::constraints::{Constraint, projected};
-use crate::contact::{Constraints, Sliding, Spring};
+use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
 use crate::vector::{add, scaled};
 
 /// Constraints and springs on rows of the system.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(crate) struct RowConditions {
     /// Orthonormal on each row.
     pub constraints: Vec<Constraint>,
@@ -24,6 +24,16 @@ impl RowConditions {
                 .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
                 .collect(),
             springs: c.springs.iter().map(|&s| (row(s.node), s)).collect(),
+        }
+    }
+
+    /// The conditions of `state`: nodes that are held move no further along their normals.
+    pub fn of_state(sliding: &Sliding, state: &ContactState) -> Self {
+        let row = |node: usize| sliding.nodes()[node].row as usize;
+        let held = |r: &ContactRow| Constraint { row: row(r.node), normal: r.normal, offset: 0.0 };
+        Self {
+            constraints: state.rows.iter().map(held).collect(),
+            springs: state.springs.iter().map(|&s| (row(s.node), s)).collect(),
         }
     }
 

@@ -1,5 +1,7 @@
 //! Newton's steps downhill: which tangent each takes, and how far it goes.
 
+use std::borrow::Cow;
+
 use crate::error::{MtmError, Result};
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::effort::Solve;
@@ -8,6 +10,7 @@ use crate::statics::newton::{
     Equilibrium, MAX_STEPS, Pose, STIFF_PARTS, TangentSolver, Target, along_slope, lost, moved_by,
     reach,
 };
+use crate::statics::row_conditions::RowConditions;
 use crate::vector::{add, dot};
 
 /// Share of the slope by which a step must decrease the energy (Armijo 1966).
@@ -33,9 +36,23 @@ const WINDOW: usize = 3;
 /// whole error with such parts as well: Newton's method converges quadratically, or only rounding is left.
 const QUADRATIC: f64 = 1e-3;
 
+/// Newton's steps under the conditions at the boundary.
+pub(super) trait Steps {
+    /// The step from `pose` with this tangent, and with this error, mm.
+    ///
+    /// # Errors
+    /// Those of the solver and of contact.
+    fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step>;
+
+    /// The conditions of the last step on its rows.
+    fn conditions(&self) -> Cow<'_, RowConditions>;
+
+    /// Nodes have moved to `pose` since the last step.
+    fn resume(&mut self, pose: &Pose);
+}
+
 impl Equilibrium {
-    /// The result of Newton's steps from `pose`. `next` computes each step from a pose, the tangent to use, and
-    /// the error allowed in the step, mm.
+    /// The result of Newton's `steps` from `pose`.
     ///
     /// `finest`: the error allowed in the last step, mm; `on_walls`: the rows that no step carries further than
     /// computed.
@@ -44,7 +61,7 @@ impl Equilibrium {
         mut pose: Pose,
         target: &Target<'_>,
         (finest, on_walls): (f64, &[u32]),
-        mut next: impl FnMut(&Pose, (TangentKind, f64)) -> Result<Step>,
+        steps: &mut impl Steps,
         solve: &mut Solve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
@@ -65,11 +82,12 @@ impl Equilibrium {
                 allowed = allowed.min(finest);
             }
             let first = if length <= near { Exact } else { Definite };
-            let (mut step, mut kind) = by_tangent(first, |kind| next(&pose, (kind, allowed)))?;
+            let (mut step, mut kind) =
+                by_tangent(first, |kind| steps.next(&pose, (kind, allowed)))?;
             // Conjugate gradients do not always notice that a tangent is indefinite.
             let is_long = !by_factor && kind == Exact && step.length() > LONGER * length;
             if is_long && !self.descends_fully(&pose, target, &step) {
-                (step, kind) = (next(&pose, (Definite, allowed))?, Definite);
+                (step, kind) = (steps.next(&pose, (Definite, allowed))?, Definite);
             }
             if kind != first {
                 near = RETRY_EXACT * length;
@@ -81,24 +99,50 @@ impl Equilibrium {
             let goal = self.options.tolerance * reach(&pose, target);
             let left = if self.tissue.contrast > STIFF_PARTS {
                 left_after(&solve.effort.history[start..], goal)
-            } else if kind == Exact || length == 0.0 {
+            } else if length == 0.0 {
                 length
             } else {
-                // With a tangent that is not that of the energy, convergence is linear, at the rate of the last
-                // step.
+                // Convergence is at least linear, at the rate of the last step: with a tangent that is not that of
+                // the energy for good, with the exact one until steps are short.
                 length / (1.0 - (length / before).min(1.0))
             };
             let bound = left + allowed;
             let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
             ending = (bound <= goal).then_some(bound);
             if ending.is_some() && allowed <= finest {
-                solve.effort.error_estimate = bound;
-                return Ok(moved_by(&self.reduction, &pose.u, &step.rows, 1.0));
+                let end = moved_by(&self.reduction, &pose.u, &step.rows, 1.0);
+                let bound = bound / (1.0 - self.rate(&pose, &end, target, &steps.conditions())?);
+                if bound <= goal {
+                    solve.effort.error_estimate = bound;
+                    return Ok(end);
+                }
+                ending = None;
             }
             pose = self.search(pose, target, &step, kind, on_walls)?;
+            let (next, has_moved) = self.eased(pose, target, &steps.conditions())?;
+            pose = next;
+            if has_moved {
+                steps.resume(&pose);
+            }
         }
         let limit = self.options.tolerance * reach(&pose, target);
         Err(lost("the estimated error of a node", length, limit, " mm"))
+    }
+
+    /// Share of the error of `pose` that is left at `end`, after a step: that of the row furthest from equilibrium
+    /// on its own. Where tets are squeezed flat, a short step may be followed by a longer one.
+    fn rate(
+        &self,
+        pose: &Pose,
+        end: &[[f64; 3]],
+        target: &Target<'_>,
+        conditions: &RowConditions,
+    ) -> Result<f64> {
+        let goal = self.options.tolerance * reach(pose, target);
+        let end = self.pose(end.to_vec(), target)?;
+        let (before, after) = (self.furthest(pose, conditions), self.furthest(&end, conditions));
+        // What is left may be rounding.
+        Ok(if after <= QUADRATIC * goal { 0.0 } else { (after / before).min(1.0) })
     }
 
     /// Whether the whole `step` goes downhill.

@@ -6,10 +6,12 @@
 
 mod descent;
 mod hierarchy;
+mod local;
 mod sliding;
 mod step;
 mod tangents;
 
+use std::borrow::Cow;
 use std::cell::RefCell;
 use std::sync::{Arc, OnceLock};
 
@@ -24,9 +26,10 @@ use crate::mechanics::strain_energy::{LAG, PointTangents, StrainEnergy};
 use crate::mechanics::tensors::MassTensors;
 use crate::statics::effort::Solve;
 use crate::statics::iterative::Extremes;
+use crate::statics::newton::descent::Steps;
 use crate::statics::newton::hierarchy::SharedHierarchy;
 use crate::statics::newton::step::{Moves, Step, by_tangent};
-use crate::statics::options::{Method, StaticOptions};
+use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::reduction::{ReducedPattern, Reduction};
 use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
@@ -117,6 +120,29 @@ struct Target<'a> {
     hierarchy: &'a SharedHierarchy,
     /// The tangents that they share.
     tangents: &'a RefCell<PointTangents>,
+}
+
+/// Steps under the conditions of `target`.
+struct UnderConditions<'a, 'i> {
+    equilibrium: &'a Equilibrium,
+    target: &'a Target<'a>,
+    /// Its constraints, which move no further.
+    still: Vec<Constraint>,
+    interrupted: Interrupt<'i>,
+}
+
+impl Steps for UnderConditions<'_, '_> {
+    fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step> {
+        let moves = Moves { constraints: &self.still, change: None };
+        let rows = self.equilibrium.step(pose, self.target, &moves, how, self.interrupted)?;
+        Ok(Step { slope: along_slope(&rows, pose), slack: 0.0, rows })
+    }
+
+    fn conditions(&self) -> Cow<'_, RowConditions> {
+        Cow::Borrowed(&self.target.conditions)
+    }
+
+    fn resume(&mut self, _pose: &Pose) {}
 }
 
 /// A state, with the data from which the next step starts.
@@ -328,14 +354,9 @@ impl Equilibrium {
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
         solve.effort.iterations += 1;
 
-        let still: Vec<Constraint> =
-            constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect();
-        let step = |pose: &Pose, how: (TangentKind, f64)| {
-            let moves = Moves { constraints: &still, change: None };
-            let rows = self.step(pose, target, &moves, how, interrupted)?;
-            Ok(Step { slope: along_slope(&rows, pose), slack: 0.0, rows })
-        };
-        self.descend(pose, target, (f64::INFINITY, &[]), step, solve)
+        let still = constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect();
+        let mut steps = UnderConditions { equilibrium: self, target, still, interrupted };
+        self.descend(pose, target, (f64::INFINITY, &[]), &mut steps, solve)
     }
 
     /// Error allowed in the next step from `pose`, mm, after a step of `length`; 0 for a factorisation.

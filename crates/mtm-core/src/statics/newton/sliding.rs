@@ -2,11 +2,14 @@
 //! themselves, not under their linearisation. Each step then costs as much as a plan of a linear body, whereas
 //! contact iterations around Newton's method would cost a whole Newton run for every set of normals.
 
+use std::borrow::Cow;
+
 use crate::boundary::Motion;
 use crate::contact::{ContactState, Sliding};
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::effort::Solve;
+use crate::statics::newton::descent::Steps;
 use crate::statics::newton::hierarchy::Found;
 use crate::statics::newton::step::{Step, by_tangent};
 use crate::statics::newton::{
@@ -15,6 +18,7 @@ use crate::statics::newton::{
 };
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::restraint::Held;
+use crate::statics::row_conditions::RowConditions;
 use crate::statics::settling::{Begin, Linked, Settle, Settled};
 use crate::statics::solution::Clock;
 use crate::statics::system::{BodyRows, System};
@@ -44,6 +48,45 @@ struct Start<'a> {
     contact: Option<&'a ContactState>,
 }
 
+/// Steps of a body in contact.
+struct InContact<'a, 'i> {
+    equilibrium: &'a Equilibrium,
+    wanted: &'a Wanted<'a>,
+    /// State after the last step.
+    contact: ContactState,
+    /// Error allowed in the last step, and that which keeps contact within its required accuracy, mm.
+    before: f64,
+    fine: f64,
+    interrupted: Interrupt<'i>,
+}
+
+impl Steps for InContact<'_, '_> {
+    fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step> {
+        let start = Start { contact: Some(&self.contact), ..Start::default() };
+        let (rows, state) =
+            self.equilibrium.settled(pose, self.wanted, &start, how, self.interrupted)?;
+        let iterations = self.contact.iterations + state.iterations;
+        self.contact = ContactState { iterations, ..state };
+        // Walls do no work along themselves, and their work across gaps does not enter the energy of the body.
+        let gaps = 2.0 * how.1.max(self.before).max(self.fine);
+        self.before = how.1;
+        let slack = self.contact.forces.iter().map(|f| f.abs() * gaps).sum();
+        Ok(Step { slope: along_slope(&rows, pose).min(0.0), slack, rows })
+    }
+
+    fn conditions(&self) -> Cow<'_, RowConditions> {
+        Cow::Owned(RowConditions::of_state(self.wanted.slide.sliding, &self.contact))
+    }
+
+    fn resume(&mut self, pose: &Pose) {
+        let ContactState { displacements, reactions, .. } = &mut self.contact;
+        let nodes = self.wanted.slide.sliding.nodes();
+        for ((node, u), force) in nodes.iter().zip(displacements).zip(reactions) {
+            (*u, *force) = (pose.u[node.node as usize], pose.slope[node.row as usize]);
+        }
+    }
+}
+
 impl Equilibrium {
     /// The state of `target` with contact at equilibrium, from rest.
     ///
@@ -65,7 +108,7 @@ impl Equilibrium {
         // Walls move the body even if no node is joined to one.
         let far = slide.sliding.farthest(slide.motions).max(reach(&rest, target));
         let first = far * STEP_SHARE.max(STEP_TOLERANCE * self.options.tolerance);
-        let ((rows, mut contact), _) = by_tangent(Exact, |kind| {
+        let ((rows, contact), _) = by_tangent(Exact, |kind| {
             let start = Start { change: Some(&change), ..Start::default() };
             self.settled(&rest, &wanted, &start, (kind, first), interrupted)
         })?;
@@ -75,22 +118,12 @@ impl Equilibrium {
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
         // Error of a step that keeps contact within its required accuracy, mm.
         let fine = slide.sliding.gap_limit(&self.options.contact);
-        let mut before = first;
         let on_walls: Vec<u32> = slide.sliding.nodes().iter().map(|n| n.row).collect();
-        let step = |pose: &Pose, how: (TangentKind, f64)| {
-            let start = Start { contact: Some(&contact), ..Start::default() };
-            let (rows, state) = self.settled(pose, &wanted, &start, how, interrupted)?;
-            contact = ContactState { iterations: contact.iterations + state.iterations, ..state };
-            // Walls do no work along themselves, and their work across gaps does not enter the energy of the
-            // body.
-            let gaps = 2.0 * how.1.max(before).max(fine);
-            before = how.1;
-            let slack = contact.forces.iter().map(|f| f.abs() * gaps).sum();
-            Ok(Step { slope: along_slope(&rows, pose).min(0.0), slack, rows })
-        };
-        let last = (fine, &on_walls[..]);
-        let u = self.descend(pose, target, last, step, solve)?;
-        Ok((u, contact))
+        let wanted = &wanted;
+        let mut steps =
+            InContact { equilibrium: self, wanted, contact, before: first, fine, interrupted };
+        let u = self.descend(pose, target, (fine, &on_walls), &mut steps, solve)?;
+        Ok((u, steps.contact))
     }
 
     /// The step of the rows that solves the tangent system at `pose` with contact at equilibrium.
