@@ -4,6 +4,7 @@
 //! negative curvature at each integration point has been removed, so that every step goes downhill. Sliding
 //! constraints n·u = g are enforced by projection, as in the linear system.
 
+mod conditions;
 mod descent;
 mod hierarchy;
 mod local;
@@ -11,25 +12,20 @@ mod sliding;
 mod step;
 mod tangents;
 
-use std::borrow::Cow;
 use std::cell::RefCell;
 use std::sync::{Arc, OnceLock};
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::Symbolic;
-use crate::algebra::constraints::Constraint;
 use crate::algebra::multigrid::Multigrid;
 use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
-use crate::mechanics::strain_energy::TangentKind::{self, Exact};
 use crate::mechanics::strain_energy::{LAG, PointTangents, StrainEnergy};
 use crate::mechanics::tensors::MassTensors;
 use crate::statics::effort::Solve;
 use crate::statics::iterative::Extremes;
-use crate::statics::newton::descent::Steps;
 use crate::statics::newton::hierarchy::SharedHierarchy;
-use crate::statics::newton::step::{Moves, Step, by_tangent};
-use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::options::{Method, StaticOptions};
 use crate::statics::reduction::{ReducedPattern, Reduction};
 use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
@@ -120,29 +116,6 @@ struct Target<'a> {
     hierarchy: &'a SharedHierarchy,
     /// The tangents that they share.
     tangents: &'a RefCell<PointTangents>,
-}
-
-/// Steps under the conditions of `target`.
-struct UnderConditions<'a, 'i> {
-    equilibrium: &'a Equilibrium,
-    target: &'a Target<'a>,
-    /// Its constraints, which move no further.
-    still: Vec<Constraint>,
-    interrupted: Interrupt<'i>,
-}
-
-impl Steps for UnderConditions<'_, '_> {
-    fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step> {
-        let moves = Moves { constraints: &self.still, change: None };
-        let rows = self.equilibrium.step(pose, self.target, &moves, how, self.interrupted)?;
-        Ok(Step { slope: along_slope(&rows, pose), slack: 0.0, rows })
-    }
-
-    fn conditions(&self) -> Cow<'_, RowConditions> {
-        Cow::Borrowed(&self.target.conditions)
-    }
-
-    fn resume(&mut self, _pose: &Pose) {}
 }
 
 /// A state, with the data from which the next step starts.
@@ -315,48 +288,6 @@ impl Equilibrium {
             }
         }
         Ok(here)
-    }
-
-    /// Equilibrium at `part` of the way from the boundary of `u` to that of `target`.
-    fn advance(
-        &self,
-        u: &[[f64; 3]],
-        target: &Target<'_>,
-        part: f64,
-        solve: &mut Solve<'_>,
-    ) -> Result<Vec<[f64; 3]>> {
-        // The boundary moves; the unknowns follow as predicted by the tangent.
-        let mut moved = target.prescribed.to_vec();
-        for &j in &self.reduction.unknowns {
-            moved[j as usize] = u[j as usize];
-        }
-        let change: Vec<[f64; 3]> =
-            moved.iter().zip(u).map(|(a, b)| scaled(sub(*a, *b), part)).collect();
-        let start = self.pose(u.to_vec(), target)?;
-        let along = |c: &Constraint| dot(c.normal, u[self.reduction.unknowns[c.row] as usize]);
-        let constraints: Vec<Constraint> = target
-            .conditions
-            .constraints
-            .iter()
-            .map(|c| Constraint { offset: part * (c.offset - along(c)), ..*c })
-            .collect();
-        let allowed = self.allowed(&start, target, f64::INFINITY);
-        let interrupted = solve.interrupted;
-        let (rows, _) = by_tangent(Exact, |kind| {
-            let moves = Moves { constraints: &constraints, change: Some(&change) };
-            self.step(&start, target, &moves, (kind, allowed), interrupted)
-        })?;
-        target.hierarchy.leave_rest(&self.at_rest);
-        let mut ahead = start.u;
-        for (value, d) in ahead.iter_mut().zip(&change) {
-            *value = add(*value, *d);
-        }
-        let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
-        solve.effort.iterations += 1;
-
-        let still = constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect();
-        let mut steps = UnderConditions { equilibrium: self, target, still, interrupted };
-        self.descend(pose, target, (f64::INFINITY, &[]), &mut steps, solve)
     }
 
     /// Error allowed in the next step from `pose`, mm, after a step of `length`; 0 for a factorisation.
