@@ -51,8 +51,9 @@ class _OneAtATime:
         self.lock = threading.Lock()
 
 
-# fast-simplification keeps its mesh in global variables and releases Python's lock while it works:
-# two threads inside it exchange their meshes without an error.
+# fast-simplification keeps its mesh in global variables: two threads inside it would exchange
+# their meshes without an error. Version 0.2.0 holds Python's lock while it works, but does not
+# promise to.
 _DECIMATING = _OneAtATime()
 
 
