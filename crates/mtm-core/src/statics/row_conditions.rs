@@ -3,7 +3,7 @@
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::constraints::{Constraint, projected};
 use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
-use crate::vector::{add, scaled};
+use crate::vector::{add, dot, scaled};
 
 /// Constraints and springs on rows of the system.
 #[derive(Clone, Default)]
@@ -17,23 +17,26 @@ pub(crate) struct RowConditions {
 impl RowConditions {
     /// The conditions that `c` sets for the sliding nodes.
     pub fn new(sliding: &Sliding, c: &Constraints<'_>) -> Self {
-        let row = |node: usize| sliding.nodes()[node].row as usize;
-        let rows = c.rows.iter().zip(c.offsets);
-        Self {
-            constraints: rows
-                .map(|(r, &offset)| Constraint { row: row(r.node), normal: r.normal, offset })
-                .collect(),
-            springs: c.springs.iter().map(|&s| (row(s.node), s)).collect(),
-        }
+        Self::on_rows(sliding, c.rows.iter().zip(c.offsets.iter().copied()), c.springs)
     }
 
     /// The conditions of `state`: nodes that are held move no further along their normals.
     pub fn of_state(sliding: &Sliding, state: &ContactState) -> Self {
+        Self::on_rows(sliding, state.rows.iter().map(|r| (r, 0.0)), &state.springs)
+    }
+
+    /// `held`: rows of contact, each with its offset, mm.
+    fn on_rows<'a>(
+        sliding: &Sliding,
+        held: impl Iterator<Item = (&'a ContactRow, f64)>,
+        springs: &[Spring],
+    ) -> Self {
         let row = |node: usize| sliding.nodes()[node].row as usize;
-        let held = |r: &ContactRow| Constraint { row: row(r.node), normal: r.normal, offset: 0.0 };
         Self {
-            constraints: state.rows.iter().map(held).collect(),
-            springs: state.springs.iter().map(|&s| (row(s.node), s)).collect(),
+            constraints: held
+                .map(|(r, offset)| Constraint { row: row(r.node), normal: r.normal, offset })
+                .collect(),
+            springs: springs.iter().map(|&s| (row(s.node), s)).collect(),
         }
     }
 
@@ -44,6 +47,20 @@ impl RowConditions {
             system.add_to_diagonal(*row, s.axis, s.stiffness);
         }
         system
+    }
+
+    /// Adds the energy of the springs, N mm, and its slope, N, under the displacement `u` of each row, mm.
+    pub fn add_stretch(
+        &self,
+        energy: &mut f64,
+        slope: &mut [[f64; 3]],
+        u: impl Fn(usize) -> [f64; 3],
+    ) {
+        for (row, s) in &self.springs {
+            let stretch = dot(s.axis, u(*row)) - s.goal;
+            slope[*row] = add(slope[*row], scaled(s.axis, s.stiffness * stretch));
+            *energy += 0.5 * s.stiffness * stretch * stretch;
+        }
     }
 
     /// Adds the forces of the springs at rest to the right-hand side `b`, N.

@@ -17,20 +17,20 @@ use crate::vector::{add, dot, scaled, sub};
 struct UnderConditions<'a, 'i> {
     equilibrium: &'a Equilibrium,
     target: &'a Target<'a>,
-    /// Its constraints, which move no further.
-    still: Vec<Constraint>,
+    /// Its conditions, whose constraints move no further.
+    still: RowConditions,
     interrupted: Interrupt<'i>,
 }
 
 impl Steps for UnderConditions<'_, '_> {
     fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step> {
-        let moves = Moves { constraints: &self.still, change: None };
+        let moves = Moves { constraints: &self.still.constraints, change: None };
         let rows = self.equilibrium.step(pose, self.target, &moves, how, self.interrupted)?;
         Ok(Step { slope: along_slope(&rows, pose), slack: 0.0, rows })
     }
 
     fn conditions(&self) -> Cow<'_, RowConditions> {
-        Cow::Borrowed(&self.target.conditions)
+        Cow::Borrowed(&self.still)
     }
 
     fn resume(&mut self, _pose: &Pose) {}
@@ -74,7 +74,10 @@ impl Equilibrium {
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
         solve.effort.iterations += 1;
 
-        let still = constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect();
+        let still = RowConditions {
+            constraints: constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect(),
+            springs: target.conditions.springs.clone(),
+        };
         let mut steps = UnderConditions { equilibrium: self, target, still, interrupted };
         self.descend(pose, target, (f64::INFINITY, &[]), &mut steps, solve)
     }

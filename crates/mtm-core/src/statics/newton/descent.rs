@@ -44,7 +44,7 @@ pub(super) trait Steps {
     /// Those of the solver and of contact.
     fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step>;
 
-    /// The conditions of the last step on its rows.
+    /// The conditions of the last step on its rows, whose constraints move no further.
     fn conditions(&self) -> Cow<'_, RowConditions>;
 
     /// Nodes have moved to `pose` since the last step.

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
-use crate::algebra::constraints::{Constraint, projected};
+use crate::algebra::constraints::{Constraint, add_offsets, projected};
 use crate::contact::Spring;
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
@@ -85,10 +85,7 @@ impl Equilibrium {
     fn distances(&self, pose: &Pose, conditions: &RowConditions) -> Vec<f64> {
         let stiffness = self.tensors.matrix();
         let mut forces = pose.slope.clone();
-        for c in &conditions.constraints {
-            let along = dot(forces[c.row], c.normal);
-            forces[c.row] = sub(forces[c.row], scaled(c.normal, along));
-        }
+        add_offsets(&mut forces, &conditions.constraints);
         forces
             .iter()
             .zip(&self.reduction.unknowns)
@@ -157,7 +154,7 @@ fn within(conditions: &RowConditions, rows: &[u32]) -> RowConditions {
     let springs = conditions.springs.iter();
     RowConditions {
         constraints: constraints
-            .filter_map(|c| Some(Constraint { row: place(c.row)?, offset: 0.0, ..*c }))
+            .filter_map(|c| Some(Constraint { row: place(c.row)?, ..*c }))
             .collect(),
         springs: springs.filter_map(|(row, s)| Some((place(*row)?, *s))).collect(),
     }
@@ -213,16 +210,9 @@ impl Local<'_> {
             *force = sub(*force, *load);
             state.energy -= dot(*load, u[j as usize]);
         }
-        for (row, spring) in &self.conditions.springs {
-            let stretch = dot(spring.axis, u[nodes[*row] as usize]) - spring.goal;
-            let force = &mut state.forces[*row];
-            *force = add(*force, scaled(spring.axis, spring.stiffness * stretch));
-            state.energy += 0.5 * spring.stiffness * stretch * stretch;
-        }
-        for c in &self.conditions.constraints {
-            let force = &mut state.forces[c.row];
-            *force = sub(*force, scaled(c.normal, dot(*force, c.normal)));
-        }
+        let EnergyState { energy, forces } = &mut state;
+        self.conditions.add_stretch(energy, forces, |row| u[nodes[row] as usize]);
+        add_offsets(&mut state.forces, &self.conditions.constraints);
         state
     }
 

@@ -313,12 +313,8 @@ impl Equilibrium {
                 size += work.abs();
             }
         }
-        for (row, spring) in &target.conditions.springs {
-            let j = self.reduction.unknowns[*row] as usize;
-            let stretch = dot(spring.axis, u[j]) - spring.goal;
-            slope[*row] = add(slope[*row], scaled(spring.axis, spring.stiffness * stretch));
-            merit += 0.5 * spring.stiffness * stretch * stretch;
-        }
+        let place = |row: usize| u[self.reduction.unknowns[row] as usize];
+        target.conditions.add_stretch(&mut merit, &mut slope, place);
         if !merit.is_finite() {
             let limit = self.options.tolerance * target.scale;
             return Err(lost("the estimated error of a node", f64::INFINITY, limit, " mm"));
