@@ -101,9 +101,10 @@ def test_noise_is_averaged_out_and_what_has_none_is_let_be():
     assert found.noise == pytest.approx(0.2 * np.sqrt(3.0), rel=0.1)
     left = np.linalg.norm(np.asarray(found.motion.moved_vertices) - there, axis=1)
     assert np.sqrt((left**2).mean()) < 0.35 * found.noise
+    # A smooth bend of 1 mm, along the surface where it is largest, is kept but for a third.
     bent = there + np.outer((vertices[:, 0] / 30.0) ** 2, [0.0, 1.0, 0.0])
     found = coherent_motion(cmfsim.MovedSurface(surface, bent))
-    assert np.linalg.norm(np.asarray(found.motion.moved_vertices) - bent, axis=1).max() < 0.25
+    assert np.linalg.norm(np.asarray(found.motion.moved_vertices) - bent, axis=1).max() < 0.35
 
 
 def test_triangles_without_area_are_left_out_on_both_sides():
