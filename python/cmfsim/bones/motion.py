@@ -1,21 +1,18 @@
-"""Bone motions given vertex by vertex: the cuts that they show, and their noise.
+"""Bone motions given vertex by vertex: the cuts that they show, and bone that is missing.
 
 A skull whose jaw was cut and moved may be given as one surface, before and after. Across the cut,
 neighbouring vertices move apart, and the triangles between them are torn: they cover no bone.
-`torn_pieces` removes them and returns the pieces, each of which moved as one.
-
-Where bone was ground away, the vertices after the operation lie inside the bone before it. They did
-not move there: their bone is gone. `without_removed` lets them follow the rest of the piece.
+`torn_pieces` removes them and returns the pieces, each of which moved as one. If the mesh holds
+together across the cut, `coherent_motion` finds the pieces.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, SurfaceMotion, rigid_fit
-from cmfsim.errors import BoundaryInputError, RegistrationError, third_party
+from cmfsim.errors import BoundaryInputError, RegistrationError
 from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.checks import Floats
@@ -26,10 +23,8 @@ __all__ = [
     "RemovedBone",
     "missing_patches",
     "moves_as_one",
-    "smooth_motion",
     "sound_motion",
     "torn_pieces",
-    "without_removed",
 ]
 
 # An edge is torn if its ends move apart by more than this, mm, and by more than this share of its
@@ -43,34 +38,15 @@ LEAST_AREA = 150.0
 ALIKE = 1.0
 # Vertices of a piece at which the motion of another piece is evaluated.
 SAMPLES = 2000
-# Neighbourhood over which a noisy motion is averaged: the standard deviation of its weights, mm.
-# Some thirty vertices of a skull at 1.5 mm lie in it, and bone does not bend within it.
-AVERAGED = 3.0
-# Weights end here, in standard deviations.
-REACH = 2.0
-# Noise that is tolerated, mm rms: a tenth of the accuracy of a segmented bone.
-QUIET = 0.03
-
-# A patch of bone was removed if a vertex of it went further than the first from where the rest of
-# the piece would take it, mm, and lies deeper than the second inside the bone before; the patch
-# reaches as far as its vertices are off by the third: three times the noise of a segmented bone.
-REMOVED, REMOVED_DEPTH, REMOVED_RIM = 1.5, 0.75, 0.75
-# Such a patch ends abruptly: this far around it, the median deviation of vertices is at most this
-# share of the largest in the patch. A bone that bends deviates all around.
-RING, RING_SHARE = 6.0, 0.35
-# A larger share of a piece was not ground away: it is how the piece moved.
-MOST_REMOVED = 0.2
-# Vertices that a motion is fitted to; rounds of fitting, each to the share of vertices nearest.
-LEAST_FITTED, FIT_ROUNDS, FIT_SHARE = 50, 20, 0.75
+# A patch of bone is missing if a vertex of it lies further than this from the bone after, mm; it
+# reaches as far as its vertices are off by the second: three times the noise of a segmented bone.
+REMOVED, REMOVED_RIM = 1.5, 0.75
 # What lies further from the bone after than this, mm, is not shown by its scan; patches smaller
 # than this, mm², are corners of a cut.
 SHOWN, LEAST_PATCH = 10.0, 10.0
 # With holes of this share of the area, measured by the sum of all area vectors, inside and outside
 # can still be distinguished: they change the winding number by a hundredth.
 CLOSED_SHARE = 0.01
-# Share of the volume that a map must keep for its inverse to be meaningful.
-LEAST_DETERMINANT = 0.1
-
 Integers = NDArray[np.int64]
 
 
@@ -172,99 +148,6 @@ def moves_as_one(one: MovedSurface, other: MovedSurface) -> bool:
     return any(_misses(a, b) <= ALIKE for a, b in ((one, other), (other, one)))
 
 
-def smooth_motion(motion: MovedSurface) -> tuple[MovedSurface, float]:
-    """The motion without the noise of its vertices, and the size of that noise, mm rms.
-
-    The best rigid motion is kept; the deviations of the vertices from it are averaged over their
-    neighbours within some millimetres (Gaussian weights by area). A motion with much less noise
-    than a segmented bone is returned unchanged.
-    """
-    here, there = motion.surface.vertices, motion.moved_vertices
-    rigid = _rigid(here, there)
-    if rigid is None:
-        return motion, 0.0
-    rest = there - (here @ rigid[:3, :3].T + rigid[:3, 3])
-    if float(np.sqrt((rest**2).sum(axis=1).mean())) <= QUIET:
-        return motion, 0.0
-    smooth = _averaged(here, rest)
-    noise = float(np.sqrt(((rest - smooth) ** 2).sum(axis=1).mean()))
-    if noise <= QUIET:
-        return motion, noise
-    return MovedSurface(motion.surface, there - rest + smooth), noise
-
-
-def without_removed(motion: MovedSurface) -> tuple[MovedSurface, tuple[RemovedBone, ...]]:
-    """The motion in which vertices over removed bone move with the rest, and the removed patches.
-
-    The motion of the rest is an affine map fitted to the vertices that agree best, so a bone that
-    bends a little, or is measured a few per cent too small, does not count as removed.
-
-    Parameters
-    ----------
-    motion : MovedSurface
-        Of one piece (`torn_pieces`).
-
-    Returns
-    -------
-    motion : MovedSurface
-        As given if no bone was removed.
-    removed : tuple of RemovedBone
-        The largest first.
-
-    Notes
-    -----
-    Mechanics: bone that is ground away does not pull the tissue over it to the new surface. Tissue
-    that was attached to it moves as if it were attached to the segment; that it later sinks into
-    the space is not modelled.
-    """
-    here, there = motion.surface.vertices, motion.moved_vertices
-    triangles = motion.surface.triangles.astype(np.int64)
-    if len(here) < LEAST_FITTED:
-        return motion, ()
-    expected = _rest_of(here, there)
-    if expected is None:
-        return motion, ()
-    went, back = expected
-    off = np.linalg.norm(there - went, axis=1)
-    if not (off > REMOVED).any():
-        return motion, ()
-    # In the frame before: the present place of a vertex relative to the rest of the bone.
-    seen = back(there)
-    surface = Surface(motion.surface.vertices, motion.surface.triangles)
-    far = np.flatnonzero(off > REMOVED_RIM)
-    depth = np.zeros(len(here))
-    inside = surface.winding_number(seen[far]) > 0.5
-    deep = far[inside]
-    depth[deep] = np.linalg.norm(surface.closest(seen[deep])[0] - seen[deep], axis=1)
-    seed = (off > REMOVED) & (depth > REMOVED_DEPTH)
-    if not seed.any():
-        return motion, ()
-    ends = edges_of(triangles).ends
-    loose = off > REMOVED_RIM
-    label = connected_labels(ends[loose[ends].all(axis=1)], len(here))
-    areas = _areas(here, triangles)
-    total = float(areas.sum())
-    corrected, found = there.copy(), []
-    for number in np.unique(label[seed]):
-        patch = (label == number) & loose
-        area = float(areas[patch[triangles].any(axis=1)].sum())
-        box = (here >= here[patch].min(axis=0) - RING) & (here <= here[patch].max(axis=0) + RING)
-        ring = box.all(axis=1) & ~patch
-        worst = int(np.argmax(np.where(patch, off, 0.0)))
-        if area > MOST_REMOVED * total or not ring.any():
-            continue
-        if float(np.median(off[ring])) > RING_SHARE * off[worst]:
-            continue
-        corrected[patch] = went[patch]
-        found.append(
-            RemovedBone(area, float(off[worst]), here[worst].copy(), np.flatnonzero(patch))
-        )
-    if not found:
-        return motion, ()
-    found.sort(key=lambda patch: -patch.area)
-    return MovedSurface(motion.surface, corrected), tuple(found)
-
-
 def missing_patches(
     segment: SurfaceData, bone: Surface, matrix: Floats, *, shown: float = SHOWN
 ) -> tuple[RemovedBone, ...]:
@@ -320,50 +203,6 @@ def _encloses(bone: Surface) -> bool:
     # The area vectors of a closed surface sum to zero.
     open_area = 0.5 * np.linalg.norm(np.cross(b - a, c - a).sum(axis=0))
     return bool(open_area <= CLOSED_SHARE * bone.area)
-
-
-def _rest_of(here: Floats, there: Floats) -> tuple[Floats, Callable[[Floats], Floats]] | None:
-    """The images of all vertices under the affine map of most of them, and the map's inverse."""
-    middle = here.mean(axis=0)
-    columns = np.column_stack([here - middle, np.ones(len(here))])
-    kept = np.ones(len(here), dtype=bool)
-    for _ in range(FIT_ROUNDS):
-        # A flat piece does not determine the map across it: the smallest one is taken.
-        coefficients = np.linalg.lstsq(columns[kept], there[kept], rcond=1e-6)[0]
-        off = np.linalg.norm(columns @ coefficients - there, axis=1)
-        nearest = off <= max(float(np.quantile(off, FIT_SHARE)), REMOVED_RIM / 3.0)
-        if np.array_equal(nearest, kept):
-            break
-        kept = nearest
-    linear = coefficients[:3]
-    if abs(float(np.linalg.det(linear))) < LEAST_DETERMINANT:
-        return None
-
-    def back(points: Floats) -> Floats:
-        moved: Floats = np.linalg.solve(linear.T, (points - coefficients[3]).T).T + middle
-        return moved
-
-    moved: Floats = columns @ coefficients
-    return moved, back
-
-
-def _averaged(points: Floats, values: Floats) -> Floats:
-    """The values averaged over neighbours in space, including the point itself."""
-    tree = third_party(
-        "scipy.spatial", "noise of a moved surface is averaged", "imaging", BoundaryInputError
-    ).cKDTree(points)
-    pairs = tree.query_pairs(REACH * AVERAGED, output_type="ndarray")
-    size = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
-    weight = np.exp(-0.5 * (size / AVERAGED) ** 2)
-    total, summed = np.ones(len(points)), values.copy()
-    for a, b in ((0, 1), (1, 0)):
-        total += np.bincount(pairs[:, a], weight, len(points))
-        for axis in range(3):
-            summed[:, axis] += np.bincount(
-                pairs[:, a], weight * values[pairs[:, b], axis], len(points)
-            )
-    averaged: Floats = summed / total[:, None]
-    return averaged
 
 
 def _misses(one: MovedSurface, other: MovedSurface) -> float:

@@ -16,7 +16,7 @@ from cmfsim.values.finding import Finding
 if TYPE_CHECKING:
     from cmfsim.bones.achieved import AchievedMotion
 
-__all__ = ["motion_findings", "plan_key", "removed_finding"]
+__all__ = ["motion_findings", "plan_key"]
 
 # A size that differs by less was segmented otherwise, and is not reported. From the second on it is
 # a warning, as for bones that are followed vertex by vertex.
@@ -37,27 +37,59 @@ def motion_findings(
 
     `skull` is how the bone that was left alone lies on the one after, where it is known.
     """
-    by_shape = found.method != "vertices"
-    if by_shape:
-        severity = "warning" if found.method == "shape" else "note"
-        yield from (removed_finding(name, where, patch, severity) for patch in found.removed)
-        yield from (_stray_finding(name, where, patch, is_still=is_still) for patch in found.stray)
+    severity = "note" if found.method == "icp" else "warning"
+    yield from (_removed_finding(name, where, patch, severity) for patch in found.removed)
     fit = found.fit
-    if not by_shape or fit is None:
-        if not (is_still or found.is_rigid):
-            yield _bent_finding(name, where, fit)
+    if found.method == "vertices" or fit is None:
+        yield from _vertex_findings(found, name, where, is_still=is_still)
         return
+    yield from (_stray_finding(name, where, patch, is_still=is_still) for patch in found.stray)
     yield from _size_findings(name, where, fit, None if is_still else skull)
     yield from (_open_finding(name, where, way, found.method) for way in fit.open)
     if found.slip > SLID:
+        yield _slip_finding(name, where, found.slip, "median", "its shape did not change")
+
+
+def _vertex_findings(
+    found: AchievedMotion, name: str, where: str, *, is_still: bool
+) -> Iterator[Finding]:
+    """Findings about a bone that is followed vertex by vertex."""
+    if len(found.pieces) > 1:
+        areas = ", ".join(f"{piece.area / 100.0:.0f}" for piece in found.pieces)
         yield Finding.note(
-            "motion-slip",
-            f"the vertices of {name} slid along its surface by {found.slip:.1f} mm (median)",
+            "motion-pieces",
+            f"{name} moved as {len(found.pieces)} rigid pieces within its surface, of {areas} cm²",
             where=where,
-            why="its shape did not change, so the slip is that of the fitted mesh, not of the "
-            "bone, and is subtracted",
+            why="each piece is followed along its normals; between pieces the vertices are "
+            "followed as they are",
+            fix="nothing to do; check the picture of the plan",
+        )
+    elif not (is_still or found.is_rigid):
+        yield _bent_finding(name, where, found.fit)
+    if found.slip > SLID:
+        why = "bending explains less motion along the surface than the vertices show"
+        yield _slip_finding(name, where, found.slip, "rms", why)
+    if found.noise > 0.0:
+        yield Finding.note(
+            "motion-noisy",
+            f"the vertices of {name} moved with {found.noise:.2f} mm of noise, which is averaged "
+            "out",
+            where=where,
+            why="bone does not bend from one vertex to the next, and the noise would crumple the "
+            "tissue on it",
             fix="nothing to do",
         )
+
+
+def _slip_finding(name: str, where: str, slip: float, measure: str, why: str) -> Finding:
+    """Vertices of a fitted mesh that slid along the bone."""
+    return Finding.note(
+        "motion-slip",
+        f"the vertices of {name} slid along its surface by {slip:.1f} mm ({measure})",
+        where=where,
+        why=f"{why}, so the slip is that of the fitted mesh, not of the bone, and is subtracted",
+        fix="nothing to do",
+    )
 
 
 def _size_findings(
@@ -130,14 +162,14 @@ def _bent_finding(name: str, where: str, fit: ShapeFit | None) -> Finding:
         "motion-bent",
         f"{name} has a different shape after the operation: {left}",
         where=where,
-        why="bone does not bend during an operation; each vertex is followed, so if the mesh "
-        "slid along the bone, the slip counts as motion",
+        why="bone does not bend during an operation; each vertex is followed along the normal of "
+        "the bone, and along the bone as far as bending explains it",
         fix="if a piece was cut, make it a separate segment in [[osteotomies]]; otherwise check "
         "both segmentations and the picture of the plan",
     )
 
 
-def removed_finding(name: str, where: str, patch: RemovedBone, severity: str) -> Finding:
+def _removed_finding(name: str, where: str, patch: RemovedBone, severity: str) -> Finding:
     """A patch of bone that is not there after the operation."""
     at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
     used = (

@@ -9,16 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cmfsim.bones import part_segment
-from cmfsim.bones.motion import smooth_motion, sound_motion, torn_pieces, without_removed
+from cmfsim.bones.motion import sound_motion, torn_pieces
 from cmfsim.doctor.moved_bones import check_pairs
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface
 from cmfsim.pipeline.building.inputs import motion_source, read_motion
-from cmfsim.pipeline.building.motion_findings import (
-    motion_findings,
-    plan_key,
-    removed_finding,
-)
+from cmfsim.pipeline.building.motion_findings import motion_findings, plan_key
 from cmfsim.pipeline.building.postoperative import REFERENCES, Postoperative, read_postoperative
 from cmfsim.surfaces.repair import clean_surface
 from cmfsim.values.anatomy import BoneSegment
@@ -139,10 +135,10 @@ def _with_motions(
     motions: Motions,
     measured: dict[str, AchievedMotion],
 ) -> PlannedBones:
-    """The segments with their motions, parted where these are torn.
+    """The segments with their motions, separated where these are torn.
 
     Motions by vertices come from surfaces before and after: what vertices slid along the bone is
-    taken off, and what was found is entered in `measured`.
+    subtracted, and what was found is entered in `measured`.
     """
     findings: list[Finding] = []
     parted: list[BoneSegment] = []
@@ -156,37 +152,25 @@ def _with_motions(
             continue
         motion = sound_motion(motion)
         # Vertices over resected bone are squeezed, as if torn off: the whole is asked first.
-        whole = _by_shape(segment.name, motion, measured, is_still=segment.name in REFERENCES)
-        if whole is not None:
-            parted.append(segment)
-            planned[segment.name] = whole
-            continue
-        for piece, its_own in _parted(case, segment, motion, findings):
+        found = _measured(motion, is_still=segment.name in REFERENCES)
+        whole = found.method == "shape" or found.is_rigid
+        pieces = [(segment, motion)] if whole else _parted(case, segment, motion, findings)
+        for piece, its_own in pieces:
+            if len(pieces) > 1:
+                found = _measured(its_own, is_still=piece.name in REFERENCES)
             parted.append(piece)
-            still = piece.name in REFERENCES
-            known = _by_shape(piece.name, its_own, measured, is_still=still)
-            if known is None:
-                kept = _without_removed(case, segment.name, piece.name, its_own, findings)
-                known = _quiet(case, segment.name, piece.name, kept, findings)
-            planned[piece.name] = known
+            measured[piece.name] = found
+            by_vertex = found.method == "vertices" and found.moved is not None
+            planned[piece.name] = found.moved if by_vertex else found.plan
     return PlannedBones(tuple(parted), planned, tuple(findings))
 
 
-def _by_shape(
-    name: str,
-    motion: MovedSurface,
-    measured: dict[str, AchievedMotion],
-    *,
-    is_still: bool,
-) -> Floats | MovedSurface | None:
-    """The motion of a piece without slip, if the bone after is the bone before that moved."""
+def _measured(motion: MovedSurface, *, is_still: bool) -> AchievedMotion:
+    """The motion of a piece without slip, noise and bone that was removed."""
     from cmfsim.bones.achieved import measure_pair  # noqa: PLC0415
 
     after = SurfaceData(motion.moved_vertices, motion.surface.triangles)
-    found = measure_pair(motion.surface, after, is_still=is_still)
-    measured[name] = found
-    # Rigid to the last vertex, or of another shape: vertices are followed.
-    return found.plan if found.method == "shape" else None
+    return measure_pair(motion.surface, after, is_still=is_still)
 
 
 def _achieved_bones(
@@ -311,32 +295,3 @@ def _parted(
 
 def _numbered(name: str, number: int) -> str:
     return name if number == 0 else f"{name}_{number + 1}"
-
-
-def _without_removed(
-    case: Case, bone: str, name: str, motion: MovedSurface, findings: list[Finding]
-) -> MovedSurface:
-    """The motion in which removed bone moves nothing, and a finding for each patch of it."""
-    sound, removed = without_removed(motion)
-    where = case.where(plan_key(case, bone))
-    findings += [removed_finding(name, where, patch, "warning") for patch in removed]
-    return sound
-
-
-def _quiet(
-    case: Case, bone: str, name: str, motion: MovedSurface, findings: list[Finding]
-) -> MovedSurface:
-    """The motion without the noise of a measurement, which is said."""
-    smooth, noise = smooth_motion(motion)
-    if smooth is not motion:
-        findings.append(
-            Finding.note(
-                "motion-noisy",
-                f"the vertices of {name} moved with {noise:.2f} mm of noise, which is averaged out",
-                where=case.where(plan_key(case, bone)),
-                why="bone does not bend from one vertex to the next, and the noise would "
-                "crumple the tissue on it",
-                fix="nothing to do",
-            )
-        )
-    return smooth
