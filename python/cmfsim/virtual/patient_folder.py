@@ -7,7 +7,7 @@ import platform
 import shutil
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,14 @@ from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.carried_skin import scanned
 from cmfsim.virtual.equilibrium import EquilibriumOptions
-from cmfsim.virtual.people import DRAWN, PATIENTS, Relocation, VirtualPatient, patient_named
+from cmfsim.virtual.people import (
+    DRAWN,
+    PATIENTS,
+    Relocation,
+    TrueTissue,
+    VirtualPatient,
+    patient_named,
+)
 from cmfsim.virtual.truth import PostoperativeTruth, postoperative_truth
 
 __all__ = [
@@ -402,7 +409,12 @@ def _described(patient: VirtualPatient) -> dict[str, Any]:
         "plan": {name: asdict(move) for name, move in patient.plan.items()},
         "departures": {name: asdict(move) for name, move in patient.departures.items()},
         "thickness_change": patient.thickness_change,
+        "tissue": {f.name: _plain(getattr(patient.tissue, f.name)) for f in fields(TrueTissue)},
     }
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else value
 
 
 def _measured(truth: PostoperativeTruth) -> dict[str, Any]:

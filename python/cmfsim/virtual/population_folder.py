@@ -31,7 +31,7 @@ from cmfsim.virtual.patient_folder import (
     write_virtual_patient,
 )
 from cmfsim.virtual.people import VirtualPatient
-from cmfsim.virtual.population import drawn_patient
+from cmfsim.virtual.population import OWN, drawn_patient
 
 __all__ = ["PatientOutcome", "make_patient", "virtual_population"]
 
@@ -71,23 +71,25 @@ class _Job:
     index: int
     edge_length: float
     spacing: float
+    truth: str = OWN
 
     @property
     def patient(self) -> VirtualPatient:
-        return drawn_patient(self.seed, self.index)
+        return drawn_patient(self.seed, self.index, truth=self.truth)
 
     @property
     def settings(self) -> dict[str, Any]:
         return patient_settings(self.patient, self.seed, self.edge_length, self.spacing)
 
 
-def virtual_population(
+def virtual_population(  # noqa: PLR0913 (options by name)
     folder: str | os.PathLike[str],
     count: int,
     *,
     seed: int = 0,
     edge_length: float = 6.0,
     spacing: float = 2.0,
+    truth: str = OWN,
     workers: int = 1,
     scheduler: str | None = None,
     progress: Callable[[PatientOutcome], None] | None = None,
@@ -109,6 +111,8 @@ def virtual_population(
         Of the true meshes.
     spacing : float, mm
         Of the CTs.
+    truth : str
+        "own" or "phantom": how the true tissue is made, see `drawn_patient`.
     workers : int
         Patients at a time, each in its own process with one thread.
     scheduler : str, optional
@@ -126,7 +130,7 @@ def virtual_population(
     ------
     CaseError
         (also `ValueError`) An invalid count, seed, number of workers or length; a folder that
-        contains a population of another seed or resolution; a worker that died.
+        contains a population of another seed, truth or resolution; a worker that died.
     OSError
         The folder cannot be written to.
 
@@ -141,8 +145,9 @@ def virtual_population(
     edge, voxel = as_positive("edge_length", edge_length), as_positive("spacing", spacing)
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    jobs = [_Job(str(place), int(seed), i, edge, voxel) for i in range(1, int(count) + 1)]
-    record = {"seed": int(seed), "edge_length_mm": edge, "ct_spacing_mm": voxel}
+    numbers = range(1, int(count) + 1)
+    jobs = [_Job(str(place), int(seed), i, edge, voxel, truth) for i in numbers]
+    record = {"seed": int(seed), "truth": truth, "edge_length_mm": edge, "ct_spacing_mm": voxel}
     entries = {job.patient.name: _entry(job, PENDING) for job in jobs}
     entries |= _further(place, record, entries)
     _write(place, record, entries)

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,19 @@ from cmfsim.cli import main
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.values.uncertainty import PLAN
 from cmfsim.virtual import population_folder
-from cmfsim.virtual.population import CHIN_FORWARDS, OPERATIONS
+from cmfsim.virtual.people import TrueTissue
+from cmfsim.virtual.population import (
+    ALONG_OVER_ACROSS,
+    CHIN_FORWARDS,
+    FAT_POISSON,
+    LACKING,
+    MUSCLE_OFFSET,
+    MUSCLE_YOUNG,
+    NEVER_LACKING,
+    OPERATIONS,
+    SKIN_THICKNESS,
+    SKIN_YOUNG,
+)
 
 SIZE = 400
 # What a test can afford: coarse tets, and a CT that no prediction will read.
@@ -72,6 +85,50 @@ def test_jaws_in_occlusion_are_off_together(people):
             chin, body = (patient.plan[name].translation[1] for name in ("chin", "mandible_body"))
             low, high = CHIN_FORWARDS[0] - CHIN_FORWARDS[2], CHIN_FORWARDS[0] + CHIN_FORWARDS[2]
             assert low - 0.01 <= body - chin <= high + 0.01
+
+
+def test_own_tissue_is_drawn_from_the_published_ranges(people):
+    """Log-uniform moduli, offsets of 5 mm in all, and a tenth without a muscle of expression."""
+    tissues = [patient.tissue for patient in people]
+    along, across = np.array([t.muscle_young for t in tissues]).T
+    for values, (low, high) in (
+        (along, MUSCLE_YOUNG),
+        (along / across, ALONG_OVER_ACROSS),
+        (np.array([t.skin_young for t in tissues]), SKIN_YOUNG),
+    ):
+        share = (np.log(values) - np.log(low)) / np.log(high / low)
+        assert -0.01 < share.min() < 0.05
+        assert 0.95 < share.max() < 1.01
+        # Of a uniform distribution: mean 1/2 within four standard errors.
+        assert abs(share.mean() - 0.5) < 4.0 / np.sqrt(12.0 * SIZE)
+    offsets = np.array([offset for t in tissues for offset in t.offsets.values()])
+    size = np.sqrt((offsets**2).sum(axis=1).mean())
+    assert size == pytest.approx(0.96 * np.sqrt(3.0) * MUSCLE_OFFSET[1], rel=0.03)
+    sides = ("masseter_L", "masseter_R")
+    assert any(t.offsets[sides[0]] != t.offsets[sides[1]] for t in tissues)
+    lacking = np.mean(["risorius_L" in t.absent for t in tissues])
+    assert abs(lacking - LACKING) < 4.0 * np.sqrt(LACKING * (1.0 - LACKING) / SIZE)
+    for tissue in tissues:
+        assert not set(tissue.absent) & set(tissue.offsets)
+        assert not any(name.rpartition("_")[0] in NEVER_LACKING for name in tissue.absent)
+        assert {name.replace("_L", "_R") for name in tissue.absent} >= {
+            name for name in tissue.absent if name.endswith("_R")
+        }
+        assert FAT_POISSON[0] <= tissue.fat_poisson <= FAT_POISSON[1]
+        assert SKIN_THICKNESS[0] <= tissue.skin_thickness <= SKIN_THICKNESS[1]
+
+
+def test_the_phantoms_tissue_belongs_to_the_same_people(people):
+    """Shape, operation, plan and errors do not depend on how the tissue is made."""
+    for index, patient in enumerate(people[:20], 1):
+        same = cmfsim.drawn_patient(5, index, truth="phantom")
+        assert same.tissue == TrueTissue()
+        assert patient == replace(same, muscle_stiffness=1.0, tissue=patient.tissue)
+    # As it was drawn before other tissue could be.
+    first = cmfsim.drawn_patient(1, 1, truth="phantom")
+    assert (first.muscle_thickness, first.muscle_stiffness) == (1.127, 0.811)
+    with pytest.raises(CaseInputError, match="truth is 'model': use one of own, phantom"):
+        cmfsim.drawn_patient(5, 1, truth="model")
 
 
 @pytest.mark.parametrize(("seed", "index"), [(-1, 1), (0, 0), (0.5, 1), (0, 1.5)])
@@ -163,6 +220,8 @@ def test_another_population_is_not_mixed_in(made):
         cmfsim.virtual_population(made[0], 1, seed=2, **COARSE)
     with pytest.raises(CaseInputError, match="use another folder"):
         cmfsim.virtual_population(made[0], 1, seed=1, edge_length=7.0, spacing=4.0)
+    with pytest.raises(CaseInputError, match="'truth': 'own'"):
+        cmfsim.virtual_population(made[0], 1, seed=1, truth="phantom", **COARSE)
 
 
 def test_a_failure_is_recorded_and_not_tried_again(tmp_path, monkeypatch):
@@ -212,6 +271,7 @@ def test_options_that_contradict_are_refused(tmp_path, capsys):
     for words in (
         ["--count", "2", "--patients", "1"],
         ["--workers", "2"],
+        ["--patients", "1", "--truth", "phantom"],
         ["--count", "0"],
         ["--count", "1", "--edge-length", "0"],
         ["--count", "1", "--workers", "0"],
