@@ -24,6 +24,7 @@ from cmfsim.io.populations import (
 )
 from cmfsim.values.checks import as_number, as_positive
 from cmfsim.virtual.patient_folder import (
+    EXECUTED,
     TRUTH,
     cohort_text,
     is_made,
@@ -181,7 +182,7 @@ def _further(
 
 
 def _write(folder: Path, record: dict[str, Any], entries: dict[str, PopulationEntry]) -> None:
-    """The population's file, and a cohort for `cmfsim study` of each part."""
+    """The population's file, and cohorts for `cmfsim study`: of each part, and as carried out."""
     population = Population(entries, record)
     population.write(folder)
     for part in PARTS:
@@ -189,6 +190,11 @@ def _write(folder: Path, record: dict[str, Any], entries: dict[str, PopulationEn
         if names:
             with replacing(folder / f"{part}.toml") as file:
                 file.write(cohort_text(f"virtual patients, {part}", names).encode())
+    everyone = population.named(MADE)
+    if everyone:
+        text = cohort_text("virtual patients, plans as carried out", everyone, executed=True)
+        with replacing(folder / EXECUTED) as file:
+            file.write(text.encode())
 
 
 def _made(jobs: list[_Job], workers: int, scheduler: str | None) -> Iterator[tuple[_Job, str, str]]:

@@ -176,6 +176,23 @@ def test_the_truth_is_the_plan_with_its_departures(made):
     assert "departures" not in (place / "case.toml").read_text()
 
 
+def test_the_operation_as_carried_out_is_a_case_of_its_own(made):
+    """Its plan is the true motion of each segment; all else is that of the case."""
+    folder, _ = made
+    cohort = cmfsim.Cohort.load(folder / "executed.toml")
+    assert list(cohort.cases) == ["D001"]
+    done, case = (cmfsim.Case.load(p) for p in (cohort.cases["D001"], folder / "D001"))
+    record = json.loads((folder / "D001/truth/truth.json").read_text())
+    assert set(done.plan) == set(case.plan)
+    for name, motion in done.plan.items():
+        np.testing.assert_allclose(motion.matrix, record["motions"][name], atol=1e-12)
+        assert np.abs(motion.matrix - case.plan[name].matrix).max() > 0.1
+    assert done.image.file.resolve() == case.image.file.resolve()
+    assert done.postoperative.skin.resolve() == case.postoperative.skin.resolve()
+    assert done.mesh == case.mesh
+    assert not [f for f in cmfsim.diagnose(done) if f.severity == "error"]
+
+
 def test_the_skin_is_thicker_where_nothing_moved(made):
     """Forehead: outward along the normal by the drawn share of the tissue's depth."""
     place, share = made[0] / "D001", cmfsim.drawn_patient(1, 1).thickness_change
@@ -263,6 +280,7 @@ def test_failures_are_in_the_record_and_counted(tmp_path, monkeypatch, capsys):
         "failed", "calibration", found.patients["D002"].operation, "stalls"
     )
     assert found.named("made", "train") == ("D001", "D004")
+    assert list(cmfsim.Cohort.load(tmp_path / "executed.toml").cases) == ["D001", "D003", "D004"]
     # A smaller count later takes nobody away.
     monkeypatch.setattr(population_folder, "_made", lambda jobs, *_: outcomes(jobs, 1))
     cmfsim.virtual_population(tmp_path, 1, seed=3)
