@@ -25,21 +25,17 @@ METHOD = (
 )
 
 
-def _tables(values: Values) -> list[Table]:
-    """A table for each model and region, then one for each model with all regions."""
+def _tables(values: Values) -> tuple[list[Table], list[Table]]:
+    """A table for each model with all regions, and one for each model and region by patient."""
     rows: dict[Key, Values] = {
         (r["variant"], r["model"], r["region"], r["patient"]): r for r in values["rows"]
     }
     regions = [region for region in COLUMNS if any(key[2] == region for key in rows)]
-    by_patient = [
-        _patients_table(values, rows, model, region)
-        for model in values["models"]
-        for region in regions
-    ]
-    return [
-        *by_patient,
-        *(_regions_table(values, rows, model, regions) for model in values["models"]),
-    ]
+    models = values["models"]
+    return (
+        [_regions_table(values, rows, model, regions) for model in models],
+        [_patients_table(values, rows, m, region) for m in models for region in regions],
+    )
 
 
 def _patients_table(values: Values, rows: Mapping[Key, Values], model: str, region: str) -> Table:
@@ -60,6 +56,8 @@ def _patients_table(values: Values, rows: Mapping[Key, Values], model: str, regi
         cells = [f"{found[p]:.2f}" if p in found else _absent(values, variant, p) for p in patients]
         mean = f"{sum(found.values()) / len(found):.2f}" if found else NOTHING
         compared = changes.get(variant) if of == model else None
+        if compared is not None:
+            mean = f"{compared['second_mm']:.2f}"
         lines.append((name, *cells, mean, *_change_cells(compared)))
     return Table(
         ("variant", *patients, "mean", "change", "95 % interval", "n", "better", "p"),
@@ -79,7 +77,10 @@ def _regions_table(
     }
     lines = []
     for name, of, variant in _lines(values, model):
-        cells = []
+        n = sum((variant, of, WHOLE, patient) in rows for patient in values["patients"])
+        if of == model and (variant, WHOLE) in changes:
+            n = changes[variant, WHOLE]["n"]
+        cells = [str(n)]
         for region in regions:
             change = changes.get((variant, region)) if of == model else None
             found = [
@@ -93,7 +94,7 @@ def _regions_table(
                 cells.append(f"{sum(found) / len(found):.2f}" if found else NOTHING)
         lines.append((name, *cells))
     caption = f"Model {model}: mean error over patients, mm, and in brackets its change"
-    return Table(("variant", *regions), tuple(lines), caption)
+    return Table(("variant", "n", *regions), tuple(lines), caption)
 
 
 def _lines(values: Values, model: str) -> list[tuple[str, str, str]]:
@@ -151,13 +152,12 @@ def variants_document(values: Values) -> Document:
                 several = "s" if len(lines) > 1 else ""
                 where = f"{variant['name']}, {case['name']}"
                 alerts.append(Alert("warning", f"{where}: {len(lines)} warning{several}", lines))
-    tables = _tables(values)
-    regions = tables[len(tables) - len(values["models"]) :]
+    regions, patients = _tables(values)
     notes = [Note(note, "warning") for note in (values["note"], values["description"]) if note]
     sections = [
         Section("Variants", (*notes, _variants_table(values))),
         Section("Regions", (*regions, Note(METHOD))),
-        Section("Patients", tuple(tables[: len(tables) - len(regions)])),
+        Section("Patients", tuple(patients)),
     ]
     facts = {
         "patients": str(len(values["patients"])),
@@ -183,7 +183,8 @@ def variants_text(values: Values) -> str:
         `VariantsReport.as_dict()`.
     """
     blocks = [note for note in (values["note"], values["description"]) if note]
-    for table in _tables(values):
+    regions, patients = _tables(values)
+    for table in (*patients, *regions):
         rows = [table.columns, *table.rows]
         widths = [max(len(row[i]) for row in rows) for i in range(len(table.columns))]
         lines = [table.caption]
@@ -205,7 +206,8 @@ def variants_markdown(values: Values) -> str:
     blocks = [f"# {plain_line(values['cohort'])}: variants"]
     blocks += [plain_line(note) for note in (values["note"], values["description"]) if note]
     blocks.append(_markdown(_variants_table(values)))
-    for table in reversed(_tables(values)):
+    regions, patients = _tables(values)
+    for table in (*regions, *patients):
         blocks += [f"{plain_line(table.caption)}:", _markdown(table)]
     blocks.append(METHOD)
     blocks += [f"{plain_line(where)} failed: {plain_line(e)}" for where, e in _failures(values)]
