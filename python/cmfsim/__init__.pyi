@@ -55,6 +55,7 @@ from cmfsim.evaluation import DistanceStatistics as DistanceStatistics
 from cmfsim.evaluation import ErrorTable as ErrorTable
 from cmfsim.evaluation import Improvement as Improvement
 from cmfsim.evaluation import ModelComparison as ModelComparison
+from cmfsim.evaluation import PairedChange as PairedChange
 from cmfsim.evaluation import PairedTest as PairedTest
 from cmfsim.evaluation import SkinComparison as SkinComparison
 from cmfsim.evaluation import calibrate as calibrate
@@ -65,6 +66,7 @@ from cmfsim.evaluation import covered_interval as covered_interval
 from cmfsim.evaluation import distance_statistics as distance_statistics
 from cmfsim.evaluation import error_table as error_table
 from cmfsim.evaluation import fitted_thickness as fitted_thickness
+from cmfsim.evaluation import paired_change as paired_change
 from cmfsim.evaluation import region_scores as region_scores
 from cmfsim.evaluation import skin_regions as skin_regions
 from cmfsim.evaluation import unmoved_regions as unmoved_regions
@@ -76,7 +78,10 @@ from cmfsim.imaging import register_volumes as register_volumes
 from cmfsim.imaging import segment_head as segment_head
 from cmfsim.imaging import undeformed_mask as undeformed_mask
 from cmfsim.io import Case as Case
+from cmfsim.io import CaseChanges as CaseChanges
 from cmfsim.io import Cohort as Cohort
+from cmfsim.io import Variant as Variant
+from cmfsim.io import Variants as Variants
 from cmfsim.io import read_image as read_image
 from cmfsim.io import read_landmarks as read_landmarks
 from cmfsim.io import read_moved_surface as read_moved_surface
@@ -198,6 +203,7 @@ from cmfsim.study.benchmark import SkinPrediction as SkinPrediction
 from cmfsim.study.benchmark import read_skin_prediction as read_skin_prediction
 from cmfsim.study.benchmark import run_benchmark as run_benchmark
 from cmfsim.study.benchmark import write_skin_prediction as write_skin_prediction
+from cmfsim.study.cohort import StudyOptions as StudyOptions
 from cmfsim.study.cohort import StudyReport as StudyReport
 from cmfsim.study.cohort import run_study as run_study
 from cmfsim.study.frontier import Choice as Choice
@@ -211,6 +217,9 @@ from cmfsim.study.outputs import write_study_report as write_study_report
 from cmfsim.study.trials import SensitivityReport as SensitivityReport
 from cmfsim.study.trials import landmark_trials as landmark_trials
 from cmfsim.study.trials import sensitivity as sensitivity
+from cmfsim.study.variants import VariantsReport as VariantsReport
+from cmfsim.study.variants import run_variants as run_variants
+from cmfsim.study.variants import write_variants_report as write_variants_report
 from cmfsim.surfaces.checks import SurfaceReport as SurfaceReport
 from cmfsim.surfaces.checks import check_surface as check_surface
 from cmfsim.surfaces.levels import contact_surface as contact_surface

@@ -182,7 +182,11 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         parents=[common],
         help="predict and evaluate every case of a cohort with every model",
         epilog="Tables and figures of Kim et al. (2010) are written below the cohort's folder: "
-        "study.csv, table3.md, figure9.png, figure10.png, and report.html (docs/kim2010.md).",
+        "study.csv, table3.md, figure9.png, figure10.png, and report.html (docs/kim2010.md). With "
+        "--variants, the cohort runs as given and once for each named change of settings in FILE, "
+        "which has tables such as [variants.soft] with lines such as muscles.young_along = 0.06 "
+        "(docs/evaluation.md). Errors of each patient, region and variant, and their changes, are "
+        "written to variants.csv, variants.md, variants.json and report.html.",
     )
     study.add_argument(
         "cohort", metavar="COHORT", type=Path, help="cohort.toml, or a folder of cases"
@@ -194,6 +198,12 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
     )
     study.add_argument("--fresh", action="store_true", help="repeat finished cases")
+    study.add_argument(
+        "--variants",
+        metavar="FILE",
+        type=Path,
+        help="compare named changes of any keys of a case file with the cases as given",
+    )
     study.set_defaults(run=study_commands.study)
 
     report = commands.add_parser(

@@ -8,6 +8,7 @@ from cmfsim.cli import benchmark_command, virtual_patients_command
 from cmfsim.io.populations import PARTS, TEST
 from cmfsim.study.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.values.model_names import MODELS
+from cmfsim.virtual.population import TRUTHS
 
 __all__ = ["add_population_commands"]
 
@@ -47,6 +48,12 @@ def _add_virtual_patients(commands: Any, common: argparse.ArgumentParser) -> Non
         help="number of drawn patients made at a time, one process each (default 1)",
     )
     virtual.add_argument("--seed", metavar="N", type=int, default=0, help="random seed (default 0)")
+    virtual.add_argument(
+        "--truth",
+        choices=TRUTHS,
+        help="true tissue of drawn patients: their own (default), or the phantom's, whose muscles "
+        "and moduli the models assume",
+    )
     virtual.add_argument(
         "--edge-length",
         metavar="H",

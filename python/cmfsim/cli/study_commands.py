@@ -18,7 +18,7 @@ from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError
-from cmfsim.io import Cohort, read_landmark_file, replacing
+from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs import (
     WrittenPrediction,
@@ -28,9 +28,10 @@ from cmfsim.pipeline.outputs import (
 )
 from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
-from cmfsim.study.cohort import CaseOutcome, StudyReport, run_study
+from cmfsim.study.cohort import CaseOutcome, StudyOptions, StudyReport, run_study
 from cmfsim.study.outputs import write_study_report
 from cmfsim.study.trials import sensitivity as landmark_sensitivity
+from cmfsim.study.variants import run_variants, write_variants_report
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 
@@ -239,6 +240,8 @@ def _mean(values: Sequence[float]) -> float:
 def study(options: argparse.Namespace) -> int:
     """Predicts and compares every case of a cohort; failed if a case failed."""
     cohort = Cohort.load(options.cohort)
+    if options.variants is not None:
+        return _study_variants(cohort, options)
 
     def say(outcome: CaseOutcome) -> None:
         if not options.quiet:
@@ -257,6 +260,31 @@ def study(options: argparse.Namespace) -> int:
     else:
         print(_study_text(found))
         print(f"written       {escaped(str(cohort.output))}: {', '.join(names)}")
+    return FAILED if found.failed else DONE
+
+
+def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
+    """Runs a cohort as given and under each variant; failed if a case of one failed."""
+    variants = Variants.load(options.variants, cohort.models)
+
+    def say(variant: str, outcome: CaseOutcome) -> None:
+        if not options.quiet:
+            done = f"{outcome.status}, {outcome.seconds:.0f} s"
+            print(f"{variant}, {outcome.name}: {done}", file=sys.stderr)
+
+    where = StudyOptions(options.workers, options.scheduler, options.fresh)
+    found = run_variants(cohort, variants, options=where, progress=say)
+    names = write_variants_report(found)
+    if options.json:
+        more = {"output": str(found.output), "files": names}
+        print(json.dumps({**found.as_dict(), **more}, allow_nan=False))
+    else:
+        print("\n".join(escaped(line) for line in found.text().split("\n")))
+        print(f"written       {escaped(str(found.output))}: {', '.join(names)}")
+    for variant, outcome in found.failed:
+        print(f"cmfsim: error: {escaped(f'{variant}, {outcome.name}')}:", file=sys.stderr)
+        for line in outcome.error.splitlines():
+            print(f"  {escaped(line)}", file=sys.stderr)
     return FAILED if found.failed else DONE
 
 

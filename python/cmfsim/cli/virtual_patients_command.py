@@ -11,6 +11,7 @@ from cmfsim.io.populations import FAILED, MADE, PARTS, PENDING
 from cmfsim.virtual import PatientOutcome, virtual_population
 from cmfsim.virtual import virtual_patients as write_patients
 from cmfsim.virtual.patient_folder import PATIENTS_WITH_JOINED_LIPS
+from cmfsim.virtual.population import OWN
 
 __all__ = ["virtual_patients"]
 
@@ -19,8 +20,10 @@ def virtual_patients(options: argparse.Namespace) -> int:
     """Writes virtual patients: the case before, the truth after the operation."""
     if options.count is not None:
         return _population(options)
-    if options.workers != 1 or options.scheduler is not None:
-        raise CaseInputError("--workers and --scheduler are for drawn patients: give --count too")
+    if options.workers != 1 or options.scheduler is not None or options.truth is not None:
+        raise CaseInputError(
+            "--workers, --scheduler and --truth are for drawn patients: give --count too"
+        )
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         cases = write_patients(
             options.folder,
@@ -56,6 +59,7 @@ def _population(options: argparse.Namespace) -> int:
         seed=options.seed,
         edge_length=options.edge_length,
         spacing=options.spacing,
+        truth=options.truth or OWN,
         workers=options.workers,
         scheduler=options.scheduler,
         progress=tell,

@@ -83,7 +83,7 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
     tissue = case.tissue
     if tissue.kind == "preset" and tissue.preset not in PRESETS:
         return  # `gather` reports it
-    stated = (k for k in case.lines if k in MUSCLE_KEYS or k.startswith("muscles.moduli."))
+    stated = (k for k in case.places if k in MUSCLE_KEYS or k.startswith("muscles.moduli."))
     place = next(stated, "tissue")
     try:
         moduli = replace(given.moduli, fat=FatModuli.of(tissue))

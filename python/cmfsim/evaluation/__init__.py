@@ -21,12 +21,19 @@ from cmfsim.evaluation.regions import (
     skin_regions,
     unmoved_regions,
 )
-from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
+from cmfsim.evaluation.significance import (
+    LEAST_PAIRS,
+    PairedChange,
+    PairedTest,
+    paired_change,
+    wilcoxon_test,
+)
 from cmfsim.evaluation.statistics import LIMITS, DistanceStatistics, distance_statistics
 from cmfsim.evaluation.tables import ErrorTable, error_table
 from cmfsim.evaluation.unmoved import ThicknessChange, compare_unmoved, fitted_thickness
 
 __all__ = [
+    "LEAST_PAIRS",
     "LIMITS",
     "MATCHINGS",
     "NO_CHANGE",
@@ -38,6 +45,7 @@ __all__ = [
     "ErrorTable",
     "Improvement",
     "ModelComparison",
+    "PairedChange",
     "PairedTest",
     "SkinComparison",
     "ThicknessChange",
@@ -50,6 +58,7 @@ __all__ = [
     "distance_statistics",
     "error_table",
     "fitted_thickness",
+    "paired_change",
     "region_scores",
     "skin_regions",
     "unmoved_regions",

@@ -10,7 +10,14 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.checks import as_floats, check_one_of
 
-__all__ = ["PAIRED_BY", "PairedTest", "wilcoxon_test"]
+__all__ = [
+    "LEAST_PAIRS",
+    "PAIRED_BY",
+    "PairedChange",
+    "PairedTest",
+    "paired_change",
+    "wilcoxon_test",
+]
 
 PAIRED_BY = ("vertex", "patient")
 CAVEATS = {
@@ -23,6 +30,8 @@ CAVEATS = {
 }
 # Two-sided 5 %, the level that the caveat of few patients speaks of.
 LEVEL = 0.05
+# Fewest patients that differ for which the test can reach that level: p is at least 2^(1-n).
+LEAST_PAIRS = 6
 
 
 @dataclass(frozen=True)
@@ -132,4 +141,88 @@ def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") ->
         raise CaseInputError(f"the test gave p = {p} for {n_used} pairs: too few to rank")
     return PairedTest(
         by, len(a), len(a) - n_used, statistic, p, float(np.median(difference)), effect, caveat
+    )
+
+
+@dataclass(frozen=True)
+class PairedChange:
+    """The change of patients' mean errors from one setting to another.
+
+    Attributes
+    ----------
+    n : int
+        Patients who have both.
+    first, second : float, mm
+        Means of their mean errors, each patient with the same weight.
+    interval : (float, float) or None, mm
+        95 % confidence interval of the mean change by Student's t; None for one patient.
+    n_better : int
+        Patients whose error became smaller.
+    test : PairedTest or None
+        None for fewer than `LEAST_PAIRS` patients whose error changed.
+    """
+
+    n: int
+    first: float
+    second: float
+    interval: tuple[float, float] | None
+    n_better: int
+    test: PairedTest | None
+
+    @property
+    def change(self) -> float:
+        """Second minus first, mm: negative, the second setting has the smaller errors."""
+        return self.second - self.first
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with their unit in the name, as JSON holds them."""
+        return {
+            "n": self.n,
+            "first_mm": self.first,
+            "second_mm": self.second,
+            "change_mm": self.change,
+            "interval_mm": None if self.interval is None else list(self.interval),
+            "n_better": self.n_better,
+            "test": None if self.test is None else self.test.as_dict(),
+        }
+
+
+def paired_change(first: ArrayLike, second: ArrayLike) -> PairedChange:
+    """The change of mean errors of the same patients from one setting to another.
+
+    Parameters
+    ----------
+    first, second : (n,) float64, mm
+        Mean error of each patient.
+
+    Returns
+    -------
+    PairedChange
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) As `wilcoxon_test`.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.paired_change([1.0, 2.0, 1.5], [0.8, 1.7, 1.1])
+    >>> round(found.change, 3), [round(end, 3) for end in found.interval], found.n_better
+    (-0.3, [-0.548, -0.052], 3)
+    >>> found.test is None
+    True
+    """
+    test = wilcoxon_test(second, first, by="patient")
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    n, interval = test.n, None
+    if n > 1:
+        stats = third_party("scipy.stats", "a confidence interval is found", "report")
+        half = float(stats.t.ppf(1.0 - 0.5 * LEVEL, n - 1) * np.std(b - a, ddof=1) / math.sqrt(n))
+        middle = float((b - a).mean())
+        interval = (middle - half, middle + half)
+    enough = n - test.n_equal >= LEAST_PAIRS
+    better = int(np.count_nonzero(b < a))
+    return PairedChange(
+        n, float(a.mean()), float(b.mean()), interval, better, test if enough else None
     )

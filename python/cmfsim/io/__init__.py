@@ -1,5 +1,6 @@
 """Files and values: each format's reader beside its writer, one file per subject."""
 
+from cmfsim.io.case_changes import CaseChanges
 from cmfsim.io.case_files import Case, CaseOrPath, as_case
 from cmfsim.io.cohorts import Cohort
 from cmfsim.io.files import replacing
@@ -16,12 +17,17 @@ from cmfsim.io.scenes import read_plan, read_scene, write_scene
 from cmfsim.io.slicer_output import write_slicer_bundle
 from cmfsim.io.surfaces import read_bone_pair, read_moved_surface, read_surface, write_surface
 from cmfsim.io.transforms import read_transform, write_transform
+from cmfsim.io.variants import AS_GIVEN, Variant, Variants
 
 __all__ = [
+    "AS_GIVEN",
     "Case",
+    "CaseChanges",
     "CaseOrPath",
     "Cohort",
     "LandmarkFile",
+    "Variant",
+    "Variants",
     "as_case",
     "finish_writing",
     "read_bone_pair",

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from cmfsim.errors import CaseInputError
+from cmfsim.io.case_changes import CaseChanges
 from cmfsim.io.case_plans import is_achieved, osteotomies_of, plan_of
 from cmfsim.io.case_tables import (
     band_of,
@@ -109,8 +110,8 @@ class Case:
     postoperative : CasePostoperative or None
     note : str
         A remark for readers of the report, such as that the patient is synthetic.
-    lines : mapping of str to int
-        The line of each dotted key in the case file, for findings.
+    places : mapping of str to str
+        File and line of each dotted key, such as "case.toml:12", for findings.
 
     Examples
     --------
@@ -137,7 +138,7 @@ class Case:
     band: CaseBand = field(default_factory=CaseBand)
     postoperative: CasePostoperative | None = None
     note: str = ""
-    lines: Mapping[str, int] = field(default_factory=dict)
+    places: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         as_text("case name", self.name)
@@ -145,17 +146,19 @@ class Case:
             raise CaseInputError("a case has either an image or surfaces")
         if self.achieved and self.plan:
             raise CaseInputError("a plan is either given or achieved, not both")
-        for name in ("plan", "node_kinds", "lines"):
+        for name in ("plan", "node_kinds", "places"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "Case":
+    def load(cls, path: str | os.PathLike[str], *, changes: CaseChanges | None = None) -> "Case":
         """The case that a `case.toml` describes.
 
         Parameters
         ----------
         path : path
             Of the file, or of a folder that holds a `case.toml`.
+        changes : CaseChanges, optional
+            Of settings in the file. Paths in it are resolved against the folder of the case, too.
 
         Returns
         -------
@@ -169,7 +172,7 @@ class Case:
             (also `ValueError`) Not TOML, an unknown key, a value of another type or out of range:
             with file, line and key.
         """
-        return _read(_case_file(Path(path)))
+        return _read(_case_file(Path(path)), changes)
 
     def with_plan(self, path: str | os.PathLike[str]) -> "Case":
         """The case under the plan in another file, such as one saved by the planning page.
@@ -197,9 +200,9 @@ class Case:
         """File, line and key, as findings name a place in the case file."""
         parts = key.split(".")
         for length in range(len(parts), 0, -1):
-            line = self.lines.get(".".join(parts[:length]))
-            if line is not None:
-                return f"{self.file.name}:{line} {key}"
+            place = self.places.get(".".join(parts[:length]))
+            if place is not None:
+                return f"{place} {key}"
         return f"{self.file.name} {key}"
 
 
@@ -242,8 +245,11 @@ def _case_file(path: Path) -> Path:
     return file
 
 
-def _read(path: Path) -> Case:
-    document = read_tables(path).only(*TABLES)
+def _read(path: Path, changes: CaseChanges | None) -> Case:
+    document = read_tables(path)
+    if changes is not None:
+        document = document.changed(changes)
+    document.only(*TABLES)
     found = document.text("format")
     if found != CASE_FORMAT:
         document.fail("format", f"is {found!r}: {CASE_FORMAT!r} is needed")
@@ -285,5 +291,5 @@ def _read(path: Path) -> Case:
             else None
         ),
         note=document.text("note") if "note" in document else "",
-        lines=document.all_lines(),
+        places=document.all_places(),
     )

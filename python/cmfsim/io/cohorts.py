@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cmfsim.errors import CaseInputError
+from cmfsim.io.case_changes import CaseChanges
 from cmfsim.io.case_files import CASE_FILE
 from cmfsim.io.files import FORMAT_VERSION, is_there
 from cmfsim.io.tables import read_tables
@@ -36,6 +37,8 @@ class Cohort:
         Folder of everything that is written for the study.
     note : str
         Printed with every result, such as what the patients are.
+    changes : CaseChanges, optional
+        Made to every case, in a variant of a cohort.
 
     Examples
     --------
@@ -49,6 +52,7 @@ class Cohort:
     models: tuple[str, ...]
     output: Path
     note: str = ""
+    changes: CaseChanges | None = None
 
     def __post_init__(self) -> None:
         as_text("cohort name", self.name)

@@ -1,7 +1,7 @@
 """Tables of a TOML text with checked values: an error names the file, the key and its line."""
 
 import contextlib
-import difflib
+import copy
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io.case_changes import CaseChanges
 from cmfsim.io.files import (
     check_numbers,
     check_plain_toml,
@@ -20,9 +21,9 @@ from cmfsim.io.files import (
     toml_module,
 )
 from cmfsim.io.toml_lines import KeyPath, line_of, toml_lines
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, nearest
 
-__all__ = ["UNDECIDED", "Table", "nearest", "read_tables"]
+__all__ = ["UNDECIDED", "Table", "read_tables"]
 
 # A case file above this size is not what it says it is, bytes.
 MAX_CASE_TEXT = 2**20
@@ -104,10 +105,28 @@ def _refuse_undecided(
     raise CaseInputError(f"{file}:{line}: {first or 'decide it'}{more}")
 
 
-def nearest(name: str, known: tuple[str, ...]) -> str:
-    """A question that names the known name most like this one; empty if none is."""
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+def _known(lines: Mapping[KeyPath, int], path: KeyPath) -> int:
+    """How many parts of a path the longest of its beginnings has that is listed."""
+    return next((n for n in range(len(path), 0, -1) if path[:n] in lines), 0)
+
+
+def _forget(lines: dict[KeyPath, int], path: KeyPath) -> None:
+    """Removes the lines of a key and of everything below it."""
+    for other in [other for other in lines if other[: len(path)] == path]:
+        del lines[other]
+
+
+def _merge(
+    into: dict[str, Any], values: Mapping[str, Any], path: KeyPath, lines: dict[KeyPath, int]
+) -> None:
+    """Puts values into a table; what they replace loses its line."""
+    for key, value in values.items():
+        place = (*path, key)
+        if isinstance(value, Mapping) and isinstance(into.get(key), dict):
+            _merge(into[key], value, place, lines)
+            continue
+        _forget(lines, place)
+        into[key] = copy.deepcopy(dict(value)) if isinstance(value, Mapping) else value
 
 
 class Table:
@@ -119,11 +138,13 @@ class Table:
         path: KeyPath,
         file: str,
         lines: Mapping[KeyPath, int],
+        changes: CaseChanges | None = None,
     ) -> None:
         self._values = values
         self._path = path
         self._file = file
         self._lines = lines
+        self._changes = changes
 
     def __contains__(self, key: str) -> bool:
         return key in self._values
@@ -140,7 +161,39 @@ class Table:
         path = self._path if key is None else (*self._path, key)
         label = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
         text = f"{label} {message}" if label else message
-        raise CaseInputError(f"{self._file}:{self.line(key)}: {text}")
+        raise CaseInputError(f"{self._place(path)}: {text}")
+
+    def _place(self, path: KeyPath) -> str:
+        """File and line of a key: in the file of changes, where that is the closer of the two."""
+        changes = self._changes
+        if changes is not None:
+            theirs, ours = (_known(lines, path) for lines in (changes.lines, self._lines))
+            if theirs and theirs >= ours:
+                return f"{changes.file}:{line_of(changes.lines, path)}"
+        return f"{self._file}:{line_of(self._lines, path)}"
+
+    def changed(self, changes: CaseChanges) -> "Table":
+        """The whole file with changes; an error names the file in which its key stands.
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) A key to be removed that the file does not have.
+        """
+        values, lines = copy.deepcopy(dict(self._values)), dict(self._lines)
+        for name in changes.without:
+            *tables, key = name.split(".")
+            table: Any = values
+            for part in tables:
+                table = table.get(part) if isinstance(table, dict) else None
+            if not isinstance(table, dict) or key not in table:
+                raise CaseInputError(
+                    f"{changes.file}: without {name!r}: {self._file} has no such key"
+                )
+            del table[key]
+            _forget(lines, (*tables, key))
+        _merge(values, changes.values, (), lines)
+        return Table(values, self._path, self._file, lines, changes)
 
     @contextlib.contextmanager
     def at(self, key: str | None) -> Iterator[None]:
@@ -150,9 +203,18 @@ class Table:
         except CmfsimError as error:
             self.fail(key, f"is invalid: {error}")
 
-    def all_lines(self) -> dict[str, int]:
-        """The line of each dotted key of the file."""
-        return {".".join(map(str, path)): line for path, line in self._lines.items()}
+    def all_paths(self) -> Mapping[KeyPath, int]:
+        """The line of each key of the file, by its path."""
+        return self._lines
+
+    def all_places(self) -> dict[str, str]:
+        """File and line of each dotted key."""
+        changed = () if self._changes is None else self._changes.lines
+        return {".".join(map(str, path)): self._place(path) for path in (*self._lines, *changed)}
+
+    def values(self) -> dict[str, Any]:
+        """All that the table holds, as plain values."""
+        return copy.deepcopy(dict(self._values))
 
     def only(self, *known: str) -> "Table":
         """The table, if it has no other keys."""
@@ -272,7 +334,7 @@ class Table:
         value = self._values.get(key, {})
         if not isinstance(value, dict):
             self.fail(key, f"is {value!r}: a table of names and values is needed")
-        return Table(value, (*self._path, key), self._file, self._lines)
+        return Table(value, (*self._path, key), self._file, self._lines, self._changes)
 
     def tables(self, key: str) -> list["Table"]:
         """The tables of an array of tables; none where it is absent."""
@@ -280,7 +342,7 @@ class Table:
         if not isinstance(value, list) or any(not isinstance(entry, dict) for entry in value):
             self.fail(key, f"is not a list of tables: write [[{key}]] before each")
         return [
-            Table(entry, (*self._path, key, number), self._file, self._lines)
+            Table(entry, (*self._path, key, number), self._file, self._lines, self._changes)
             for number, entry in enumerate(value)
         ]
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from cmfsim._core import MuscleShares, Tissue
 from cmfsim.errors import MaterialInputError
-from cmfsim.io.tables import nearest
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, nearest
 from cmfsim.values.finding import Finding
 from cmfsim.values.moduli import MuscleModuli, TissueModuli
 from cmfsim.values.tissue_data import TissueData

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from cmfsim.errors import CaseInputError
 
-__all__ = ["Alert", "Document", "Figure", "Note", "Section", "Table", "number"]
+__all__ = ["Alert", "Document", "Figure", "Note", "Section", "Table", "number", "plain_line"]
 
 # Stands where there is no figure.
 NOTHING = "–"
@@ -21,6 +21,12 @@ def number(value: object, digits: int = 2) -> str:
         return f"{value:,}".replace(",", "\u202f")
     small = value != 0.0 and abs(value) < 0.5 * 10.0**-digits
     return f"{value:.1e}" if small else f"{value:.{digits}f}"
+
+
+def plain_line(text: str) -> str:
+    """Words of a user as one line in which Markdown finds nothing to mark up."""
+    line = " ".join(text.split())
+    return "".join(f"\\{c}" if c in "\\`*_[]<>#|!" else c for c in line)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cmfsim.evaluation import NO_CHANGE, ErrorTable
-from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
+from cmfsim.report.document import (
+    NOTHING,
+    Alert,
+    Document,
+    Figure,
+    Note,
+    Section,
+    Table,
+    number,
+    plain_line,
+)
 from cmfsim.report.labels import MEASURES
 
 __all__ = ["PAPER_AVERAGES", "study_document", "table3_text"]
@@ -65,9 +75,9 @@ def table3_text(study: Values, table: ErrorTable) -> str:
     str
     """
     models = tuple(study["models"])
-    blocks = [f"# {_plain_line(study['cohort'])}: errors by patient and model"]
+    blocks = [f"# {plain_line(study['cohort'])}: errors by patient and model"]
     if study["note"]:
-        blocks.append(f"**{_plain_line(study['note'])}**")
+        blocks.append(f"**{plain_line(study['note'])}**")
     blocks.append(TABLE_3_CAPTION)
     blocks += _measures(study["cases"])
     blocks.append(table.markdown())
@@ -97,12 +107,6 @@ def _measures(cases: Sequence[Values]) -> list[str]:
     return [
         f"**Distances were measured in two ways, so averages mix both.** {' '.join(found)}"
     ] * bool(found)
-
-
-def _plain_line(text: str) -> str:
-    """A cohort's own words as one line in which Markdown finds nothing to mark up."""
-    line = " ".join(text.split())
-    return "".join(f"\\{c}" if c in "\\`*_[]<>#|!" else c for c in line)
 
 
 def _tests(table: ErrorTable, models: tuple[str, ...]) -> list[str]:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,7 +15,7 @@ from types import FrameType
 from typing import Any, BinaryIO
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io import Case, Cohort, finish_writing
+from cmfsim.io import Case, CaseChanges, Cohort, finish_writing
 from cmfsim.io.cluster import on_cluster
 from cmfsim.io.folders import check_below, check_writable
 from cmfsim.io.metrics import AGAIN, read_evaluation
@@ -23,7 +23,7 @@ from cmfsim.io.skin_errors import skin_errors_file
 from cmfsim.io.summaries import checked_file
 from cmfsim.pipeline.evaluating import evaluation_key
 
-__all__ = ["CaseJob", "CaseOutcome", "StudyReport", "run_study"]
+__all__ = ["CaseJob", "CaseOutcome", "StudyOptions", "StudyReport", "run_studies", "run_study"]
 
 # Lines of a failed case's log that are shown.
 SHOWN_LINES = 12
@@ -40,6 +40,8 @@ class CaseJob:
     models : tuple of str
     threads : int
         That the case may use.
+    changes : str
+        Of its settings, as `CaseChanges.as_json` writes them; empty if there are none.
     """
 
     name: str
@@ -47,6 +49,7 @@ class CaseJob:
     output: str
     models: tuple[str, ...]
     threads: int
+    changes: str = ""
 
 
 @dataclass(frozen=True)
@@ -149,48 +152,107 @@ def run_study(
     >>> [outcome.status for outcome in report.outcomes]  # doctest: +SKIP
     ['done', 'done', 'kept', 'failed']
     """
+
+    def say(cohort: Cohort, outcome: CaseOutcome) -> None:
+        del cohort
+        if progress is not None:
+            progress(outcome)
+
+    options = StudyOptions(workers, scheduler, fresh)
+    return run_studies([cohort], options, progress=say)[0]
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """Where and how many at a time the cases of a study run; see `run_study`.
+
+    Attributes
+    ----------
+    workers : int or None
+    scheduler : str or None
+    fresh : bool
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
+    fresh: bool = False
+
+
+def run_studies(
+    cohorts: Sequence[Cohort],
+    options: StudyOptions,
+    *,
+    progress: Callable[[Cohort, CaseOutcome], None],
+) -> list[StudyReport]:
+    """The reports of several cohorts, whose cases share the workers.
+
+    Parameters
+    ----------
+    cohorts : sequence of Cohort
+        Each with a different output folder.
+    options : StudyOptions
+    progress : callable
+        Called with each outcome as soon as it is known.
+
+    Raises
+    ------
+    CaseError, OSError
+        As `run_study`.
+    """
     cores = os.cpu_count() or 1
+    workers = options.workers
     if workers is not None and workers < 1:
         raise CaseInputError(f"workers is {workers}: must be 1 or more")
     workers = max(1, cores // 2) if workers is None else workers
     begun = time.perf_counter()
-    check_below(cohort.output, cohort.file.parent)
-    check_writable(cohort.output)
-    cohort.output.mkdir(parents=True, exist_ok=True)
-    outcomes: dict[str, CaseOutcome] = {}
-    jobs = []
-    for name, file in cohort.cases.items():
-        output = cohort.output / name
-        check_below(output, cohort.output)
-        kept = None if fresh else _kept(name, file, output, cohort.models)
-        if kept is None:
-            threads = max(1, cores // workers)
-            jobs.append(CaseJob(name, str(file), str(output), cohort.models, threads))
-        else:
-            outcomes[name] = kept
-            if progress is not None:
-                progress(kept)
+    outcomes: list[dict[str, CaseOutcome]] = [{} for _ in cohorts]
+    jobs: list[CaseJob] = []
+    of: list[int] = []
+    for number, cohort in enumerate(cohorts):
+        check_below(cohort.output, cohort.file.parent)
+        check_writable(cohort.output)
+        cohort.output.mkdir(parents=True, exist_ok=True)
+        for name in cohort.cases:
+            job = _job(cohort, name, max(1, cores // workers))
+            kept = None if options.fresh else _kept(job, cohort.changes)
+            if kept is None:
+                jobs.append(job)
+                of.append(number)
+            else:
+                outcomes[number][name] = kept
+                progress(cohort, kept)
+    scheduler = options.scheduler
     run = _on_this_machine(jobs, workers) if scheduler is None else _on_dask(jobs, scheduler)
-    for outcome in run:
-        outcomes[outcome.name] = outcome
-        if progress is not None:
-            progress(outcome)
-    ordered = tuple(outcomes[name] for name in cohort.cases)
-    return StudyReport(cohort, ordered, time.perf_counter() - begun)
+    for index, outcome in run:
+        outcomes[of[index]][outcome.name] = outcome
+        progress(cohorts[of[index]], outcome)
+    seconds = time.perf_counter() - begun
+    return [
+        StudyReport(cohort, tuple(found[name] for name in cohort.cases), seconds)
+        for cohort, found in zip(cohorts, outcomes, strict=True)
+    ]
 
 
-def _kept(name: str, file: Path, output: Path, models: tuple[str, ...]) -> CaseOutcome | None:
+def _job(cohort: Cohort, name: str, threads: int) -> CaseJob:
+    output = cohort.output / name
+    check_below(output, cohort.output)
+    changes = "" if cohort.changes is None else cohort.changes.as_json()
+    return CaseJob(name, str(cohort.cases[name]), str(output), cohort.models, threads, changes)
+
+
+def _kept(job: CaseJob, changes: CaseChanges | None) -> CaseOutcome | None:
     """The outcome of an earlier run, if nothing has changed since."""
+    output = Path(job.output)
     try:
         finish_writing(output)
         written = read_evaluation(output)
-        key = evaluation_key(Case.load(file), models)
+        key = evaluation_key(Case.load(job.file, changes=changes), job.models)
         # The study's figures are drawn from these.
         for model in written["models"]:
             checked_file(output, written, skin_errors_file(model), AGAIN)
     except (OSError, ValueError, CmfsimError):
         return None
-    return _outcome(name, "kept", 0.0, written) if written["key"] == key else None
+    return _outcome(job.name, "kept", 0.0, written) if written["key"] == key else None
 
 
 def _outcome(name: str, status: str, seconds: float, written: Mapping[str, Any]) -> CaseOutcome:
@@ -237,14 +299,16 @@ class _Workers:
                 process.kill()
 
 
-def _on_this_machine(jobs: list[CaseJob], workers: int) -> Iterator[CaseOutcome]:
+def _on_this_machine(jobs: list[CaseJob], workers: int) -> Iterator[tuple[int, CaseOutcome]]:
     # Threads that wait for processes: what a case does, happens in its own.
     processes = _Workers()
     with ThreadPoolExecutor(workers) as pool, _ended_by_signal():
-        running: list[Future[CaseOutcome]] = [pool.submit(run_job, job, processes) for job in jobs]
+        running: dict[Future[CaseOutcome], int] = {
+            pool.submit(run_job, job, processes): index for index, job in enumerate(jobs)
+        }
         try:
             for future in as_completed(running):
-                yield future.result()
+                yield running[future], future.result()
         except BaseException:
             for future in running:
                 future.cancel()
@@ -270,20 +334,21 @@ def _ended_by_signal() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[CaseOutcome]:
+def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[tuple[int, CaseOutcome]]:
     for index, outcome, error in on_cluster(scheduler, run_job, [(job,) for job in jobs]):
         if error is None:
-            yield outcome
+            yield index, outcome
         else:
             reason = f"the cluster lost the case: {error}"
-            yield CaseOutcome(jobs[index].name, "failed", error=reason)
+            yield index, CaseOutcome(jobs[index].name, "failed", error=reason)
 
 
 def run_job(job: CaseJob, processes: _Workers | None = None) -> CaseOutcome:
     """The outcome of one case, worked on by another process."""
     output = Path(job.output)
     begun = time.perf_counter()
-    command = [sys.executable, "-m", "cmfsim.study.worker", job.file, job.output, *job.models]
+    words = [job.file, job.output, job.changes, *job.models]
+    command = [sys.executable, "-m", "cmfsim.study.worker", *words]
     threads = str(job.threads)
     environment = {**os.environ, "RAYON_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
     try:

@@ -1,6 +1,6 @@
 """The process that works on one case of a study.
 
-    python -m cmfsim.study.worker FILE OUTPUT MODEL [MODEL ...]
+    python -m cmfsim.study.worker FILE OUTPUT CHANGES MODEL [MODEL ...]
 
 It writes what `cmfsim evaluate` writes, and ends with 0 if `metrics.json` is whole and new. Its log
 goes to standard error. Standard input is a pipe of the process that started it: when that is
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from cmfsim.doctor import examine, findings_text
 from cmfsim.errors import CmfsimError, error_text
-from cmfsim.io import Case
+from cmfsim.io import Case, CaseChanges
 from cmfsim.pipeline.evaluating import evaluate
 from cmfsim.pipeline.outputs import write_results
 from cmfsim.pipeline.predicting import case_for_models
@@ -35,13 +35,15 @@ def main(words: Sequence[str]) -> int:
     Parameters
     ----------
     words : sequence of str
-        The case's file, its output folder, and the models.
+        The case's file, its output folder, changes of its settings as `CaseChanges.as_json` writes
+        them or an empty text, and the models.
     """
     logging.basicConfig(format="cmfsim: %(message)s", level=logging.WARNING, stream=sys.stderr)
-    file, output, *models = words
+    file, output, changes, *models = words
     _end_with_input()
     try:
-        case = replace(Case.load(file), output=Path(output))
+        made = CaseChanges.from_json(changes) if changes else None
+        case = replace(Case.load(file, changes=made), output=Path(output))
         return 0 if _evaluated(case, models) else 1
     except (CmfsimError, OSError, ValueError, MemoryError) as error:
         _log.error("error: %s", error_text(error))

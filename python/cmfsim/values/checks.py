@@ -1,5 +1,6 @@
 """Checks of what comes in: shape, range and name, with the index and value at fault."""
 
+import difflib
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -23,6 +24,7 @@ __all__ = [
     "check_instance",
     "check_one_of",
     "frozen",
+    "nearest",
 ]
 
 Floats = NDArray[np.float64]
@@ -150,6 +152,12 @@ def check_instance(name: str, value: object, kind: type) -> None:
     if not isinstance(value, kind):
         found = type(value).__name__
         raise CaseInputError(f"{name} is of type {found}: a {kind.__name__} is needed")
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """A question that names the known name most like this one; empty if none is."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def check_one_of(

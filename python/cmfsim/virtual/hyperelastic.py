@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats
 
-__all__ = ["FAT", "MUSCLE", "HyperelasticTissue", "Moduli", "cofactor"]
+__all__ = ["FAT", "MUSCLE", "HyperelasticTissue", "Moduli", "SkinLayer", "cofactor"]
 
 # (i, j, k, ε_ijk) that are not zero.
 PERMUTATIONS = (
@@ -78,6 +78,21 @@ MUSCLE = Moduli(0.79, 0.5, 0.43)
 
 
 @dataclass(frozen=True, eq=False)
+class SkinLayer:
+    """A layer of skin in a mesh, whose share of a tet replaces fat and muscle there.
+
+    Attributes
+    ----------
+    moduli : Moduli
+    share : (m,) float64
+        Part of each tet's volume that is skin, 0 to 1.
+    """
+
+    moduli: Moduli
+    share: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class HyperelasticTissue:
     """A neo-Hookean matrix with fibres, one set of constants per tet, finite even in collapse.
 
@@ -110,9 +125,16 @@ class HyperelasticTissue:
 
     @classmethod
     def mixed(
-        cls, fraction: ArrayLike, fibre: ArrayLike, *, stiffness: float = 1.0
+        cls,
+        fraction: ArrayLike,
+        fibre: ArrayLike,
+        *,
+        stiffness: float = 1.0,
+        muscle: Moduli = MUSCLE,
+        fat: Moduli = FAT,
+        skin: SkinLayer | None = None,
     ) -> "HyperelasticTissue":
-        """The tissue of tets that are part muscle, part fat.
+        """The tissue of tets that are part muscle, part fat, and part skin at the surface.
 
         Parameters
         ----------
@@ -122,6 +144,8 @@ class HyperelasticTissue:
             Unit vectors; not read where the fraction is 0.
         stiffness : float
             Of this person's muscle, in the ordinary muscle's.
+        muscle, fat : Moduli
+        skin : SkinLayer, optional
 
         Raises
         ------
@@ -142,8 +166,11 @@ class HyperelasticTissue:
             raise CaseInputError(f"fibre[{bad[0]}] has length {length[bad[0]]:.6g}: 1 is needed")
         if not (np.isfinite(stiffness) and stiffness > 0.0):
             raise CaseInputError(f"stiffness of muscle is {stiffness}: above 0 is needed")
-        fat, muscle = FAT.spencer()[:, None], stiffness * MUSCLE.spencer()[:, None]
-        lambda_, mu, alpha, difference, beta = (1.0 - p) * fat + p * muscle
+        mixture = (1.0 - p) * fat.spencer()[:, None] + p * stiffness * muscle.spencer()[:, None]
+        if skin is not None:
+            layer = skin.moduli.spencer()[:, None]
+            mixture = (1.0 - skin.share) * mixture + skin.share * layer
+        lambda_, mu, alpha, difference, beta = mixture
         # Fat has no direction: what rounding leaves of its fibre terms is nothing.
         alpha, difference, beta = (np.where(p > 0.0, c, 0.0) for c in (alpha, difference, beta))
         along = np.where(p > 0.0, a.T, np.array([[1.0], [0.0], [0.0]]))

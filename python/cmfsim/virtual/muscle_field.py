@@ -10,9 +10,9 @@ from cmfsim.phantom import Muscle, PhantomHead
 from cmfsim.phantom.curves import smooth_max
 from cmfsim.phantom.muscles import MELT
 from cmfsim.phantom.shapes import FlatTube
-from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
+from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows, check_one_of
 
-__all__ = ["muscle_field", "thickened"]
+__all__ = ["muscle_field", "skin_share", "thickened"]
 
 # Barycentric places at which a tet is asked whether it is muscle: corners of the four smaller tets
 # about its corners and the middle, drawn in so that none lies on a face.
@@ -57,12 +57,33 @@ def thickened(muscles: Mapping[str, Muscle], factor: float) -> dict[str, Muscle]
     }
 
 
+def skin_share(nodes: ArrayLike, tets: ArrayLike, depth: Floats, thickness: float) -> Floats:
+    """The part of each tet that lies within a depth below the skin, (m,), asked at eleven places.
+
+    Parameters
+    ----------
+    nodes : (n, 3) float64, mm
+    tets : (m, 4) uint32
+    depth : (n,) float64, mm
+        Of the nodes below the skin.
+    thickness : float, mm
+    """
+    points = as_rows("nodes", nodes, 3)
+    rows = as_index_rows("tets", tets, 4, len(points), "nodes")
+    blur = BLUR * np.linalg.norm(points[rows[:, 1]] - points[rows[:, 0]], axis=1)
+    inside = thickness - depth[rows] @ PLACES.T
+    share: Floats = np.clip(0.5 + inside / (2.0 * blur)[:, None], 0.0, 1.0).mean(axis=1)
+    return share
+
+
 def muscle_field(
     head: PhantomHead,
     muscles: Mapping[str, Muscle],
     nodes: ArrayLike,
     tets: ArrayLike,
     depth: Floats,
+    *,
+    offsets: Mapping[str, tuple[float, float, float]] | None = None,
 ) -> tuple[Floats, Floats]:
     """The muscle fraction (m,) and fibre (m, 3) of each tet, from the muscles' own levels.
 
@@ -79,14 +100,19 @@ def muscle_field(
     tets : (m, 4) uint32
     depth : (n,) float64, mm
         Of the nodes below the skin.
+    offsets : mapping of str to 3 float, mm, optional
+        By muscle, the distance left, backwards and up by which it lies elsewhere.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Misshapen arrays.
+        (also `ValueError`) Misshapen arrays; an offset of no muscle.
     """
     points = as_rows("nodes", nodes, 3)
     rows = as_index_rows("tets", tets, 4, len(points), "nodes")
+    shifts = dict(offsets or {})
+    for name in shifts:
+        check_one_of("muscle with an offset", name, tuple(muscles))
     corners = points[rows]
     middles = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
@@ -94,8 +120,10 @@ def muscle_field(
     total = np.zeros(len(rows))
     axes = np.zeros((len(rows), 3, 3))
     warp, scale = head.warp, head.parameters.scale
-    drawn = np.column_stack(warp.inverse(*middles.T))
-    for muscle in muscles.values():
+    unmoved = np.column_stack(warp.inverse(*middles.T))
+    for name, muscle in muscles.items():
+        shift = np.array(shifts.get(name, (0.0, 0.0, 0.0)))
+        drawn = np.column_stack(warp.inverse(*(middles - shift).T)) if shift.any() else unmoved
         box, room = muscle.box, float(reach.max()) / scale
         low, high = np.array(box.low) - room, np.array(box.high) + room
         chosen = np.flatnonzero(((drawn >= low) & (drawn <= high)).all(axis=1))
@@ -105,7 +133,7 @@ def muscle_field(
         chosen = chosen[level > -(reach + blur)[chosen]]
         if not len(chosen):
             continue
-        asked = np.einsum("pc,tci->tpi", PLACES, corners[chosen])
+        asked = np.einsum("pc,tci->tpi", PLACES, corners[chosen]) - shift
         folded = _folded(muscle, np.column_stack(warp.inverse(*asked.reshape(-1, 3).T)))
         level = scale * _level(muscle, folded.reshape(asked.shape), room)
         level = np.minimum(level, depth[rows[chosen]] @ PLACES.T - BELOW_SKIN)
@@ -115,7 +143,7 @@ def muscle_field(
         chosen, part = chosen[touched], part[touched]
         if not len(chosen):
             continue
-        along = muscle.fibre(middles[chosen])
+        along = muscle.fibre(middles[chosen] - shift)
         total[chosen] += part
         axes[chosen] += part[:, None, None] * along[:, :, None] * along[:, None, :]
     fibre = np.tile([1.0, 0.0, 0.0], (len(rows), 1))

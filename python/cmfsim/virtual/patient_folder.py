@@ -7,7 +7,7 @@ import platform
 import shutil
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,18 @@ from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.virtual.carried_skin import scanned
 from cmfsim.virtual.equilibrium import EquilibriumOptions
-from cmfsim.virtual.people import DRAWN, PATIENTS, Relocation, VirtualPatient, patient_named
+from cmfsim.virtual.people import (
+    DRAWN,
+    PATIENTS,
+    Relocation,
+    TrueTissue,
+    VirtualPatient,
+    patient_named,
+)
 from cmfsim.virtual.truth import PostoperativeTruth, postoperative_truth
 
 __all__ = [
+    "EXECUTED",
     "PATIENTS_WITH_JOINED_LIPS",
     "TRUTH",
     "case_text",
@@ -57,6 +65,9 @@ TIMES = "times.json"
 # The skin before the operation, whose vertices a prediction moves.
 SKIN = "skin.ply"
 COHORT = "cohort.toml"
+# The case with the operation as it was carried out, where it departs from the plan; and the cohort
+# of these.
+EXECUTED = "executed.toml"
 
 
 def virtual_patients(
@@ -139,7 +150,7 @@ def _write_cohort(folder: Path) -> None:
         file.write(cohort_text("virtual patients", names).encode())
 
 
-def cohort_text(name: str, patients: Iterable[str]) -> str:
+def cohort_text(name: str, patients: Iterable[str], *, executed: bool = False) -> str:
     """The text of a `cohort.toml` next to the folders of patients."""
     lines = [
         "# `cmfsim study` with this file predicts every patient by every model.",
@@ -147,10 +158,11 @@ def cohort_text(name: str, patients: Iterable[str]) -> str:
         "version = 1",
         f'name = "{name}"',
         'note = "in silico: synthetic heads and computed operations; no patients"',
-        'output = "study"',
+        'output = "executed"' if executed else 'output = "study"',
     ]
     for patient in patients:
-        lines += ["", "[[cases]]", f'file = "{patient}/case.toml"']
+        file = f"{TRUTH}/{EXECUTED}" if executed else "case.toml"
+        lines += ["", "[[cases]]", f'name = "{patient}"', f'file = "{patient}/{file}"']
     return "\n".join([*lines, ""])
 
 
@@ -242,6 +254,9 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     fresh = folder / f".{TRUTH}.new"
     shutil.rmtree(fresh, ignore_errors=True)
     _write_truth(fresh, truth, _scan(truth, patient, seed), _landmarks_after(truth, patient, seed))
+    if patient.departures:
+        text = case_text(patient, {}, COARSER * edge_length, executed=truth.motions)
+        (fresh / EXECUTED).write_text(text, encoding="utf-8")
     settings = patient_settings(patient, seed, edge_length, spacing)
     _write_json(fresh / RECORD, _record(patient, truth, settings))
     # In a separate file: the record is reproduced to the last byte by the same seed.
@@ -323,26 +338,54 @@ def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> d
     }
 
 
-def case_text(patient: VirtualPatient, skull: Mapping[str, Floats], edge_length: float) -> str:
-    """The text of `case.toml`: turns are about the skull landmarks, the mesh has this edge, mm."""
+def case_text(
+    patient: VirtualPatient,
+    skull: Mapping[str, Floats],
+    edge_length: float,
+    *,
+    executed: Mapping[str, Floats] | None = None,
+) -> str:
+    """The text of `case.toml`, or of the case with the operation as it was carried out.
+
+    Parameters
+    ----------
+    patient : VirtualPatient
+    skull : mapping of str to (3,) float64, mm
+        Landmarks about which the turns of the plan are.
+    edge_length : float, mm
+        Of the mesh.
+    executed : mapping of str to (4, 4) float64, mm, optional
+        True motions of the segments, which replace the plan in a file in the folder of the truth.
+    """
+    place, truth = ("", f"{TRUTH}/") if executed is None else ("../", "")
+    what = (
+        "# `cmfsim evaluate case.toml` predicts the face and compares it with the truth in truth/."
+        if executed is None
+        else "# Its plan is what the operation did: errors are those of the tissue alone."
+    )
     lines = [
         f"# Virtual patient {patient.name} ({patient.label}), in silico: no patient.",
-        "# `cmfsim evaluate case.toml` predicts the face and compares it with the truth in truth/.",
+        what,
         'format = "cmfsim-case"',
         "version = 1",
         f'name = "{patient.name}-in-silico"',
         "",
         "[image]",
-        'file = "ct.nrrd"',
+        f'file = "{place}ct.nrrd"',
         "",
         "[landmarks]",
-        'skull = "skull.mrk.json"',
-        'skin = "skin.mrk.json"',
+        f'skull = "{place}skull.mrk.json"',
+        f'skin = "{place}skin.mrk.json"',
     ]
     for procedure in patient.osteotomies:
         lines += ["", "[[osteotomies]]", f'procedure = "{procedure}"']
     for segment, move in patient.plan.items():
-        lines += ["", f"[plan.{segment}]", *_motion_lines(move, skull)]
+        motion = (
+            _motion_lines(move, skull)
+            if executed is None
+            else [f"matrix = {executed[segment].tolist()}"]
+        )
+        lines += ["", f"[plan.{segment}]", *motion]
     lines += [
         "",
         "[mesh]",
@@ -351,8 +394,8 @@ def case_text(patient: VirtualPatient, skull: Mapping[str, Floats], edge_length:
         "[muscles]",
         "",
         "[postoperative]",
-        f'skin = "{TRUTH}/skin.ply"',
-        f'landmarks = "{TRUTH}/skin.mrk.json"',
+        f'skin = "{truth}skin.ply"',
+        f'landmarks = "{truth}skin.mrk.json"',
         "",
         "[output]",
         'folder = "out"',
@@ -402,7 +445,12 @@ def _described(patient: VirtualPatient) -> dict[str, Any]:
         "plan": {name: asdict(move) for name, move in patient.plan.items()},
         "departures": {name: asdict(move) for name, move in patient.departures.items()},
         "thickness_change": patient.thickness_change,
+        "tissue": {f.name: _plain(getattr(patient.tissue, f.name)) for f in fields(TrueTissue)},
     }
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else value
 
 
 def _measured(truth: PostoperativeTruth) -> dict[str, Any]:

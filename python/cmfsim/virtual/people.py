@@ -7,7 +7,7 @@ from types import MappingProxyType
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
 
-__all__ = ["DRAWN", "PATIENTS", "Relocation", "VirtualPatient", "patient_named"]
+__all__ = ["DRAWN", "PATIENTS", "Relocation", "TrueTissue", "VirtualPatient", "patient_named"]
 
 Triple = tuple[float, float, float]
 
@@ -37,6 +37,43 @@ class Relocation:
 
 
 @dataclass(frozen=True)
+class TrueTissue:
+    """How a person's tissue departs from the phantom's, from which the built-in template was drawn.
+
+    The values by default are those of the phantom and of the models: what a model assumes is then
+    true of the person.
+
+    Attributes
+    ----------
+    muscle_young : (float, float) or None, MPa
+        Of muscle along and across its fibres; None: those of the phantom.
+    fat_poisson : float
+    skin_young, skin_thickness : float, MPa and mm
+        Of a layer of skin; none if the thickness is 0.
+    offsets : mapping of str to 3 float, mm
+        By muscle, the distance left, backwards and up by which it lies elsewhere.
+    absent : tuple of str
+        Muscles that the person does not have.
+    slides_on : str
+        Where tissue slides at the tooth rows: "sheet" or "bone", as `KindOptions` has it.
+    vestibule : float, mm
+        By how much the zone in which it slides is deeper than models assume.
+    """
+
+    muscle_young: tuple[float, float] | None = None
+    fat_poisson: float = 0.46
+    skin_young: float = 0.0
+    skin_thickness: float = 0.0
+    offsets: Mapping[str, Triple] = field(default_factory=dict)
+    absent: tuple[str, ...] = ()
+    slides_on: str = "sheet"
+    vestibule: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "offsets", MappingProxyType(dict(self.offsets)))
+
+
+@dataclass(frozen=True)
 class VirtualPatient:
     """A synthetic person with an operation.
 
@@ -60,6 +97,7 @@ class VirtualPatient:
         By segment, how the operation departs from the plan. The case file has only the plan.
     thickness_change : float
         Swelling of the soft tissue after the operation, as a share of its depth.
+    tissue : TrueTissue
     """
 
     number: int
@@ -72,6 +110,7 @@ class VirtualPatient:
     separate_lips: bool = False
     departures: Mapping[str, Relocation] = field(default_factory=dict)
     thickness_change: float = 0.0
+    tissue: TrueTissue = field(default_factory=TrueTissue)
 
     def __post_init__(self) -> None:
         for name in ("plan", "departures"):

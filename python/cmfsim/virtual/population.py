@@ -11,11 +11,12 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
-from cmfsim.values.checks import as_number
+from cmfsim.phantom.courses import COURSES
+from cmfsim.values.checks import as_number, check_one_of
 from cmfsim.values.uncertainty import ADDED, PLAN
-from cmfsim.virtual.people import DRAWN, Relocation, VirtualPatient
+from cmfsim.virtual.people import DRAWN, Relocation, TrueTissue, VirtualPatient
 
-__all__ = ["drawn_patient"]
+__all__ = ["OWN", "PHANTOM", "TRUTHS", "drawn_patient"]
 
 # Mean, standard deviation and largest departure from the mean.
 Distribution = tuple[float, float, float]
@@ -73,11 +74,42 @@ SHAPES = (
 )
 
 
+# How the true tissue is made: with muscles, moduli and sliding of its own, or with those that the
+# models assume, as the phantom has them from which the built-in template was drawn.
+TRUTHS = OWN, PHANTOM = "own", "phantom"
+# Number that makes the draws of a person's tissue independent of all others.
+TISSUE_DRAW = 1
+# Young's modulus of muscle along its fibres, MPa, log-uniform: from the masseter at rest in
+# elastography to the constants of Kim et al. 2010 (docs/moduli.md); and the ratio of it to that
+# across, about whose direction sources disagree.
+MUSCLE_YOUNG = (0.007, 0.79)
+ALONG_OVER_ACROSS = (0.5, 2.0)
+# Of fat, uniform: what tissue squeezed for weeks loses in volume is not known.
+FAT_POISSON = (0.3, 0.48)
+# Of skin, MPa, log-uniform, and its thickness, mm, uniform.
+SKIN_YOUNG = (0.01, 0.5)
+SKIN_THICKNESS = (1.0, 2.0)
+# Offset of a muscle along each axis, mm: 5 mm in all.
+MUSCLE_OFFSET: Distribution = (0.0, 2.9, 5.8)
+# Share of persons who lack a muscle of expression on both sides, and the muscles nobody lacks.
+LACKING = 0.1
+NEVER_LACKING = (
+    "masseter",
+    "temporalis",
+    "medial_pterygoid",
+    "buccinator",
+    "orbicularis_oris",
+    "orbicularis_oculi",
+)
+# Depth of the vestibule beyond that which the models assume, mm.
+VESTIBULE: Distribution = (0.0, 2.0, 4.0)
+
+
 class _Draws:
     """The random numbers of one patient."""
 
-    def __init__(self, seed: int, index: int) -> None:
-        self.generator = np.random.default_rng([seed, index])
+    def __init__(self, *seed: int) -> None:
+        self.generator = np.random.default_rng(seed)
 
     def within(self, distribution: Distribution) -> float:
         """A normal draw, limited to the largest departure and rounded as in a plan."""
@@ -89,8 +121,16 @@ class _Draws:
         """A normal draw about zero."""
         return self.within((0.0, sd, MOST_ERRORS * sd))
 
+    def uniform(self, low: float, high: float) -> float:
+        """A number between two others, rounded to a thousandth."""
+        return round(float(self.generator.uniform(low, high)), 3)
 
-def drawn_patient(seed: int, index: int) -> VirtualPatient:
+    def log_uniform(self, low: float, high: float) -> float:
+        """A number whose logarithm is uniform, rounded to three digits."""
+        return float(f"{np.exp(self.generator.uniform(np.log(low), np.log(high))):.3g}")
+
+
+def drawn_patient(seed: int, index: int, *, truth: str = OWN) -> VirtualPatient:
     """One patient of the population that belongs to a seed.
 
     Parameters
@@ -99,16 +139,20 @@ def drawn_patient(seed: int, index: int) -> VirtualPatient:
         0 or more.
     index : int
         1 or more; the patient is named D with this number.
+    truth : str
+        "own": the person's muscles lie elsewhere than the phantom's, some are absent, all have
+        their own moduli, fat and skin too, and tissue slides on bone; "phantom": muscles, moduli of
+        fat and sliding are what the models assume. Shape, operation, plan and errors are the same.
 
     Returns
     -------
     VirtualPatient
-        Always the same for the same seed and index.
+        Always the same for the same seed, index and truth.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) A seed or index that is not a whole number in its range.
+        (also `ValueError`) A seed or index that is not a whole number in its range; another truth.
 
     Examples
     --------
@@ -119,12 +163,13 @@ def drawn_patient(seed: int, index: int) -> VirtualPatient:
     for name, value, least in (("seed", seed, 0), ("index", index, 1)):
         if as_number(name, value) < least or int(value) != value:
             raise CaseInputError(f"{name} is {value!r}: a whole number from {least} is needed")
+    check_one_of("truth", truth, TRUTHS)
     draws = _Draws(int(seed), int(index))
     shares = np.array([share for _, share in OPERATIONS])
     osteotomies = OPERATIONS[int(draws.generator.choice(len(OPERATIONS), p=shares))][0]
     person = _person(draws, only_maxilla=osteotomies == ("le_fort_1",))
     plan = _plan(draws, person, osteotomies)
-    return VirtualPatient(
+    patient = VirtualPatient(
         DRAWN + int(index),
         ", ".join(LABELS[procedure] for procedure in osteotomies),
         person,
@@ -134,6 +179,36 @@ def drawn_patient(seed: int, index: int) -> VirtualPatient:
         plan,
         departures=_departures(draws, plan),
         thickness_change=round(0.01 * draws.error(100.0 * THICKNESS_CHANGE), 4),
+    )
+    if truth == PHANTOM:
+        return patient
+    tissue = _own_tissue(_Draws(int(seed), int(index), TISSUE_DRAW))
+    return replace(patient, muscle_stiffness=1.0, tissue=tissue)
+
+
+def _own_tissue(draws: _Draws) -> TrueTissue:
+    """Tissue about which the models know nothing but that it lies between bones and skin."""
+    along = draws.log_uniform(*MUSCLE_YOUNG)
+    across = float(f"{along / draws.log_uniform(*ALONG_OVER_ACROSS):.3g}")
+    offsets: dict[str, tuple[float, float, float]] = {}
+    absent: list[str] = []
+    for name, course in COURSES.items():
+        sides = [f"{name}_{side}" for side in "LR"] if course.paired else [name]
+        lacking = draws.generator.random() < LACKING
+        if lacking and name not in NEVER_LACKING:
+            absent += sides
+        for side in sides:
+            left, back, up = (draws.within(MUSCLE_OFFSET) for _ in range(3))
+            offsets[side] = (left, back, up)
+    return TrueTissue(
+        muscle_young=(along, across),
+        fat_poisson=draws.uniform(*FAT_POISSON),
+        skin_young=draws.log_uniform(*SKIN_YOUNG),
+        skin_thickness=draws.uniform(*SKIN_THICKNESS),
+        offsets={name: offset for name, offset in offsets.items() if name not in absent},
+        absent=tuple(absent),
+        slides_on="bone",
+        vestibule=draws.within(VESTIBULE),
     )
 
 

@@ -24,6 +24,7 @@ from cmfsim.io.populations import (
 )
 from cmfsim.values.checks import as_number, as_positive
 from cmfsim.virtual.patient_folder import (
+    EXECUTED,
     TRUTH,
     cohort_text,
     is_made,
@@ -31,7 +32,7 @@ from cmfsim.virtual.patient_folder import (
     write_virtual_patient,
 )
 from cmfsim.virtual.people import VirtualPatient
-from cmfsim.virtual.population import drawn_patient
+from cmfsim.virtual.population import OWN, drawn_patient
 
 __all__ = ["PatientOutcome", "make_patient", "virtual_population"]
 
@@ -71,23 +72,25 @@ class _Job:
     index: int
     edge_length: float
     spacing: float
+    truth: str = OWN
 
     @property
     def patient(self) -> VirtualPatient:
-        return drawn_patient(self.seed, self.index)
+        return drawn_patient(self.seed, self.index, truth=self.truth)
 
     @property
     def settings(self) -> dict[str, Any]:
         return patient_settings(self.patient, self.seed, self.edge_length, self.spacing)
 
 
-def virtual_population(
+def virtual_population(  # noqa: PLR0913 (options by name)
     folder: str | os.PathLike[str],
     count: int,
     *,
     seed: int = 0,
     edge_length: float = 6.0,
     spacing: float = 2.0,
+    truth: str = OWN,
     workers: int = 1,
     scheduler: str | None = None,
     progress: Callable[[PatientOutcome], None] | None = None,
@@ -109,6 +112,8 @@ def virtual_population(
         Of the true meshes.
     spacing : float, mm
         Of the CTs.
+    truth : str
+        "own" or "phantom": how the true tissue is made, see `drawn_patient`.
     workers : int
         Patients at a time, each in its own process with one thread.
     scheduler : str, optional
@@ -126,7 +131,7 @@ def virtual_population(
     ------
     CaseError
         (also `ValueError`) An invalid count, seed, number of workers or length; a folder that
-        contains a population of another seed or resolution; a worker that died.
+        contains a population of another seed, truth or resolution; a worker that died.
     OSError
         The folder cannot be written to.
 
@@ -141,8 +146,9 @@ def virtual_population(
     edge, voxel = as_positive("edge_length", edge_length), as_positive("spacing", spacing)
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    jobs = [_Job(str(place), int(seed), i, edge, voxel) for i in range(1, int(count) + 1)]
-    record = {"seed": int(seed), "edge_length_mm": edge, "ct_spacing_mm": voxel}
+    numbers = range(1, int(count) + 1)
+    jobs = [_Job(str(place), int(seed), i, edge, voxel, truth) for i in numbers]
+    record = {"seed": int(seed), "truth": truth, "edge_length_mm": edge, "ct_spacing_mm": voxel}
     entries = {job.patient.name: _entry(job, PENDING) for job in jobs}
     entries |= _further(place, record, entries)
     _write(place, record, entries)
@@ -176,7 +182,7 @@ def _further(
 
 
 def _write(folder: Path, record: dict[str, Any], entries: dict[str, PopulationEntry]) -> None:
-    """The population's file, and a cohort for `cmfsim study` of each part."""
+    """The population's file, and cohorts for `cmfsim study`: of each part, and as carried out."""
     population = Population(entries, record)
     population.write(folder)
     for part in PARTS:
@@ -184,6 +190,11 @@ def _write(folder: Path, record: dict[str, Any], entries: dict[str, PopulationEn
         if names:
             with replacing(folder / f"{part}.toml") as file:
                 file.write(cohort_text(f"virtual patients, {part}", names).encode())
+    everyone = population.named(MADE)
+    if everyone:
+        text = cohort_text("virtual patients, plans as carried out", everyone, executed=True)
+        with replacing(folder / EXECUTED) as file:
+            file.write(text.encode())
 
 
 def _made(jobs: list[_Job], workers: int, scheduler: str | None) -> Iterator[tuple[_Job, str, str]]:

@@ -11,7 +11,7 @@ from cmfsim._core import Surface, TetMesh
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io import Case
 from cmfsim.phantom import PhantomHead
-from cmfsim.pipeline.building.case_model import build_model
+from cmfsim.pipeline.building.case_model import build_model, kind_options_of
 from cmfsim.surfaces.depth import moved_outward, tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
@@ -30,9 +30,9 @@ from cmfsim.virtual.equilibrium import (
     EquilibriumOptions,
     find_equilibrium,
 )
-from cmfsim.virtual.hyperelastic import HyperelasticTissue
+from cmfsim.virtual.hyperelastic import FAT, MUSCLE, HyperelasticTissue, Moduli, SkinLayer
 from cmfsim.virtual.lip_contact import ContactSum, LipContact, lips_of
-from cmfsim.virtual.muscle_field import muscle_field, thickened
+from cmfsim.virtual.muscle_field import muscle_field, skin_share, thickened
 from cmfsim.virtual.open_mouth import MouthSlit, with_open_mouth
 from cmfsim.virtual.operation import (
     Operation,
@@ -42,7 +42,7 @@ from cmfsim.virtual.operation import (
     without_bite,
     without_gaps,
 )
-from cmfsim.virtual.people import VirtualPatient
+from cmfsim.virtual.people import TrueTissue, VirtualPatient
 
 __all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
 
@@ -60,6 +60,10 @@ STEPS_WITH_LIPS = 6
 MOST_SWELLING = 12.0
 # Nodes within this distance from the skin lie on it, mm.
 NEAR_SKIN = 0.5
+# Poisson's ratio of a layer of skin: mostly water, as far as linear tets allow.
+SKIN_POISSON = 0.46
+# How deep the zone is in which tissue slides, front and side of either jaw.
+ZONE = ("upper_front", "upper_molars", "lower_front", "lower_molars")
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +173,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     separate = patient.separate_lips
     if options is None and separate:
         options = EquilibriumOptions(steps=STEPS_WITH_LIPS)
-    fine = _true_case(case, head, length, refine=refine or separate)
+    fine = _true_case(case, head, patient.tissue, length, refine=refine or separate)
     stage("drawing the true anatomy")
     drawn = _drawn(head, as_positive("grid", grid), separate_lips=separate)
     model = build_model(fine, progress=progress, check=False, anatomy=drawn.anatomy)
@@ -190,10 +194,8 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     nodes, tets = opened.nodes, opened.tets
 
     stage("placing the true muscles")
-    muscles = thickened(head.muscles, patient.muscle_thickness)
     depth = drawn.anatomy.skin.sample(nodes)
-    fraction, fibre = muscle_field(head, muscles, nodes, tets, np.maximum(depth, 0.0))
-    tissue = HyperelasticTissue.mixed(fraction, fibre, stiffness=patient.muscle_stiffness)
+    fraction, fibre, tissue = _tissue(patient, head, nodes, tets, np.maximum(depth, 0.0))
 
     stage("moving the bones")
     body = HyperelasticBody(nodes, tets, tissue)
@@ -229,14 +231,50 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     )
 
 
-def _true_case(case: Case, head: PhantomHead, edge_length: float, *, refine: bool) -> Case:
+def _tissue(
+    patient: VirtualPatient,
+    head: PhantomHead,
+    nodes: Floats,
+    tets: NDArray[np.uint32],
+    depth: Floats,
+) -> tuple[Floats, Floats, HyperelasticTissue]:
+    """Muscle fraction (m,), fibre (m, 3) and law of the person's tissue."""
+    own = patient.tissue
+    present = {name: muscle for name, muscle in head.muscles.items() if name not in own.absent}
+    muscles = thickened(present, patient.muscle_thickness)
+    offsets = {name: offset for name, offset in own.offsets.items() if name in muscles}
+    fraction, fibre = muscle_field(head, muscles, nodes, tets, depth, offsets=offsets)
+    muscle = MUSCLE
+    if own.muscle_young is not None:
+        muscle = replace(MUSCLE, young_along=own.muscle_young[0], young_across=own.muscle_young[1])
+    skin = None
+    if own.skin_thickness > 0.0:
+        moduli = Moduli(own.skin_young, own.skin_young, SKIN_POISSON)
+        skin = SkinLayer(moduli, skin_share(nodes, tets, depth, own.skin_thickness))
+    law = HyperelasticTissue.mixed(
+        fraction,
+        fibre,
+        stiffness=patient.muscle_stiffness,
+        muscle=muscle,
+        fat=replace(FAT, poisson=own.fat_poisson),
+        skin=skin,
+    )
+    return fraction, fibre, law
+
+
+def _true_case(
+    case: Case, head: PhantomHead, tissue: TrueTissue, edge_length: float, *, refine: bool
+) -> Case:
     """The case from which the true model is built: no muscles, nothing after the operation."""
+    options = kind_options_of(case)
+    zone = {name: getattr(options, name) + tissue.vestibule for name in ZONE}
+    kinds = {**case.node_kinds, **zone, "contact_surface": tissue.slides_on}
     return replace(
         case,
         region=replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION),
         mesh=replace(case.mesh, edge_length=edge_length, refine=refine),
         # The operation itself strips tissue off the bone, by how far the sides of a cut move apart.
-        node_kinds=dict(case.node_kinds, lifted=0.0),
+        node_kinds=dict(kinds, lifted=0.0),
         muscles=None,
         postoperative=None,
     )

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,19 @@ from cmfsim.cli import main
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.values.uncertainty import PLAN
 from cmfsim.virtual import population_folder
-from cmfsim.virtual.population import CHIN_FORWARDS, OPERATIONS
+from cmfsim.virtual.people import TrueTissue
+from cmfsim.virtual.population import (
+    ALONG_OVER_ACROSS,
+    CHIN_FORWARDS,
+    FAT_POISSON,
+    LACKING,
+    MUSCLE_OFFSET,
+    MUSCLE_YOUNG,
+    NEVER_LACKING,
+    OPERATIONS,
+    SKIN_THICKNESS,
+    SKIN_YOUNG,
+)
 
 SIZE = 400
 # What a test can afford: coarse tets, and a CT that no prediction will read.
@@ -74,6 +87,50 @@ def test_jaws_in_occlusion_are_off_together(people):
             assert low - 0.01 <= body - chin <= high + 0.01
 
 
+def test_own_tissue_is_drawn_from_the_published_ranges(people):
+    """Log-uniform moduli, offsets of 5 mm in all, and a tenth without a muscle of expression."""
+    tissues = [patient.tissue for patient in people]
+    along, across = np.array([t.muscle_young for t in tissues]).T
+    for values, (low, high) in (
+        (along, MUSCLE_YOUNG),
+        (along / across, ALONG_OVER_ACROSS),
+        (np.array([t.skin_young for t in tissues]), SKIN_YOUNG),
+    ):
+        share = (np.log(values) - np.log(low)) / np.log(high / low)
+        assert -0.01 < share.min() < 0.05
+        assert 0.95 < share.max() < 1.01
+        # Of a uniform distribution: mean 1/2 within four standard errors.
+        assert abs(share.mean() - 0.5) < 4.0 / np.sqrt(12.0 * SIZE)
+    offsets = np.array([offset for t in tissues for offset in t.offsets.values()])
+    size = np.sqrt((offsets**2).sum(axis=1).mean())
+    assert size == pytest.approx(0.96 * np.sqrt(3.0) * MUSCLE_OFFSET[1], rel=0.03)
+    sides = ("masseter_L", "masseter_R")
+    assert any(t.offsets[sides[0]] != t.offsets[sides[1]] for t in tissues)
+    lacking = np.mean(["risorius_L" in t.absent for t in tissues])
+    assert abs(lacking - LACKING) < 4.0 * np.sqrt(LACKING * (1.0 - LACKING) / SIZE)
+    for tissue in tissues:
+        assert not set(tissue.absent) & set(tissue.offsets)
+        assert not any(name.rpartition("_")[0] in NEVER_LACKING for name in tissue.absent)
+        assert {name.replace("_L", "_R") for name in tissue.absent} >= {
+            name for name in tissue.absent if name.endswith("_R")
+        }
+        assert FAT_POISSON[0] <= tissue.fat_poisson <= FAT_POISSON[1]
+        assert SKIN_THICKNESS[0] <= tissue.skin_thickness <= SKIN_THICKNESS[1]
+
+
+def test_the_phantoms_tissue_belongs_to_the_same_people(people):
+    """Shape, operation, plan and errors do not depend on how the tissue is made."""
+    for index, patient in enumerate(people[:20], 1):
+        same = cmfsim.drawn_patient(5, index, truth="phantom")
+        assert same.tissue == TrueTissue()
+        assert patient == replace(same, muscle_stiffness=1.0, tissue=patient.tissue)
+    # As it was drawn before other tissue could be.
+    first = cmfsim.drawn_patient(1, 1, truth="phantom")
+    assert (first.muscle_thickness, first.muscle_stiffness) == (1.127, 0.811)
+    with pytest.raises(CaseInputError, match="truth is 'model': use one of own, phantom"):
+        cmfsim.drawn_patient(5, 1, truth="model")
+
+
 @pytest.mark.parametrize(("seed", "index"), [(-1, 1), (0, 0), (0.5, 1), (0, 1.5)])
 def test_what_is_no_patient_is_refused(seed, index):
     """Seeds from 0, indices from 1, whole."""
@@ -119,6 +176,23 @@ def test_the_truth_is_the_plan_with_its_departures(made):
     assert "departures" not in (place / "case.toml").read_text()
 
 
+def test_the_operation_as_carried_out_is_a_case_of_its_own(made):
+    """Its plan is the true motion of each segment; all else is that of the case."""
+    folder, _ = made
+    cohort = cmfsim.Cohort.load(folder / "executed.toml")
+    assert list(cohort.cases) == ["D001"]
+    done, case = (cmfsim.Case.load(p) for p in (cohort.cases["D001"], folder / "D001"))
+    record = json.loads((folder / "D001/truth/truth.json").read_text())
+    assert set(done.plan) == set(case.plan)
+    for name, motion in done.plan.items():
+        np.testing.assert_allclose(motion.matrix, record["motions"][name], atol=1e-12)
+        assert np.abs(motion.matrix - case.plan[name].matrix).max() > 0.1
+    assert done.image.file.resolve() == case.image.file.resolve()
+    assert done.postoperative.skin.resolve() == case.postoperative.skin.resolve()
+    assert done.mesh == case.mesh
+    assert not [f for f in cmfsim.diagnose(done) if f.severity == "error"]
+
+
 def test_the_skin_is_thicker_where_nothing_moved(made):
     """Forehead: outward along the normal by the drawn share of the tissue's depth."""
     place, share = made[0] / "D001", cmfsim.drawn_patient(1, 1).thickness_change
@@ -133,7 +207,10 @@ def test_the_skin_is_thicker_where_nothing_moved(made):
     bone = cmfsim.read_surface(place / "truth/bones_before/cranium.ply")
     closest, _, _ = cmfsim.Surface(bone.vertices, bone.triangles).closest(points[forehead])
     depth = np.minimum(np.linalg.norm(closest - points[forehead], axis=1), 12.0)
-    assert np.abs(outward[forehead] - share * depth).max() < 0.02
+    off = np.abs(outward[forehead] - share * depth)
+    # The person's stiffer skin carries a little of the operation's motion as far as here.
+    assert np.median(off) < 0.01
+    assert off.max() < 0.04
 
 
 def test_another_process_gives_the_same_bytes(made, tmp_path):
@@ -163,6 +240,8 @@ def test_another_population_is_not_mixed_in(made):
         cmfsim.virtual_population(made[0], 1, seed=2, **COARSE)
     with pytest.raises(CaseInputError, match="use another folder"):
         cmfsim.virtual_population(made[0], 1, seed=1, edge_length=7.0, spacing=4.0)
+    with pytest.raises(CaseInputError, match="'truth': 'own'"):
+        cmfsim.virtual_population(made[0], 1, seed=1, truth="phantom", **COARSE)
 
 
 def test_a_failure_is_recorded_and_not_tried_again(tmp_path, monkeypatch):
@@ -201,6 +280,7 @@ def test_failures_are_in_the_record_and_counted(tmp_path, monkeypatch, capsys):
         "failed", "calibration", found.patients["D002"].operation, "stalls"
     )
     assert found.named("made", "train") == ("D001", "D004")
+    assert list(cmfsim.Cohort.load(tmp_path / "executed.toml").cases) == ["D001", "D003", "D004"]
     # A smaller count later takes nobody away.
     monkeypatch.setattr(population_folder, "_made", lambda jobs, *_: outcomes(jobs, 1))
     cmfsim.virtual_population(tmp_path, 1, seed=3)
@@ -212,6 +292,7 @@ def test_options_that_contradict_are_refused(tmp_path, capsys):
     for words in (
         ["--count", "2", "--patients", "1"],
         ["--workers", "2"],
+        ["--patients", "1", "--truth", "phantom"],
         ["--count", "0"],
         ["--count", "1", "--edge-length", "0"],
         ["--count", "1", "--workers", "0"],

@@ -12,7 +12,7 @@ from cmfsim.cli import main
 from cmfsim.errors import CaseInputError
 from cmfsim.virtual import PATIENTS, EquilibriumOptions
 from cmfsim.virtual.carried_skin import carried, scanned
-from cmfsim.virtual.muscle_field import muscle_field, thickened
+from cmfsim.virtual.muscle_field import muscle_field, skin_share, thickened
 from cmfsim.virtual.operation import bone_distances, screw, without_bite, without_gaps
 from cmfsim.virtual.patient_folder import virtual_patients
 from cmfsim.virtual.truth import largest_body
@@ -220,6 +220,39 @@ def test_thicker_muscles_fill_more():
         for factor in (1.0, 1.5)
     ]
     assert 1.4 < volume[1] / volume[0] < 1.6
+
+
+def test_a_muscle_with_an_offset_is_the_same_muscle_elsewhere():
+    """Asked where everything is shifted alike, fractions and fibres are those without offset."""
+    head = cmfsim.make_head()
+    muscles = {name: head.muscles[name] for name in ("masseter_L", "risorius_L")}
+    centre = np.mean([line.mean(axis=0) for line in muscles["masseter_L"].course], axis=0)
+    nodes, tets = meshes.box((6, 6, 6), (30.0, 30.0, 30.0))
+    nodes = nodes + centre - 15.0
+    deep = np.full(len(nodes), 50.0)
+    offset = (3.0, -2.5, 4.0)
+    fraction, fibre = muscle_field(head, muscles, nodes, tets, deep)
+    both = dict.fromkeys(muscles, offset)
+    moved = muscle_field(head, muscles, nodes + np.array(offset), tets, deep, offsets=both)
+    assert fraction.max() == 1.0
+    np.testing.assert_allclose(moved[0], fraction, atol=1e-5)
+    held = fraction > 0.01
+    assert (np.abs((moved[1] * fibre)[held].sum(axis=1)) > 1.0 - 1e-6).all()
+    # In place, the offset takes muscle away from where it was.
+    there = muscle_field(head, muscles, nodes, tets, deep, offsets=both)[0]
+    assert np.abs(there - fraction).max() > 0.5
+    with pytest.raises(CaseInputError, match="muscle with an offset is 'masseter'"):
+        muscle_field(head, muscles, nodes, tets, deep, offsets={"masseter": offset})
+
+
+def test_a_layer_of_skin_has_the_volume_of_its_thickness():
+    """A block of 30 mm below a plane of skin: the layer is area times thickness, within 10 %."""
+    nodes, tets = meshes.box((6, 6, 6), (30.0, 30.0, 30.0), jitter=0.1, seed=1)
+    volumes = np.abs(np.linalg.det(nodes[tets[:, 1:]] - nodes[tets[:, :1]])) / 6.0
+    for thickness in (1.0, 1.5, 2.0, 5.0):
+        share = skin_share(nodes, tets, nodes[:, 2], thickness)
+        assert (share * volumes).sum() == pytest.approx(900.0 * thickness, rel=0.1)
+    assert not skin_share(nodes, tets, nodes[:, 2] + 20.0, 2.0).any()
 
 
 def test_points_are_carried_by_the_linear_field():

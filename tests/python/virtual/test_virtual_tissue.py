@@ -1,5 +1,7 @@
 """The true tissue of virtual patients against closed forms, the linear solver and differences."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,8 @@ from cmfsim.virtual.hyperelastic import (
     FAT,
     MUSCLE,
     HyperelasticTissue,
+    Moduli,
+    SkinLayer,
 )
 from cmfsim.virtual.operation import screw
 
@@ -42,6 +46,27 @@ def cube(cells: int = 3, jitter: float = 0.2):
 def on_border(nodes: np.ndarray) -> np.ndarray:
     """The nodes of the outside of the cube."""
     return np.flatnonzero(((nodes < 1e-9) | (nodes > 10.0 - 1e-9)).any(axis=1))
+
+
+def test_skin_replaces_fat_and_muscle_by_its_share():
+    """All skin has the constants of skin alone; a half has the mean, and no fibre is lost."""
+    fraction, fibre = np.array([0.0, 0.7, 0.7]), np.tile([0.0, 0.6, 0.8], (3, 1))
+    skin = Moduli(0.1, 0.1, 0.46)
+    share = np.array([1.0, 1.0, 0.5])
+    own = Moduli(0.02, 0.01, 0.4)
+    soft = replace(FAT, poisson=0.35)
+    found = HyperelasticTissue.mixed(
+        fraction, fibre, muscle=own, fat=soft, skin=SkinLayer(skin, share)
+    )
+    young, nu = 0.1, 0.46
+    mu, lambda_ = young / (2 * (1 + nu)), young * nu / ((1 + nu) * (1 - 2 * nu))
+    assert found.mu[:2] == pytest.approx(mu)
+    assert found.lambda_[:2] == pytest.approx(lambda_)
+    assert np.abs([found.alpha[:2], found.beta[:2]]).max() < 1e-12
+    below = 0.3 * soft.spencer() + 0.7 * own.spencer()
+    half = 0.5 * (below + skin.spencer())
+    constants = [found.lambda_, found.mu, found.alpha, found.difference, found.beta]
+    assert [c[2] for c in constants] == pytest.approx(half)
 
 
 def test_stress_is_the_derivative_of_energy():

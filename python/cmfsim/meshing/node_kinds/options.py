@@ -16,6 +16,7 @@ from cmfsim.values.checks import (
     as_rows,
     as_text,
     check_one_of,
+    nearest,
 )
 
 __all__ = ["BORDERS", "KindOptions", "SlidingBox", "SlidingSphere", "kind_options"]
@@ -199,7 +200,10 @@ def kind_options(table: Mapping[str, Any]) -> KindOptions:
     known = [field.name for field in fields(KindOptions)]
     for name in table:
         if name not in known:
-            raise CaseInputError(f"there is no option {name!r}; options are: {', '.join(known)}")
+            raise CaseInputError(
+                f"there is no option {name!r}{nearest(name, known)}; options are: "
+                f"{', '.join(known)}"
+            )
     values = dict(table)
     if not isinstance(values.get("sliding", True), bool):
         raise CaseInputError(f"sliding is {values['sliding']!r}: true or false is needed")

@@ -42,7 +42,7 @@ from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import Progress, no_progress
 
-__all__ = ["build_case", "build_model", "model_of"]
+__all__ = ["build_case", "build_model", "kind_options_of", "model_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -155,7 +155,7 @@ def build_model(
 
 def model_of(case: Case, options: BuildOptions) -> PatientModel:
     """The model of a case, as `build_model` makes it."""
-    kinds = _kind_options(case)
+    kinds = kind_options_of(case)
     stages = Stages(options)
     if options.check:
         stages.begin("checking the case")
@@ -313,9 +313,18 @@ def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:
     return placed
 
 
-def _kind_options(case: Case) -> KindOptions:
-    """The options of [node_kinds], or an error that names their line."""
-    try:
-        return kind_options(case.node_kinds)
-    except CaseInputError as error:
-        raise CaseInputError(f"{case.where('node_kinds')}: {error}") from error
+def kind_options_of(case: Case) -> KindOptions:
+    """The options of [node_kinds].
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) An unknown option, or a value of another kind or out of range, with
+        its line.
+    """
+    for key, value in case.node_kinds.items():
+        try:
+            kind_options({key: value})
+        except CaseInputError as error:
+            raise CaseInputError(f"{case.where(f'node_kinds.{key}')}: {error}") from error
+    return kind_options(case.node_kinds)

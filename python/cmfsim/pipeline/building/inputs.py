@@ -209,7 +209,7 @@ def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
         "case": {
             field.name: _plain(getattr(case, field.name), folder)
             for field in fields(case)
-            if field.name not in {"file", "output", "lines", "band"}
+            if field.name not in {"file", "output", "places", "band"}
         },
         "version": __version__,
     }
