@@ -20,6 +20,7 @@ from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import Scene
+from cmfsim.values.skin_motion import SkinEnd, skin_end
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TissueData
 
@@ -102,6 +103,18 @@ class PatientModel(Frozen):
         """The patient's skin as the mesh has it, outward."""
         nodes, triangles = used_nodes(self.skin_triangles)
         return SurfaceData(self.scene.nodes[nodes], triangles)
+
+    @cached_property
+    def skin_end(self) -> SkinEnd:
+        """The skin next to the planes on which the tissue ends, and what it is continued from."""
+        kinds = self.kinds
+        on_plane = kinds.nodes("fixed")
+        on_plane = on_plane[np.asarray(kinds.segment)[on_plane] < 0]
+        return skin_end(self.skin, np.isin(self.skin_nodes, on_plane))
+
+    def skin_field(self, values: Floats) -> Floats:
+        """What vertices of `skin` have of a field of all nodes, (n, …): `skin_end` is continued."""
+        return self.skin_end.continued(values[self.skin_nodes])
 
     def with_plan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> PatientModel:
         """The patient under another plan; segments that are not named stay.
