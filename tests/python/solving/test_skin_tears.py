@@ -62,7 +62,7 @@ def test_no_row_of_dents_where_the_tissue_ends(patient):
     What is farther from the planes keeps its solution to the bit.
     """
     back = cmfsim.rigid_motion(translation=(0.0, 5.0, 0.0))
-    jaw = {name: back for name in ("mandible_body", "ramus_left", "ramus_right")}
+    jaw = dict.fromkeys(("mandible_body", "ramus_left", "ramus_right"), back)
     found = cmfsim.predict_patient(patient.with_plan(jaw), "H")
     skin, end, moved = found.skin_before, found.patient.skin_end, found.skin_displacements
     solved = found.result.displacements[found.skin_nodes]

@@ -120,10 +120,10 @@ class KindOptions:
     teeth_distance : float, mm
         Largest distance from the teeth, if these are known separately from bone.
     lifted : float, mm
-        How far above the cut of a Le Fort I osteotomy tissue is lifted off the cranium, as the
+        How far above the cut of a Le Fort I osteotomy tissue is lifted off the skull, as the
         surgeon lifts the periosteum between the piriform aperture and the infraorbital foramen:
-        within this distance of the maxilla, nodes that a plan does not press against the bone are
-        free. 0: none.
+        within this distance of what was cut off, nodes that a plan does not press against the bone
+        are free. 0: none.
     contact_surface : str
         The surface on which nodes slide at the arches: "sheet", the labial and buccal face of gums
         and crowns, bridged between teeth and continued past their edges (`contact_sheet`), or

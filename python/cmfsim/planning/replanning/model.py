@@ -129,7 +129,8 @@ class PlanningModel:
         """
         patient = self.patient.with_plan(self.whole(plan))
         # What is lifted off the bone is as at the reference: the factorisation is of that.
-        scene = replace(patient.scene, fixed=self.patient.scene.fixed)
+        reference = self.patient.scene
+        scene = replace(patient.scene, fixed=reference.fixed, segments=reference.segments)
         patient = replace(patient, scene=scene)
         return predict_patient(patient, self.model, solver=self.solver)
 
