@@ -47,6 +47,17 @@ class LiftedTissue(Frozen):
     places: Floats
     normals: Floats
 
+    def without(self, others: Indices) -> LiftedTissue:
+        """The same without some nodes, (l,) uint32."""
+        kept = ~np.isin(self.nodes, others)
+        return replace(
+            self,
+            nodes=self.nodes[kept],
+            piece=self.piece[kept],
+            places=self.places[kept],
+            normals=self.normals[kept],
+        )
+
     def free(self, plan: Plan) -> Indices:
         """The nodes that the pieces' motions do not press against the skull, (l,) uint32.
 

@@ -12,7 +12,7 @@ from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["lifted_tissue"]
+__all__ = ["cut_off_skull", "lifted_tissue"]
 
 # Faces of a cut lie on each other: this close, mm, and facing each other with this cosine.
 CUT_GAP, CUT_FACING = 0.5, 0.9
@@ -29,9 +29,6 @@ def lifted_tissue(
     options: KindOptions | None = None,
 ) -> LiftedTissue | None:
     """The nodes on the skull from which tissue is lifted next to a Le Fort cut.
-
-    The skull is the segment that reaches highest, whatever its name. What was cut off it has a face
-    in common with it; jaws and teeth that touch it have not.
 
     Parameters
     ----------
@@ -62,12 +59,8 @@ def lifted_tissue(
     ... )  # doctest: +SKIP
     """
     reach = (options or KindOptions()).lifted
-    if reach == 0.0 or len(segments) < 2:
-        return None
-    skull = max(segments, key=lambda segment: float(segment.surface.vertices[:, 2].max()))
-    others = [s for s in segments if s is not skull and s.name in moved]
-    pieces = [s for s in others if _is_cut_off(s.surface, skull.surface)]
-    if not pieces:
+    skull, pieces = cut_off_skull(segments, moved)
+    if reach == 0.0 or not pieces:
         return None
     is_joined = skull.name in moved
     held = kinds.nodes("joined" if is_joined else "fixed")
@@ -89,6 +82,25 @@ def lifted_tissue(
         places[near],
         normals,
     )
+
+
+def cut_off_skull(
+    segments: Sequence[BoneSegment], moved: Collection[str]
+) -> tuple[BoneSegment, list[BoneSegment]]:
+    """The skull, and the segments that were cut off it, whatever their names.
+
+    The skull is the segment that reaches highest. What was cut off it has a face in common with it;
+    jaws and teeth that touch it have not.
+
+    Parameters
+    ----------
+    segments : sequence of BoneSegment
+    moved : collection of str
+        Names of the segments that are cut or moved.
+    """
+    skull = max(segments, key=lambda segment: float(segment.surface.vertices[:, 2].max()))
+    others = [s for s in segments if s is not skull and s.name in moved]
+    return skull, [s for s in others if _is_cut_off(s.surface, skull.surface)]
 
 
 def _is_cut_off(piece: SurfaceData, skull: SurfaceData) -> bool:
