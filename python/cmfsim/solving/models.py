@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Solution, StaticSolver, rigid_fit
 from cmfsim.errors import CaseInputError
 from cmfsim.solving.simulation import scene_solver, solved_scene, told
+from cmfsim.solving.skin_tears import tear_finding
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
@@ -137,7 +138,11 @@ def solved_patient(
     solver = solver or scene_solver(scene)
     result, solution = solved_scene(scene, solver)
     timings = {**patient.summary.get("timings", {}), "solving": time.perf_counter() - begun}
-    moved = np.linalg.norm(result.displacements[patient.skin_nodes], axis=1)
+    skin = patient.skin_field(result.displacements)
+    if (torn := tear_finding(patient.skin, skin)) is not None:
+        noticed = [*result.summary["findings"], told(torn)]
+        result = replace(result, summary={**result.summary, "findings": noticed})
+    moved = np.linalg.norm(skin, axis=1)
     summary = {
         **patient.summary,
         "model": model,

@@ -102,8 +102,7 @@ def skin_rates(
             changes[name], sources[name] = {segment: rate}, source
     listed: Sequence[ArrayLike | Mapping[str, ArrayLike]] = list(changes.values())
     found = solver.responses(solution, scene_plan(scene), listed, accuracy=ACCURACY)
-    nodes = patient.skin_nodes
-    rates_found = {name: u[nodes] for name, u in zip(changes, found, strict=True)}
+    rates_found = {name: patient.skin_field(u) for name, u in zip(changes, found, strict=True)}
     return SkinRates(rates_found, sources, tuple(left_out), time.perf_counter() - begun)
 
 

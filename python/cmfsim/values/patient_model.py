@@ -20,6 +20,7 @@ from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import Scene
+from cmfsim.values.skin_motion import SkinEnd, skin_end
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TissueData
 
@@ -57,8 +58,8 @@ class PatientModel(Frozen):
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull" and "skin", where given or found (`landmarks_are_found`).
     lifted : LiftedTissue or None
-        Nodes lifted off the cranium above a Le Fort I cut; `scene.fixed` includes those that the
-        plan presses against the bone.
+        Nodes lifted off the skull next to a Le Fort cut; `scene` holds those on the bone that the
+        plan presses against it.
     lips : mapping of str to LipRegion
         "upper" and "lower", where the mesh was separated between them.
     findings : tuple of Finding
@@ -103,11 +104,23 @@ class PatientModel(Frozen):
         nodes, triangles = used_nodes(self.skin_triangles)
         return SurfaceData(self.scene.nodes[nodes], triangles)
 
+    @cached_property
+    def skin_end(self) -> SkinEnd:
+        """The skin next to the planes on which the tissue ends, and what it is continued from."""
+        kinds = self.kinds
+        on_plane = kinds.nodes("fixed")
+        on_plane = on_plane[np.asarray(kinds.segment)[on_plane] < 0]
+        return skin_end(self.skin, np.isin(self.skin_nodes, on_plane))
+
+    def skin_field(self, values: Floats) -> Floats:
+        """What vertices of `skin` have of a field of all nodes, (n, …): `skin_end` is continued."""
+        return self.skin_end.continued(values[self.skin_nodes])
+
     def with_plan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> PatientModel:
         """The patient under another plan; segments that are not named stay.
 
         Neither mesh nor node kinds depend on how far segments move, so nothing is built again. What
-        is lifted off the bone above a Le Fort I cut follows the plan.
+        is lifted off the bone next to a Le Fort cut follows the plan.
 
         Parameters
         ----------
@@ -132,12 +145,12 @@ class PatientModel(Frozen):
             for entry in summary.get("findings", ())
             if not str(entry.get("code", "")).startswith("plan-")
         ]
-        fixed = self.scene.fixed
+        fixed, segments = self.scene.fixed, dict(self.scene.segments)
         if self.lifted is not None:
-            fixed = self.lifted.fixed(fixed, motions[self.lifted.segment])
+            fixed, segments = self.lifted.held(fixed, segments, motions)
         # `replace` is typed by the fields; the scene converts what it is given.
         plan_given = cast("Mapping[str, Floats | MovedSurface]", motions)
-        scene = replace(self.scene, plan=plan_given, fixed=fixed)
+        scene = replace(self.scene, plan=plan_given, fixed=fixed, segments=segments)
         return replace(self, scene=scene, findings=findings, summary=summary)
 
     @cached_property

@@ -11,62 +11,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, as_rows, check_one_of
+from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.model_names import MODELS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene, SceneResult
+from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.values.musculature import Musculature
     from cmfsim.values.skin_band import SkinBand
 
-__all__ = ["MODELS", "Prediction", "carried_points", "carried_share"]
-
-# Up to so many edges off the mesh's skin a point follows it whole, and from so many on not at all.
-FOLLOWS, FADED = 2.0, 4.0
-
-
-def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike) -> Floats:
-    """How points on or near a mesh's skin move, (k, 3) mm: as its closest point.
-
-    What lies away from the tissue that was simulated, as the back of the head, stays: from two
-    edges off its movement fades, to nothing at four.
-
-    Parameters
-    ----------
-    before : SurfaceData
-        The mesh's skin.
-    displacements : (v, 3) float64, mm
-        Of its vertices.
-    points : (k, 3) float64, mm
-    """
-    moved = before.vertices + displacements
-    skin = Surface(before.vertices, before.triangles)
-    places = as_rows("points", points, 3)
-    closest, _, _ = skin.closest(places)
-    share = carried_share(skin, np.linalg.norm(closest - places, axis=1))
-    carried: Floats = share[:, None] * SurfaceMotion(skin, moved).displacement(places)
-    return carried
-
-
-def carried_share(skin: Surface, away: Floats) -> Floats:
-    """The share of the skin's movement that points follow at a distance from it, (k,).
-
-    Parameters
-    ----------
-    skin : Surface
-        The mesh's skin.
-    away : (k,) float64, mm
-        Distances of the points from it.
-    """
-    ends = skin.vertices[skin.triangles]
-    edge = float(np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).mean())
-    return np.clip((FADED - away / edge) / (FADED - FOLLOWS), 0.0, 1.0)
+__all__ = ["MODELS", "Prediction"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +84,12 @@ class Prediction(Frozen):
 
     @property
     def skin_displacements(self) -> Floats:
-        """How each vertex of the skin moves, (k, 3) mm."""
-        return self.result.displacements[self.skin_nodes]
+        """How each vertex of the skin moves, (k, 3) mm: as its node, except where the tissue ends.
+
+        Next to the planes on which the tissue ends, and is fixed, it moves as the skin before them
+        (`SkinEnd`).
+        """
+        return self.patient.skin_field(self.result.displacements)
 
     def carried(self, points: ArrayLike) -> Floats:
         """How points on or near the skin move, (k, 3) mm: as `carried_points` has it.

@@ -274,7 +274,7 @@ def _true_case(
         region=replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION),
         mesh=replace(case.mesh, edge_length=edge_length, refine=refine),
         # The operation itself strips tissue off the bone, by how far the sides of a cut move apart.
-        node_kinds=dict(kinds, lifted=0.0),
+        node_kinds=dict(kinds, lifted=0.0, septum=False),
         muscles=None,
         postoperative=None,
     )

@@ -121,10 +121,13 @@ class KindOptions:
     teeth_distance : float, mm
         Largest distance from the teeth, if these are known separately from bone.
     lifted : float, mm
-        How far above the cut of a Le Fort I osteotomy tissue is lifted off the cranium, as the
+        How far above the cut of a Le Fort I osteotomy tissue is lifted off the skull, as the
         surgeon lifts the periosteum between the piriform aperture and the infraorbital foramen:
-        within this distance of the maxilla, nodes that a plan does not press against the bone are
-        free. 0: none.
+        within this distance of what was cut off, nodes that a plan does not press against the bone
+        are free. 0: none.
+    septum : bool
+        Whether the nasal septum stays with the skull if the floor of the nose is cut off it, as by
+        a Le Fort I osteotomy: it holds the tip of the nose.
     contact_surface : str
         The surface on which nodes slide at the arches: "sheet", the labial and buccal face of gums
         and crowns, bridged between teeth and continued past their edges (`contact_sheet`), or
@@ -148,6 +151,7 @@ class KindOptions:
     beside: float = 8.0
     teeth_distance: float = 15.0
     lifted: float = 10.0
+    septum: bool = True
     contact_surface: str = "sheet"
     regions: tuple[SlidingBox | SlidingSphere, ...] = ()
 
@@ -205,8 +209,9 @@ def kind_options(table: Mapping[str, Any]) -> KindOptions:
                 f"{', '.join(known)}"
             )
     values = dict(table)
-    if not isinstance(values.get("sliding", True), bool):
-        raise CaseInputError(f"sliding is {values['sliding']!r}: true or false is needed")
+    for name in ("sliding", "septum"):
+        if not isinstance(values.get(name, True), bool):
+            raise CaseInputError(f"{name} is {values[name]!r}: true or false is needed")
     for name, of in (("fixed_borders", "borders"), ("regions", "tables")):
         if name in values:
             if not isinstance(values[name], list | tuple):

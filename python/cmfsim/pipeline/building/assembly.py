@@ -92,7 +92,7 @@ def _scene(
     plan = {name: bones.motions.get(name, np.eye(4)) for name in data}
     fixed = kinds.nodes("fixed")
     if lifted is not None:
-        fixed = lifted.fixed(fixed, plan[lifted.segment])
+        fixed, data = lifted.held(fixed, data, plan)
     return Scene(
         nodes=mesh.nodes,
         tets=mesh.tets,

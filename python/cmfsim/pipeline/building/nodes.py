@@ -5,7 +5,13 @@ from concurrent.futures import ThreadPoolExecutor
 from cmfsim._core import TetMesh
 from cmfsim.io import Case
 from cmfsim.meshing import report_of_part
-from cmfsim.meshing.node_kinds import DentalArches, KindOptions, classify_nodes, lifted_tissue
+from cmfsim.meshing.node_kinds import (
+    DentalArches,
+    KindOptions,
+    classify_nodes,
+    lifted_tissue,
+    septum,
+)
 from cmfsim.pipeline.building.attached_bodies import held_part
 from cmfsim.pipeline.building.case_checks import cut_segments, untouched
 from cmfsim.pipeline.building.clefts import without_clefts
@@ -72,6 +78,11 @@ def nodes_of(
         stages.add(_noticed(head, bones, tissue, mesh, kinds))
         stages.drop_repeated()
         lifted = lifted_tissue(mesh.nodes, kinds, bones.segments, moved, options)
+        if options.septum:
+            held = septum(mesh.nodes, kinds, bones.segments, moved, head.landmarks)
+            stages.add(held.findings)
+            kinds = held.kinds
+            lifted = None if lifted is None else lifted.without(held.nodes)
         report = report if counted is None else counted.result()
     return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
 

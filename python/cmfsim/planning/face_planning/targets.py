@@ -12,8 +12,8 @@ from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
 from cmfsim.planning.replanning import Motions, PlanningModel
 from cmfsim.values.checks import Floats, as_positive, as_rows
-from cmfsim.values.prediction import carried_share
 from cmfsim.values.renumbering import used_nodes
+from cmfsim.values.skin_motion import attachment
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
@@ -207,11 +207,10 @@ class CarriedPoints:
 
     def __init__(self, planning: PlanningModel, points: Floats) -> None:
         before = planning.skin_before
-        skin = Surface(before.vertices, before.triangles)
-        closest, _, triangles = skin.closest(points)
-        self.share = carried_share(skin, np.linalg.norm(closest - points, axis=1))
-        nodes, corners = used_nodes(before.triangles[np.unique(triangles)])
-        self.points = points
+        found = attachment(before.searched, points)
+        self.share = found.share
+        nodes, corners = used_nodes(before.triangles[np.unique(found.triangles)])
+        self._points = found.places
         self._places = before.vertices[nodes]
         self._surface = Surface(self._places, corners)
         columns = planning.columns
@@ -226,7 +225,7 @@ class CarriedPoints:
         if self._correction is not None:
             moved = moved + self._correction.displacements(plan).ravel()
         motion = SurfaceMotion(self._surface, self._places + moved.reshape(-1, 3))
-        return self.share[:, None] * motion.displacement(self.points)
+        return self.share[:, None] * motion.displacement(self._points)
 
 
 def _points_wish(planning: PlanningModel, target: PointTarget) -> Wish:

@@ -25,7 +25,8 @@ from cmfsim.surfaces.barycentric import barycentric
 from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
-from cmfsim.values.prediction import Prediction, carried_share
+from cmfsim.values.prediction import Prediction
+from cmfsim.values.skin_motion import attachment
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["PageContent", "page_content"]
@@ -243,16 +244,13 @@ def _correction(planning: PlanningModel) -> dict[str, Any] | None:
 
 def _carried(part: str, skin: SurfaceData, points: Floats) -> dict[str, NDArray[Any]]:
     """How points are attached to the skin, as in `carried_points` of a prediction."""
-    there = Surface(skin.vertices, skin.triangles)
-    closest, _, triangles = there.closest(points)
-    corners = skin.vertices[skin.triangles[triangles]]
-    offset = points - closest
-    share = carried_share(there, np.linalg.norm(offset, axis=1))
+    found = attachment(skin.searched, points)
+    corners = skin.vertices[skin.triangles[found.triangles]]
     return {
-        f"{part}_triangle": _indices(triangles),
-        f"{part}_barycentric": _singles(barycentric(corners, closest)),
-        f"{part}_offset": _singles(offset),
-        f"{part}_share": _singles(share),
+        f"{part}_triangle": _indices(found.triangles),
+        f"{part}_barycentric": _singles(barycentric(corners, found.closest)),
+        f"{part}_offset": _singles(found.places - found.closest),
+        f"{part}_share": _singles(found.share),
     }
 
 

@@ -16,8 +16,9 @@ from cmfsim.solving.simulation import scene_plan, scene_solver
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.prediction import Prediction, carried_points
+from cmfsim.values.prediction import Prediction
 from cmfsim.values.scene import Scene
+from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = ["Motions", "PlanningModel", "planning_model"]
@@ -128,7 +129,8 @@ class PlanningModel:
         """
         patient = self.patient.with_plan(self.whole(plan))
         # What is lifted off the bone is as at the reference: the factorisation is of that.
-        scene = replace(patient.scene, fixed=self.patient.scene.fixed)
+        reference = self.patient.scene
+        scene = replace(patient.scene, fixed=reference.fixed, segments=reference.segments)
         patient = replace(patient, scene=scene)
         return predict_patient(patient, self.model, solver=self.solver)
 
@@ -192,7 +194,12 @@ def planning_model(
     motions: dict[str, NDArray[np.float64]] = {
         name: np.asarray(scene.plan[name], dtype=np.float64) for name in scene.segments
     }
-    return PlanningModel(patient, model, solver, plan_columns(operator), motions)
+    columns = plan_columns(operator)
+    end = patient.skin_end
+    columns = replace(
+        columns, matrix=end.continued(columns.matrix), offset=end.continued(columns.offset)
+    )
+    return PlanningModel(patient, model, solver, columns, motions)
 
 
 def _check_scene(scene: Scene) -> None:

@@ -169,9 +169,9 @@ def _rates(
     """The change of each modulus's part with each number of a plan, along the normals."""
     solver = planning.solver
     scene = model_scene(planning.patient, planning.model)
-    plan, nodes = scene_plan(scene), planning.patient.skin_nodes
+    plan, patient = scene_plan(scene), planning.patient
     moves = solver.responses(solution, plan, _unit_rates(planning), accuracy=ACCURACY)
-    parts = scene_parts(planning.patient, scene)
+    parts = scene_parts(patient, scene)
     assert parts is not None  # noqa: S101 (the band of the reference has the moduli's parts)
     sources: Mapping[str, Source] = {source.name: source for source in TISSUE}
     # A common factor on all moduli moves nothing, so that the last follows from the others.
@@ -182,7 +182,7 @@ def _rates(
         for move in moves
     ]
     found = solver.responses(solution, plan, loads, accuracy=ACCURACY)
-    along = np.array([np.einsum("ka,ka->k", normals, u[nodes]) for u in found])
+    along = np.array([np.einsum("ka,ka->k", normals, patient.skin_field(u)) for u in found])
     rates: NDArray[np.float64] = along.reshape(len(solved), len(moves), -1).transpose(0, 2, 1)
     by_sd = np.array([sources[name].sd for name in solved])
     last = -sources[moduli[-1]].sd * np.einsum("pkq,p->kq", rates, 1.0 / by_sd)

@@ -21,7 +21,7 @@ from cmfsim.solving.simulation import solve_scene
 from cmfsim.study.frontier.choice import Choice
 from cmfsim.study.frontier.memory import peak_memory
 from cmfsim.study.frontier.skin_points import read_points, skin_points, write_points
-from cmfsim.values.prediction import carried_points
+from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MOVED_FORMAT", "main"]

@@ -29,7 +29,7 @@ from cmfsim.study.frontier import frontier_run as bench
 from cmfsim.study.frontier.measure import run_job
 from cmfsim.study.frontier.rows import FrontierRow, with_front
 from cmfsim.study.frontier.sweep import EARLY
-from cmfsim.values.prediction import carried_points
+from cmfsim.values.skin_motion import carried_points
 from head_case import HeadCase
 
 EDGES, KINEMATICS = [40.0, 30.0], ["linear", "corotational"]

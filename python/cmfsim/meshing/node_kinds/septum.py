@@ -1,0 +1,175 @@
+"""The nasal septum, which a Le Fort I osteotomy leaves on the skull: nodes that stay with it."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmfsim.meshing.node_kinds.lifted import cut_off_skull
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats, as_rows
+from cmfsim.values.finding import Finding
+from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+
+__all__ = ["Septum", "septum"]
+
+SKULL_LANDMARKS = ("nasion", "rhinion", "mid_philtrum", "supradentale")
+SKIN_LANDMARKS = ("pronasale", "subnasale")
+# Half the thickness of the septum with its mucosa, mm: cartilage of 1.75 mm (mean of 40 cadavers)
+# between two layers of about 0.7 mm. Tets cannot be cut there: in edges of the mesh at least, so
+# that there is one layer of nodes.
+HALF_THICKNESS, HALF_EDGES = 1.6, 0.32
+# From the skin to the septum at the tip, which the alar cartilages form, and at the columella, mm.
+BEHIND_TIP, BEHIND_COLUMELLA = 8.0, 5.0
+# How far above the height of subnasale the septum ends, mm.
+ABOVE_SUBNASALE = 3.0
+# The septum was separated from what was cut off: so far from it no node is held, mm: as
+# much as an impaction moves it up.
+CLEARANCE = 6.0
+# Perpendicular plate and vomer carry it up to this distance behind the nasal bones, mm.
+DEPTH = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Septum:
+    """The nodes of the septum.
+
+    Attributes
+    ----------
+    kinds : NodeKinds
+        Of all nodes; those of the septum that were free stay with the skull.
+    nodes : (k,) uint32
+        Nodes of the septum, including those that lie on the skull.
+    findings : tuple of Finding
+    """
+
+    kinds: NodeKinds
+    nodes: NDArray[np.uint32]
+    findings: tuple[Finding, ...] = ()
+
+
+def septum(
+    nodes: ArrayLike,
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    moved: Collection[str],
+    landmarks: Mapping[str, Mapping[str, ArrayLike]],
+) -> Septum:
+    """The septum of a nose whose floor was cut off the skull; empty if nothing was.
+
+    Parameters
+    ----------
+    nodes : (n, 3) float64, mm
+    kinds : NodeKinds
+    segments : sequence of BoneSegment
+    moved : collection of str
+        Names of the segments that are cut or moved.
+    landmarks : mapping of str to mapping of str to (3,) float64, mm
+        "skull": nasion, rhinion, mid_philtrum, supradentale; "skin": pronasale, subnasale.
+
+    Returns
+    -------
+    Septum
+
+    Notes
+    -----
+    Cartilage (2.7 MPa; Griffin et al. 2016) is a thousand times as stiff as fat, so the septum
+    moves as a rigid body. In a Le Fort I osteotomy it is separated from the maxilla and stays with
+    nasal bones, perpendicular plate and vomer.
+    """
+    none = np.zeros(0, dtype=np.uint32)
+    skull, pieces = cut_off_skull(segments, moved)
+    if not pieces:
+        return Septum(kinds, none)
+    marks: dict[str, Floats] = {}
+    for kind_of, names in (("skull", SKULL_LANDMARKS), ("skin", SKIN_LANDMARKS)):
+        given = landmarks.get(kind_of, {})
+        marks |= {name: np.asarray(given[name], dtype=float) for name in names if name in given}
+    missing = [n for n in (*SKULL_LANDMARKS, *SKIN_LANDMARKS) if n not in marks]
+    if missing:
+        return Septum(kinds, none, (_left_out(missing),))
+    # What was cut off must be the floor of the nose, and not its bridge.
+    if _nearest(marks["mid_philtrum"], segments) not in pieces:
+        return Septum(kinds, none)
+    if _nearest(marks["rhinion"], segments) is not skull:
+        return Septum(kinds, none)
+    places = as_rows("nodes", nodes, 3)
+    inside = np.flatnonzero(_inside(places, marks))
+    for piece in pieces:
+        closest, _, _ = piece.surface.searched.closest(places[inside])
+        away = np.linalg.norm(closest - places[inside], axis=1)
+        inside = inside[away > CLEARANCE]
+    number = kinds.segments.index(skull.name)
+    kind, owner = np.array(kinds.kind), np.array(kinds.segment)
+    free = inside[kind[inside] == NODE_KINDS.index("free")]
+    on_skull = inside[owner[inside] == number]
+    kind[free] = NODE_KINDS.index("joined" if skull.name in moved else "fixed")
+    owner[free] = number
+    found = np.union1d(free, on_skull).astype(np.uint32)
+    return Septum(replace(kinds, kind=kind, segment=owner), found)
+
+
+def _inside(places: Floats, marks: Mapping[str, Floats]) -> NDArray[np.bool_]:
+    """Which places lie in the septum: near the midline's plane, and in its outline there."""
+    midline = np.array(list(marks.values()))
+    middle = midline.mean(axis=0)
+    across = np.linalg.svd(midline - middle)[2][-1]
+    across *= np.sign(across[0])
+    back = np.array([0.0, 1.0, 0.0]) - across[1] * across
+    back /= np.linalg.norm(back)
+    up = np.cross(across, back)
+
+    def flat(points: Floats) -> Floats:
+        found: Floats = (points - middle) @ np.array([back, up]).T
+        return found
+
+    rhinion, tip, columella = (flat(marks[n]) for n in ("rhinion", "pronasale", "subnasale"))
+    behind = max(rhinion[0], flat(marks["mid_philtrum"])[0]) + DEPTH
+    lowest = columella[1] + ABOVE_SUBNASALE
+    outline = np.array(
+        [
+            rhinion,
+            tip + [BEHIND_TIP, 0.0],
+            [columella[0] + BEHIND_COLUMELLA, lowest],
+            [behind, lowest],
+            [behind, rhinion[1]],
+        ]
+    )
+    offset = np.abs((places - middle) @ across)
+    around = (np.abs(flat(places) - outline.mean(axis=0)) < DEPTH).all(axis=1) & (offset < DEPTH)
+    half = max(HALF_THICKNESS, HALF_EDGES * _spacing(places[around]))
+    inside: NDArray[np.bool_] = offset < half
+    ends = np.roll(outline, -1, axis=0)
+    for start, side in zip(outline, ends - outline, strict=True):
+        way = flat(places) - start
+        inside &= side[0] * way[:, 1] - side[1] * way[:, 0] >= 0.0
+    return inside
+
+
+def _spacing(places: Floats) -> float:
+    """The edge of a cube of which each place has one, in the box round them, mm."""
+    if len(places) < 2:
+        return 0.0
+    return float((np.prod(np.ptp(places, axis=0)) / len(places)) ** (1.0 / 3.0))
+
+
+def _nearest(place: Floats, segments: Sequence[BoneSegment]) -> BoneSegment:
+    """The segment that a landmark lies on."""
+
+    def distance(segment: BoneSegment) -> float:
+        closest, _, _ = segment.surface.searched.closest(place[np.newaxis])
+        return float(np.linalg.norm(closest[0] - place))
+
+    return min(segments, key=distance)
+
+
+def _left_out(missing: Sequence[str]) -> Finding:
+    return Finding.note(
+        "septum-left-out",
+        f"the nasal septum is not modelled: {', '.join(missing)} "
+        f"{'is' if len(missing) == 1 else 'are'} not among the landmarks",
+        where="[landmarks]",
+        why="without its support, the tip of the nose follows the maxilla too far, mostly upwards",
+        fix="add these landmarks, or set septum = false in [node_kinds]",
+    )
