@@ -294,16 +294,18 @@ def _plain(table: Table) -> dict[str, Any]:
     return {key: table.plain(key) for key in table}
 
 
-def tissue_of(table: Table) -> TissueData:
-    """Fat of the paper's Table 1 unless the case says otherwise."""
+def tissue_of(table: Table) -> TissueData | None:
+    """The fat that the table states; None if it states none."""
     table.only("preset", "young", "poisson")
     young = table.number("young", "MPa", above=0.0, high=1e5)
     poisson = table.number("poisson", above=-1.0, high=0.4999)
-    if young is None and poisson is None:
-        with table.at("preset"):
-            return TissueData("preset", preset=table.text("preset", "kim2010"), fraction=0.0)
     if "preset" in table:
-        table.fail("preset", "is given together with young or poisson: give one or the other")
+        if young is not None or poisson is not None:
+            table.fail("preset", "is given together with young or poisson: give one or the other")
+        with table.at("preset"):
+            return TissueData("preset", preset=table.text("preset"), fraction=0.0)
+    if young is None and poisson is None:
+        return None
     if young is None or poisson is None:
         table.fail(None, "needs both young (MPa) and poisson, or neither")
     return TissueData("isotropic", young=young, poisson=poisson)
