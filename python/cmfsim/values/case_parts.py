@@ -339,6 +339,9 @@ class CaseMuscles:
         Of muscles, instead of the preset's; those of fat come from the case.
     fit : bool
         Whether muscles are moved out of bone, air and skin once landmarks have placed them.
+    blur : float, mm
+        Standard deviation of the blur of the shares of muscle, in which they fade into fat; 0 takes
+        them as sampled, so that the tissue changes from tet to tet.
 
     Examples
     --------
@@ -355,6 +358,7 @@ class CaseMuscles:
     seed: int = 0
     moduli: TissueModuli = field(default_factory=TissueModuli)
     fit: bool = False
+    blur: float = 4.0
 
 
 @dataclass(frozen=True)
