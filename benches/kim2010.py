@@ -1,8 +1,10 @@
 """The study of Kim et al. (2010) on virtual patients: kim2010.py FOLDER [--markdown PAGE].
 
 FOLDER gets the virtual patients P1 to P4 (`cmfsim virtual-patients FOLDER`; existing ones are kept)
-and their study (`cmfsim study FOLDER`). The landmarks of P1 are then placed again three times, as
-in the paper's section 3.3. With a page, the tables and figures of the docs are written as well.
+and their study (`cmfsim study FOLDER/paper.toml`), with the constants and the muscles of the paper:
+Table 1, placed by landmarks alone, with shares as sampled. The landmarks of P1 are then placed
+again three times, as in section 3.3. With a page, the tables and figures of the docs are written as
+well.
 """
 
 import argparse
@@ -16,14 +18,32 @@ from marked import publish
 
 NAME = "benches/kim2010.py"
 TRIALS = 3
+# What a virtual patient's case states of its muscles, and what it states with those of the paper.
+DEFAULT_MUSCLES = "\n[muscles]\n"
+PAPER_MUSCLES = '\n[muscles]\npreset = "kim2010"\nfit = false\nblur = 0\n'
+CASE_FILE, PAPER_FILE = "case.toml", "paper.toml"
 # Pixels of a page's column.
 WIDTH = 1000
+
+
+def paper_cohort(folder: Path) -> Path:
+    """A cohort of the patients of a folder with the paper's muscles: files next to their own."""
+    for case in sorted(folder.glob(f"*/{CASE_FILE}")):
+        text = case.read_text(encoding="utf-8")
+        if text.count(DEFAULT_MUSCLES) != 1:
+            raise SystemExit(f"{case}: needs one empty [muscles], as virtual-patients writes it")
+        paper = text.replace(DEFAULT_MUSCLES, PAPER_MUSCLES)
+        case.with_name(PAPER_FILE).write_text(paper, encoding="utf-8")
+    cohort = (folder / "cohort.toml").read_text(encoding="utf-8")
+    made = folder / PAPER_FILE
+    made.write_text(cohort.replace(CASE_FILE, PAPER_FILE), encoding="utf-8")
+    return made
 
 
 def studied(folder: Path) -> cmfsim.StudyReport:
     """The study of the four virtual patients in a folder, and its files."""
     cmfsim.virtual_patients(folder, progress=lambda stage: print(stage, flush=True))
-    report = cmfsim.run_study(cmfsim.Cohort.load(folder), workers=1)
+    report = cmfsim.run_study(cmfsim.Cohort.load(paper_cohort(folder)), workers=1)
     cmfsim.write_study_report(report)
     for outcome in report.failed:
         raise SystemExit(f"{outcome.name} failed: {outcome.error}")
@@ -97,7 +117,7 @@ def main() -> None:
     # The page has its own title, and its sections are a level below.
     table = text.split("\n", 2)[2].strip().replace("\n## ", "\n### ")
     machine = f"{platform.machine()}, {os.cpu_count()} cores, cmfsim {cmfsim.__version__}."
-    blocks = [table, shares(cmfsim.study_table(report)), trials(options.folder / "P1/case.toml")]
+    blocks = [table, shares(cmfsim.study_table(report)), trials(options.folder / "P1" / PAPER_FILE)]
     publish(options.markdown, NAME, "\n\n".join([*blocks, machine]))
     if options.markdown is not None:
         write_figures(report.cohort.output, options.markdown.parent)

@@ -52,7 +52,7 @@ mod _core {
         module.add("ELEMENTS", ("p1", "anp", "p2"))?;
         let kinematics: Vec<&str> = Kinematics::all().map(Kinematics::name).collect();
         module.add("KINEMATICS", PyTuple::new(module.py(), kinematics)?)?;
-        module.add("PRESETS", ("kim2010", "kim2010-swapped"))?;
+        module.add("PRESETS", ("passive", "kim2010", "kim2010-swapped"))?;
         module.add("LAWS", ("spencer", "picinbono"))?;
         module.add("MOST_BOXES", mtm_core::MOST_BOXES)
     }

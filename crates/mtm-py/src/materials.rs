@@ -140,9 +140,10 @@ impl PyTissue {
     ///
     /// Parameters
     /// ----------
-    /// name : {"kim2010", "kim2010-swapped"}
-    ///     Table 1 of Kim et al. (2010) as printed (muscle 0.79 MPa across, 0.5 along, nu 0.43; fat
-    ///     0.003 MPa, nu 0.46), or with the muscle's moduli exchanged.
+    /// name : {"passive", "kim2010", "kim2010-swapped"}
+    ///     Muscle at rest (0.03 MPa across, 0.06 along, nu 0.43) in fat that can lose volume (0.003
+    ///     MPa, nu 0.40); Table 1 of Kim et al. (2010) as printed (muscle 0.79 MPa across, 0.5 along,
+    ///     nu 0.43; fat 0.003 MPa, nu 0.46), or with its muscle's moduli exchanged.
     /// fraction : float or (m,) array_like
     ///     Muscle volume fraction, 0 to 1.
     /// fibre : (3,) or (m, 3) array_like, optional

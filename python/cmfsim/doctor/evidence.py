@@ -237,11 +237,11 @@ def _check_region(case: Case, skull: Mapping[str, Floats], findings: list[Findin
 
 def _check_preset(case: Case, findings: list[Finding]) -> None:
     """Whether the constants of the tissue are known."""
-    if case.tissue.kind == "preset" and case.tissue.preset not in PRESETS:
+    if case.fat.kind == "preset" and case.fat.preset not in PRESETS:
         findings.append(
             Finding.error(
                 "tissue-preset",
-                f"preset is {case.tissue.preset!r}",
+                f"preset is {case.fat.preset!r}",
                 where=case.where("tissue.preset"),
                 why="no tissue can be built from this preset",
                 fix=f"use one of: {', '.join(PRESETS)}",

@@ -80,7 +80,7 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
                 why="they would have no effect",
                 fix=f"use one of: {', '.join(close or names)}",
             )
-    tissue = case.tissue
+    tissue = case.fat
     if tissue.kind == "preset" and tissue.preset not in PRESETS:
         return  # `gather` reports it
     stated = (k for k in case.places if k in MUSCLE_KEYS or k.startswith("muscles.moduli."))

@@ -101,8 +101,9 @@ class Case:
         The plan is measured on the post-operative bones; `plan` is empty.
     node_kinds : mapping of str to plain values
         Options of the stage that classifies nodes.
-    tissue : TissueData
-        Fat: everywhere in a homogeneous model, between the muscles in the others.
+    tissue : TissueData or None
+        Fat: everywhere in a homogeneous model, between the muscles in the others. None: that of the
+        muscles' preset, or of the default preset without muscles.
     muscles : CaseMuscles or None
         None: `cmfsim build` makes a model without muscles.
     solver : SolverOptions
@@ -132,7 +133,7 @@ class Case:
     plan: Mapping[str, CaseMotion] = field(default_factory=dict)
     achieved: bool = False
     node_kinds: Mapping[str, Any] = field(default_factory=dict)
-    tissue: TissueData = field(default_factory=lambda: TissueData("preset", fraction=0.0))
+    tissue: TissueData | None = None
     muscles: CaseMuscles | None = None
     solver: SolverOptions = field(default_factory=SolverOptions)
     band: CaseBand = field(default_factory=CaseBand)
@@ -148,6 +149,14 @@ class Case:
             raise CaseInputError("a plan is either given or achieved, not both")
         for name in ("plan", "node_kinds", "places"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    @property
+    def fat(self) -> TissueData:
+        """The fat of the case: `tissue`, or that of the preset of its muscles."""
+        if self.tissue is not None:
+            return self.tissue
+        muscles = CaseMuscles() if self.muscles is None else self.muscles
+        return TissueData("preset", preset=muscles.preset, fraction=0.0)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, changes: CaseChanges | None = None) -> "Case":

@@ -48,6 +48,8 @@ __all__ = [
 
 # What [muscles] and each table below [muscles.moduli] may set, as `MuscleModuli` has it.
 MODULI = ("young_along", "young_across", "poisson")
+# Wider, mm, than any muscle of the face is thick.
+MOST_BLUR = 30.0
 # Points in a tet that a muscle's surface crosses.
 SAMPLES = (1, 100_000)
 # Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
@@ -294,16 +296,18 @@ def _plain(table: Table) -> dict[str, Any]:
     return {key: table.plain(key) for key in table}
 
 
-def tissue_of(table: Table) -> TissueData:
-    """Fat of the paper's Table 1 unless the case says otherwise."""
+def tissue_of(table: Table) -> TissueData | None:
+    """The fat that the table states; None if it states none."""
     table.only("preset", "young", "poisson")
     young = table.number("young", "MPa", above=0.0, high=1e5)
     poisson = table.number("poisson", above=-1.0, high=0.4999)
-    if young is None and poisson is None:
-        with table.at("preset"):
-            return TissueData("preset", preset=table.text("preset", "kim2010"), fraction=0.0)
     if "preset" in table:
-        table.fail("preset", "is given together with young or poisson: give one or the other")
+        if young is not None or poisson is not None:
+            table.fail("preset", "is given together with young or poisson: give one or the other")
+        with table.at("preset"):
+            return TissueData("preset", preset=table.text("preset"), fraction=0.0)
+    if young is None and poisson is None:
+        return None
     if young is None or poisson is None:
         table.fail(None, "needs both young (MPa) and poisson, or neither")
     return TissueData("isotropic", young=young, poisson=poisson)
@@ -311,13 +315,14 @@ def tissue_of(table: Table) -> TissueData:
 
 def muscles_of(table: Table, folder: Path) -> CaseMuscles:
     """A template's name is that of one in the package; a path leads to a folder."""
-    settings = ("template", "smoothing", "fit", "preset", "mixing", "samples", "seed")
+    settings = ("template", "smoothing", "fit", "blur", "preset", "mixing", "samples", "seed")
     table.only(*settings, *MODULI, "moduli")
     default = CaseMuscles()
     template: Path | str = table.text("template", str(default.template))
     if template != default.template:
         template = file_of(table, "template", folder)
     smoothing = table.number("smoothing", low=0.0, high=1e6)
+    blur = table.number("blur", "mm", low=0.0, high=MOST_BLUR)
     return CaseMuscles(
         template,
         default.smoothing if smoothing is None else smoothing,
@@ -327,6 +332,7 @@ def muscles_of(table: Table, folder: Path) -> CaseMuscles:
         table.whole("seed", default.seed, 0, 2**63 - 1),
         _muscle_moduli(table),
         table.flag("fit", default=default.fit),
+        default.blur if blur is None else blur,
     )
 
 

@@ -23,7 +23,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.moduli import TissueModuli
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.surface_data import SurfaceData
-from cmfsim.values.tissue_data import MIXINGS, TissueData
+from cmfsim.values.tissue_data import DEFAULT_PRESET, MIXINGS, TissueData
 
 __all__ = [
     "INSIDE_TESTS",
@@ -189,7 +189,7 @@ def equivalent_material(
     mesh: TetMesh,
     muscles: Muscles | PreparedMuscles,
     *,
-    preset: str = "kim2010",
+    preset: str = DEFAULT_PRESET,
     samples: int = 64,
     seed: int = 0,
     mixing: str = "moduli",
@@ -213,7 +213,7 @@ def equivalent_material(
         Without a name they are called "muscle_0", "muscle_1", ... Without any muscle, the tissue is
         homogeneous fat, with a finding. Also the result of `prepared_muscles`.
     preset : str
-        One of `PRESETS`: constants of fat and muscle (Table 1).
+        One of `PRESETS`: constants of fat and muscle.
     samples : int
         Points in each tet that a surface crosses, 1 to 1048576.
     seed : int

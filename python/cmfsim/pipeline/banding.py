@@ -118,13 +118,16 @@ def band_settings(prediction: Prediction) -> dict[str, Any]:
     muscles = {}
     if prediction.model.startswith("M"):
         muscles = {name: used.get(name) for name in ("mixing", "moduli")}
-    fat = {name: value.tolist() for name, value in prediction.patient.fat.arrays().items()}
+    tissue = prediction.patient.fat
+    fat = {name: value.tolist() for name, value in tissue.arrays().items()}
+    if tissue.kind == "preset":
+        fat["preset"] = tissue.preset
     return {
         "model": prediction.model,
         "element": options.element,
         "kinematics": options.kinematics,
         "contact": options.contact if prediction.model.endswith("+S") else "none",
-        "fat": {"kind": prediction.patient.fat.kind, **fat},
+        "fat": {"kind": tissue.kind, **fat},
         **muscles,
         "plan": "achieved" if "achieved" in prediction.patient.summary else "planned",
         "sources": band_sources(),

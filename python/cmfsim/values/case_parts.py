@@ -17,6 +17,7 @@ from cmfsim.values.case_region import Plane
 from cmfsim.values.checks import Floats, as_text, check_one_of
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.moduli import TissueModuli
+from cmfsim.values.tissue_data import DEFAULT_PRESET
 
 __all__ = [
     "BAND_COVERAGE",
@@ -328,16 +329,19 @@ class CaseMuscles:
     smoothing : float
         Of the thin-plate spline that maps the template to the patient; 0 matches every landmark.
     preset : str
-        Constants of fat and muscle.
+        Constants of fat and muscle; its fat is the case's too, unless `[tissue]` states another.
     mixing : str
         "moduli" (the paper) or "stiffness".
     samples : int
         Points in a tet that a muscle's surface crosses.
     seed : int
     moduli : TissueModuli
-        Of muscles, instead of the preset's; those of fat come from the case's `[tissue]`.
+        Of muscles, instead of the preset's; those of fat come from the case.
     fit : bool
         Whether muscles are moved out of bone, air and skin once landmarks have placed them.
+    blur : float, mm
+        Standard deviation of the blur of the shares of muscle, in which they fade into fat; 0 takes
+        them as sampled, so that the tissue changes from tet to tet.
 
     Examples
     --------
@@ -348,12 +352,13 @@ class CaseMuscles:
 
     template: Path | str = "default"
     smoothing: float = 0.0
-    preset: str = "kim2010"
+    preset: str = DEFAULT_PRESET
     mixing: str = "moduli"
     samples: int = 64
     seed: int = 0
     moduli: TissueModuli = field(default_factory=TissueModuli)
-    fit: bool = True
+    fit: bool = False
+    blur: float = 4.0
 
 
 @dataclass(frozen=True)

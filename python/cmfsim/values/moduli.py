@@ -253,10 +253,11 @@ class TissueModuli:
         }
 
 
-# Table 1 of Kim et al. (2010) as printed, and with the muscle's moduli exchanged, as the core has
-# them in `Preset::from_name`.
+# As the core has them in `Preset::from_name`: muscle at rest in fat that can lose volume
+# (docs/moduli.md); Table 1 of Kim et al. (2010) as printed, and with its muscle's moduli exchanged.
 PRESET_MODULI: Mapping[str, TissueModuli] = MappingProxyType(
     {
+        "passive": TissueModuli(FatModuli(0.003, 0.40), MuscleModuli(0.06, 0.03, 0.43)),
         "kim2010": TissueModuli(FatModuli(0.003, 0.46), MuscleModuli(0.5, 0.79, 0.43)),
         "kim2010-swapped": TissueModuli(FatModuli(0.003, 0.46), MuscleModuli(0.79, 0.5, 0.43)),
     }

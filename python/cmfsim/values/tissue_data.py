@@ -17,7 +17,7 @@ from cmfsim.values.checks import (
 )
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["MIXINGS", "TISSUE_ARRAYS", "TISSUE_OPTIONAL", "TissueData"]
+__all__ = ["DEFAULT_PRESET", "MIXINGS", "TISSUE_ARRAYS", "TISSUE_OPTIONAL", "TissueData"]
 
 # Arrays that each kind of tissue needs, with the number of axes after the first.
 TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(
@@ -37,6 +37,8 @@ TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(
 TISSUE_OPTIONAL = frozenset({("preset", "fibre")})
 # How the constants of fat and muscle mix: each modulus, or the whole stiffness.
 MIXINGS = ("moduli", "stiffness")
+# Constants of fat and muscle where nothing else is stated; docs/moduli.md has the reasons.
+DEFAULT_PRESET = "passive"
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +98,7 @@ class TissueData(Frozen):
         stiffness: ArrayLike | None = None,
         fraction: ArrayLike | None = None,
         law: str = "spencer",
-        preset: str = "kim2010",
+        preset: str = DEFAULT_PRESET,
         mixing: str = "moduli",
     ) -> None:
         check_one_of("tissue kind", kind, tuple(TISSUE_ARRAYS))

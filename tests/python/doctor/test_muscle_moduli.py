@@ -12,6 +12,7 @@ from head_case import HeadCase
 CODES = ("muscle-moduli", "muscle-moduli-unusual", "muscle-moduli-unknown", "fat-moduli")
 OWN = """
 [muscles]
+preset = "kim2010"
 young_along = 0.2
 
 [muscles.moduli.masseter_L]
@@ -48,14 +49,36 @@ def test_a_case_sets_moduli_of_all_muscles_and_of_one(tmp_path):
 
 
 def test_without_moduli_they_are_the_preset_s(tmp_path):
-    assert case_of(tmp_path, "\n[muscles]\n").muscles == cmfsim.CaseMuscles()
-    assert findings(tmp_path, "\n[muscles]\n") == []
-    assert findings(tmp_path, "\n[muscles]\n", tissue="young = 0.003\npoisson = 0.46") == []
+    plain, paper = "\n[muscles]\n", '\n[muscles]\npreset = "kim2010"\n'
+    assert case_of(tmp_path, plain).muscles == cmfsim.CaseMuscles()
+    assert findings(tmp_path, plain, tissue="") == []
+    assert findings(tmp_path, plain, tissue="young = 0.003\npoisson = 0.40") == []
+    assert findings(tmp_path, paper, tissue="") == []
+    assert findings(tmp_path, paper, tissue="young = 0.003\npoisson = 0.46") == []
+    # The fat of one preset between the muscles of another is reported.
+    (note,) = findings(tmp_path, plain)
+    assert "differ from those of passive, MPa: fat 0.003 (poisson 0.46)" in note.what
+
+
+@pytest.mark.parametrize(
+    ("tissue", "muscles", "fat"),
+    [
+        ("", "", (0.003, 0.40)),
+        ("", "[muscles]", (0.003, 0.40)),
+        ("", '[muscles]\npreset = "kim2010"', (0.003, 0.46)),
+        ('preset = "passive"', '[muscles]\npreset = "kim2010"', (0.003, 0.40)),
+        ('preset = "kim2010"', "[muscles]", (0.003, 0.46)),
+        ("young = 0.002\npoisson = 0.3", '[muscles]\npreset = "kim2010"', (0.002, 0.3)),
+    ],
+)
+def test_fat_is_that_of_tissue_and_else_of_the_muscles_preset(tmp_path, tissue, muscles, fat):
+    case = case_of(tmp_path, f"\n{muscles}\n", tissue=tissue)
+    assert cmfsim.FatModuli.of(case.fat).constants() == fat
 
 
 def test_the_fat_of_a_case_is_stated_too(tmp_path):
     (note,) = findings(tmp_path, "\n[muscles]\n", tissue="young = 0.01\npoisson = 0.4")
-    assert "fat 0.01 (poisson 0.4); muscle 0.5 along" in note.what
+    assert "fat 0.01 (poisson 0.4); muscle 0.06 along" in note.what
     (error,) = findings(tmp_path, "\n[muscles]\n", tissue="young = 2000\npoisson = 0.4")
     assert (error.severity, error.code) == ("error", "fat-moduli")
     assert "young is 2000 MPa" in error.what

@@ -124,11 +124,12 @@ def test_everything_in_a_case_file_arrives(tmp_path):
 
 
 def test_what_a_case_file_leaves_out_has_its_default(tmp_path):
-    """Fat of the paper, 3 mm, refinement, an output folder beside the file."""
+    """The default fat, 4 mm, refinement, an output folder beside the file."""
     case = load(tmp_path, HEAD + SURFACES)
     assert case.name == tmp_path.name
-    assert case.tissue.preset == "kim2010"
-    assert case.tissue.fraction.tolist() == [0.0]
+    assert case.tissue is None
+    assert case.fat.preset == "passive"
+    assert case.fat.fraction.tolist() == [0.0]
     assert case.mesh == cmfsim.values.case_parts.CaseMesh(edge_length=4.0, refine=True)
     assert case.lips == cmfsim.values.case_parts.CaseLips()
     assert not case.lips.contact

@@ -11,9 +11,13 @@ import real_heads
 from angles import angle_of_lines
 from cmfsim.muscles.equivalent import prepared_muscles
 
-# Table 1 of Kim et al. (2010): fat, then muscle along and across.
-FAT = (0.003, 0.46)
-MUSCLE = {"kim2010": (0.5, 0.79, 0.43), "kim2010-swapped": (0.79, 0.5, 0.43)}
+# Fat, and muscle along and across: Table 1 of Kim et al. (2010), and muscle at rest.
+FAT = {"passive": (0.003, 0.40), "kim2010": (0.003, 0.46), "kim2010-swapped": (0.003, 0.46)}
+MUSCLE = {
+    "passive": (0.06, 0.03, 0.43),
+    "kim2010": (0.5, 0.79, 0.43),
+    "kim2010-swapped": (0.79, 0.5, 0.43),
+}
 
 
 def cuboid(low, high):
@@ -52,11 +56,12 @@ def test_moduli_mix_as_the_paper_says(preset):
     mixture = cmfsim.equivalent_material(block(), muscles, preset=preset)
     p = mixture.fraction
     along, across, poisson = MUSCLE[preset]
+    young, nu = FAT[preset]
     fibre = np.where(p[:, None] > 0.0, mixture.fibre, [1.0, 0.0, 0.0])
     expected = cmfsim.Tissue.transversely_isotropic(
-        FAT[0] * (1 - p) + along * p,
-        FAT[0] * (1 - p) + across * p,
-        FAT[1] * (1 - p) + poisson * p,
+        young * (1 - p) + along * p,
+        young * (1 - p) + across * p,
+        nu * (1 - p) + poisson * p,
         fibre,
     )
     assert np.allclose(mixture.tissue.stiffness(), expected.stiffness(), rtol=1e-12, atol=1e-15)
@@ -66,10 +71,10 @@ def test_moduli_mix_as_the_paper_says(preset):
 def test_stiffness_mixes_by_shares_along_each_muscle():
     """C = Σ p_i C(a_i) + (1 − Σ p_i) C_fat, and positive definite by numpy."""
     muscles = [cuboid([1.2, 1.3, -1.0], [3.7, 3.1, 9.0]), cuboid([-1, 2.0, 2.0], [9.0, 4.0, 3.0])]
-    mixture = cmfsim.equivalent_material(block(), muscles, mixing="stiffness")
+    mixture = cmfsim.equivalent_material(block(), muscles, preset="kim2010", mixing="stiffness")
     shares = [mixture.muscle_fraction(name) for name in mixture.volumes]
     assert np.allclose(sum(shares), mixture.fraction, atol=1e-12)
-    fat = cmfsim.Tissue.isotropic(*FAT).stiffness()[0]
+    fat = cmfsim.Tissue.isotropic(*FAT["kim2010"]).stiffness()[0]
     along = [
         cmfsim.Tissue.transversely_isotropic(*MUSCLE["kim2010"], a).stiffness()[0]
         for a in ([0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
@@ -131,7 +136,7 @@ def test_no_muscle_is_homogeneous_fat_and_said():
     assert not mixture.fibre.any()
     assert mixture.samples == 0
     assert mixture.findings[0].code == "muscles-none"
-    fat = cmfsim.Tissue.isotropic(*FAT).stiffness()
+    fat = cmfsim.Tissue.isotropic(*FAT["passive"]).stiffness()
     assert np.array_equal(mixture.tissue.stiffness(), np.repeat(fat, block().n_tets, axis=0))
 
 

@@ -39,7 +39,10 @@ def muscles():
 
 
 def mixed(moduli=None, **options):
-    return cmfsim.equivalent_material(block(), muscles(), moduli=moduli, **options)
+    """With the paper's constants where `moduli` states none."""
+    return cmfsim.equivalent_material(
+        block(), muscles(), preset="kim2010", moduli=moduli, **options
+    )
 
 
 @pytest.mark.parametrize("preset", cmfsim.PRESETS)
@@ -180,9 +183,9 @@ def test_the_fat_of_a_case_lies_between_its_muscles():
     assert cmfsim.FatModuli.of(cmfsim.TissueData("isotropic", young=0.01, poisson=0.4)) == (
         cmfsim.FatModuli(0.01, 0.4)
     )
-    assert cmfsim.FatModuli.of(cmfsim.TissueData("preset", fraction=0.0)).constants() == (
-        0.003,
-        0.46,
-    )
+    for preset, poisson in (("passive", 0.40), ("kim2010", 0.46)):
+        fat = cmfsim.TissueData("preset", preset=preset, fraction=0.0)
+        assert cmfsim.FatModuli.of(fat).constants() == (0.003, poisson)
+    assert cmfsim.TissueData("preset", fraction=0.0).preset == cmfsim.CaseMuscles().preset
     with pytest.raises(ValueError, match="must be isotropic"):
         cmfsim.FatModuli.of(cmfsim.TissueData("stiffness", stiffness=np.eye(6)))

@@ -239,15 +239,15 @@ def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, m
         assert listed.count(escape(finding.what)) == 1
 
 
-def test_muscles_are_fitted_unless_the_case_says_otherwise(predictions):
+def test_muscles_are_fitted_if_the_case_asks_for_it(predictions):
     patient = predictions["M"].patient
-    fitted = cmfsim.with_muscles(patient, cmfsim.CaseMuscles(samples=16))
+    fitted = cmfsim.with_muscles(patient, cmfsim.CaseMuscles(samples=16, fit=True))
     stated = fitted.summary["muscle_fit"]
     assert stated["used"]
     assert stated["outside_after"] < stated["outside_before"]
     assert fitted.muscles.is_fitted
     assert "fitting the muscles" in fitted.summary["timings"]
-    bare = cmfsim.with_muscles(patient, cmfsim.CaseMuscles(samples=16, fit=False))
+    bare = cmfsim.with_muscles(patient, cmfsim.CaseMuscles(samples=16))
     assert bare.summary["muscle_fit"] is None
     assert not bare.muscles.is_fitted
     # The synthetic head is the template's kin: muscles lie nearly right as they are.

@@ -87,7 +87,7 @@ pub struct Preset {
 }
 
 /// Names of the built-in presets.
-pub const PRESETS: &str = "kim2010, kim2010-swapped";
+pub const PRESETS: &str = "passive, kim2010, kim2010-swapped";
 /// Names of the fibre laws.
 pub const LAWS: &str = "spencer, picinbono";
 /// Names of the mixing rules.
@@ -116,17 +116,21 @@ impl Mixing {
 }
 
 impl Preset {
-    /// The preset called `name`: `kim2010` is Table 1 of Kim et al. (2010) as printed (muscle 0.79 MPa
-    /// across, 0.5 along, ν 0.43; fat 0.003, 0.46); `kim2010-swapped` exchanges the muscle's moduli, as
-    /// the physiology of passive muscle suggests.
+    /// The preset called `name`: `passive` has the moduli of muscle at rest (0.03 MPa across, 0.06
+    /// along, ν 0.43) and fat that can lose volume (0.003 MPa, ν 0.40; docs/moduli.md); `kim2010` is
+    /// Table 1 of Kim et al. (2010) as printed (muscle 0.79 MPa across, 0.5 along, ν 0.43; fat 0.003,
+    /// 0.46); `kim2010-swapped` exchanges its muscle's moduli.
     pub fn from_name(name: &str) -> Result<Self> {
-        let fat = Elastic { young: 0.003, poisson: 0.46 };
-        let (young_along, young_across) = match name {
-            "kim2010" => (0.5, 0.79),
-            "kim2010-swapped" => (0.79, 0.5),
+        let (of_fat, young_along, young_across) = match name {
+            "passive" => (0.40, 0.06, 0.03),
+            "kim2010" => (0.46, 0.5, 0.79),
+            "kim2010-swapped" => (0.46, 0.79, 0.5),
             _ => return Err(unknown("preset", name, PRESETS)),
         };
-        Ok(Self { fat, muscle: FibreElastic { young_along, young_across, poisson: 0.43 } })
+        Ok(Self {
+            fat: Elastic { young: 0.003, poisson: of_fat },
+            muscle: FibreElastic { young_along, young_across, poisson: 0.43 },
+        })
     }
 }
 

@@ -57,7 +57,7 @@ def assembled(
         skin_triangles=skin,
         segments=bones.segments,
         anatomy=anatomy,
-        fat=case.tissue,
+        fat=case.fat,
         landmarks=head.landmarks,
         lifted=nodes.lifted,
         lips=nodes.lips.regions,
@@ -96,7 +96,7 @@ def _scene(
     return Scene(
         nodes=mesh.nodes,
         tets=mesh.tets,
-        tissue=case.tissue,
+        tissue=case.fat,
         segments=data,
         plan=plan,
         fixed=fixed,

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 
 from cmfsim._core import TetMesh
 from cmfsim.errors import LandmarkInputError
+from cmfsim.muscles.blurring import blurred
 from cmfsim.muscles.equivalent import PreparedMuscles, equivalent_material, prepared_muscles
 from cmfsim.muscles.fitting import MuscleFit, fit_muscles
 from cmfsim.muscles.mixing import MODULI_CODES
@@ -125,14 +126,18 @@ def with_muscles(
     muscles, fit = found.muscles, found.fit
     begun = time.perf_counter()
     scene = patient.scene
+    mesh = TetMesh(scene.nodes, scene.tets) if mesh is None else mesh
     mixture = equivalent_material(
-        TetMesh(scene.nodes, scene.tets) if mesh is None else mesh,
+        mesh,
         found.prepared,
         preset=given.preset,
         mixing=given.mixing,
         samples=given.samples,
         seed=given.seed,
         moduli=replace(given.moduli, fat=FatModuli.of(patient.fat)),
+    )
+    fraction, fibre, tissue = blurred(
+        mesh, mixture.fraction, mixture.fibre, mixture.tissue_data, given.blur
     )
     timings["sampling the muscles"] = time.perf_counter() - begun
     # What the doctor found already has the line of the case.
@@ -149,10 +154,10 @@ def with_muscles(
     }
     return replace(
         patient,
-        scene=replace(scene, tissue=mixture.tissue_data),
+        scene=replace(scene, tissue=tissue),
         muscles=muscles,
-        fraction=mixture.fraction,
-        fibre=mixture.fibre,
+        fraction=fraction,
+        fibre=fibre,
         findings=findings,
         summary=summary,
     )
