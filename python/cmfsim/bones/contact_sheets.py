@@ -1,4 +1,4 @@
-"""The labial and buccal sheet of a dental arch: what lips and cheeks slide on.
+"""The labial and buccal sheet of a dental arch: a wall for the lips, or what tissue slides on.
 
 Soft tissue bridges the gaps between teeth and their incisal edges. The sheet follows gums and
 crowns, bridges the gaps, is smooth at the scale of the tissue's tets, and is extended past the edge
@@ -253,7 +253,8 @@ class _Grid:
         if len(place) < 10:
             raise CaseInputError(
                 f"{self.name!r}: no bone within {self.options.beside:g} mm of the {self.arch.jaw} "
-                'arch: check its landmarks, or set contact_surface = "bone" in [node_kinds]'
+                "arch: check its landmarks; or, without contact of the lips, set contact_surface = "
+                '"bone" in [node_kinds]'
             )
         points = self.low + SPACING * place
         angle = np.arctan2(points[:, 1] + 5.0, points[:, 0])

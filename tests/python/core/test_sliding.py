@@ -300,6 +300,24 @@ def test_a_contact_that_cannot_settle_ends_with_an_error():
     assert not isinstance(caught.value, ValueError)
 
 
+@pytest.mark.parametrize("method", ["pcg", "cholesky"])
+def test_a_contact_that_stops_near_a_solution_is_a_result(method):
+    """One step too few leaves a gap that no face shows: the result states it."""
+    _, _, tensors, boundary, _ = shell_on_sphere(1, 2, 3)
+    plan = {
+        "shell": cmfsim.rigid_motion((0, 0, 0), 20.0, (0, 0, 1)),
+        "ball": cmfsim.rigid_motion((0.5, 0, 0)),
+    }
+    whole = cmfsim.StaticSolver(tensors, boundary, method).solve(plan)
+    most = whole.contact_iterations - 1
+    found = cmfsim.StaticSolver(tensors, boundary, method, contact_iterations=most).solve(plan)
+    assert not found.contact_converged
+    assert found.contact_iterations == most
+    assert 0.0 < found.contact_gap < 1e-3
+    assert np.abs(found.displacements - whole.displacements).max() < 1e-3
+    assert found.error_estimate >= np.abs(found.displacements - whole.displacements).max()
+
+
 def test_closest_point_of_face_edge_and_vertex():
     """Closest features of a box, over the tie cases and ±1e-12 (Ericson 2005, section 5.1.5)."""
     corners = np.array(list(itertools.product((0.0, 1.0), repeat=3)))

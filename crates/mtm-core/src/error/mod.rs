@@ -256,7 +256,7 @@ pub enum MtmError {
     },
     /// The contact solver ran out of steps, or made no progress.
     #[error(
-        "contact did not converge: after {iterations} steps nodes {nodes:?} are off their surfaces or out of balance (largest gap {gap:.3e} mm); smooth the contact surface there, refine the tissue, or check that bones do not pass through each other"
+        "contact did not converge: after {iterations} steps nodes {nodes:?} are off their surfaces or out of balance (largest gap {gap:.3e} mm, largest imbalance {unbalanced:.3e} mm); smooth the contact surface there, refine the tissue, or check that bones do not pass through each other"
     )]
     ContactNotConverged {
         /// Steps done.
@@ -265,6 +265,8 @@ pub enum MtmError {
         nodes: Vec<usize>,
         /// Largest gap reached, mm.
         gap: f64,
+        /// Largest distance, mm, by which the remaining tangential force would move a node on its own.
+        unbalanced: f64,
     },
     /// The factorisation met a pivot that is not positive, or the system is singular to working precision.
     #[error(

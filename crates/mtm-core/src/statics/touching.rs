@@ -464,7 +464,8 @@ impl Path<'_> {
     /// The error for touching parts without equilibrium, with the nodes that carry the largest forces.
     fn lost(&self, pose: &Pose, rounds: usize, gap: f64) -> MtmError {
         let nodes = self.pairs.pressed(&pose.touching, NAMED_NODES);
-        MtmError::ContactNotConverged { iterations: rounds, nodes, gap }
+        let unbalanced = pose.contact.as_ref().map_or(0.0, |contact| contact.unbalanced);
+        MtmError::ContactNotConverged { iterations: rounds, nodes, gap, unbalanced }
     }
 }
 

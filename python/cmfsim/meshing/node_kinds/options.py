@@ -21,7 +21,7 @@ from cmfsim.values.checks import (
 
 __all__ = ["BORDERS", "KindOptions", "SlidingBox", "SlidingSphere", "kind_options"]
 
-CONTACT_SURFACES = ("sheet", "bone")
+CONTACT_SURFACES = ("bone", "sheet")
 BORDERS = ("left", "right", "anterior", "posterior", "inferior", "superior")
 
 
@@ -129,10 +129,10 @@ class KindOptions:
         Whether the nasal septum stays with the skull if the floor of the nose is cut off it, as by
         a Le Fort I osteotomy: it holds the tip of the nose.
     contact_surface : str
-        The surface on which nodes slide at the arches: "sheet", the labial and buccal face of gums
-        and crowns, bridged between teeth and continued past their edges (`contact_sheet`), or
-        "bone", the blurred bone (`contact_surface`), on which nodes also lie on palate and biting
-        faces.
+        The surface on which nodes slide at the arches: "bone", the blurred bone
+        (`contact_surface`), which ends at the edges of the teeth and on which nodes also lie on
+        palate and biting faces, or "sheet", the labial and buccal face of gums and crowns, bridged
+        between teeth and continued past their edges (`contact_sheet`).
     regions : tuple of SlidingBox or SlidingSphere
         Regions in which nodes slide on the named segments, instead of the above; there they slide
         on the blurred bone.
@@ -152,7 +152,7 @@ class KindOptions:
     teeth_distance: float = 15.0
     lifted: float = 10.0
     septum: bool = True
-    contact_surface: str = "sheet"
+    contact_surface: str = "bone"
     regions: tuple[SlidingBox | SlidingSphere, ...] = ()
 
     def __post_init__(self) -> None:
@@ -198,8 +198,8 @@ def kind_options(table: Mapping[str, Any]) -> KindOptions:
     Examples
     --------
     >>> import cmfsim
-    >>> cmfsim.kind_options({"contact_surface": "bone"}).contact_surface
-    'bone'
+    >>> cmfsim.kind_options({"contact_surface": "sheet"}).contact_surface
+    'sheet'
     """
     known = [field.name for field in fields(KindOptions)]
     for name in table:

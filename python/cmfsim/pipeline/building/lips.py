@@ -146,7 +146,7 @@ def lip_contact(
     *,
     height: float,
     arches: DentalArches | None,
-    contacts: CaseContacts,
+    walls: CaseContacts,
     segments: Sequence[BoneSegment],
 ) -> CaseLipContact:
     """The lips of a separated mesh, free to lift off the teeth, and what they may not enter.
@@ -159,7 +159,7 @@ def lip_contact(
     height : float, mm
         How far from the seam the lips reach.
     arches : DentalArches or None
-    contacts : CaseContacts
+    walls : CaseContacts
         The sheets of the arches.
     segments : sequence of BoneSegment
         Those that the kinds were found with.
@@ -181,9 +181,7 @@ def lip_contact(
     )
     obstacles: list[ObstacleData] = []
     for jaw in by_jaw:
-        obstacles += _obstacles(
-            nodes, regions, jaw, arches=arches, contacts=contacts, segments=segments
-        )
+        obstacles += _obstacles(nodes, regions, jaw, arches=arches, walls=walls, segments=segments)
     return CaseLipContact(regions, _released(kinds, regions), touching, tuple(obstacles))
 
 
@@ -210,7 +208,7 @@ def _obstacles(
     jaw: str,
     *,
     arches: DentalArches | None,
-    contacts: CaseContacts,
+    walls: CaseContacts,
     segments: Sequence[BoneSegment],
 ) -> list[ObstacleData]:
     """The teeth of a jaw before both lips: of each segment that bears them, its nearest nodes."""
@@ -229,17 +227,17 @@ def _obstacles(
             mine = ids[(nearest == number) & (away[number] <= REACH)]
             if not len(mine):
                 continue
-            whole = _sheet(segment, contacts)
+            whole = _sheet(segment, walls)
             surface = whole if lip == jaw else _on_teeth(whole, bones)
             if surface is not None:
                 found.append(ObstacleData(mine, segment.name, surface))
     return found
 
 
-def _sheet(segment: BoneSegment, contacts: CaseContacts) -> SurfaceData:
-    """What tissue slides on at a segment: its contact sheet, else the blurred bone."""
-    if segment.name in contacts.sheets:
-        return contacts.sheets[segment.name].surface
+def _sheet(segment: BoneSegment, walls: CaseContacts) -> SurfaceData:
+    """The contact sheet of a segment, else the blurred bone."""
+    if segment.name in walls.sheets:
+        return walls.sheets[segment.name].surface
     return contact_surface(segment)
 
 

@@ -1,6 +1,7 @@
 """The kind of each node of the soft tissue, and the remaining tets."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 from cmfsim._core import TetMesh
 from cmfsim.io import Case
@@ -15,7 +16,7 @@ from cmfsim.meshing.node_kinds import (
 from cmfsim.pipeline.building.attached_bodies import held_part
 from cmfsim.pipeline.building.case_checks import cut_segments, untouched
 from cmfsim.pipeline.building.clefts import without_clefts
-from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets
+from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets, mean_edge
 from cmfsim.pipeline.building.lips import CaseLipContact, lip_contact, separated_at_seam
 from cmfsim.pipeline.building.motions import PlannedBones
 from cmfsim.pipeline.building.parts import Head, Nodes, Tissue
@@ -67,7 +68,7 @@ def nodes_of(
             tissue.seam,
             height=case.lips.height,
             arches=tissue.arches,
-            contacts=contacts,
+            walls=_walls(head, stages, bones, tissue, options),
             segments=bones.segments,
         )
         kinds = lips.kinds
@@ -85,6 +86,23 @@ def nodes_of(
             lifted = None if lifted is None else lifted.without(held.nodes)
         report = report if counted is None else counted.result()
     return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
+
+
+def _walls(
+    head: Head, stages: Stages, bones: PlannedBones, tissue: Tissue, options: KindOptions
+) -> CaseContacts:
+    """The sheets that the lips may not enter, whatever tissue slides on.
+
+    The blurred bone would let a lip that only pushes sink into the edges of the teeth.
+    """
+    if options.contact_surface == "sheet" and options.sliding:
+        return tissue.contacts
+    sheets = replace(options, contact_surface="sheet", sliding=True)
+    case = head.case
+    edge = case.mesh.edge_length if case.mesh.file is None else mean_edge(tissue.mesh)
+    walls = made_contacts(head, stages, bones, tissue.arches, sheets, edge_length=edge)
+    stages.add(walls.findings)
+    return walls
 
 
 def _moved(case: Case, bones: PlannedBones) -> list[str]:
@@ -120,5 +138,6 @@ def made_contacts(
     """The surfaces along the dental arches that tissue slides on: none without arches."""
     if arches is None:
         return CaseContacts()
-    stages.begin("making the contact sheets")
+    if options.contact_surface == "sheet":
+        stages.begin("making the contact sheets")
     return arch_sheets(head.anatomy, bones.segments, arches, options, edge_length)

@@ -332,7 +332,7 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
     bones = real_heads.cut(head_name)
     back = nodes[:, 1].max()
     arches = cmfsim.dental_arches(anatomy, bones.segments, points)
-    sheets = arch_sheets(anatomy, bones.segments, arches, cmfsim.KindOptions(), 4.0).surfaces
+    made = arch_sheets(anatomy, bones.segments, arches, cmfsim.KindOptions(), 4.0)
     found = cmfsim.classify_nodes(
         nodes,
         mesh.boundary_triangles(),
@@ -341,7 +341,7 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
         moved=["maxilla", "mandible_body", "chin"],
         landmarks=points,
         fixed_planes={"posterior": ((0, back, 0), (0, 1, 0))},
-        contacts=sheets,
+        contacts=made.surfaces,
     )
     kinds, counts = found.kinds, found.counts
     assert found.findings == ()
@@ -359,7 +359,8 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
     assert np.abs(sliding[:, 2] - bite[2]).max() < 35
     molars = max(points[n][1] for n in ("supra_m2_L", "supra_m2_R", "sub_m2_L", "sub_m2_R"))
     assert molars + 6.0 < sliding[:, 1].max() < molars + cmfsim.KindOptions().behind + 1.0
-    segments = cmfsim.segment_data(kinds, bones.segments, contacts=sheets)
+    contacts = made.of_scene(bones.segments, kinds)
+    segments = cmfsim.segment_data(kinds, bones.segments, contacts=contacts)
     names = ["chin", "mandible_body", "maxilla", "ramus_left", "ramus_right"]
     assert sorted(segments) == names
     scene = cmfsim.Scene(

@@ -47,7 +47,7 @@ impl Sliding {
     /// be if they were attached to their segment.
     ///
     /// # Errors
-    /// `ContactNotConverged` if the steps run out far from a solution, `ContactSurface` if a node ends beyond
+    /// `ContactNotConverged` if the steps run out where a face would show it, `ContactSurface` if a node ends past
     /// the border of its surface, and any error of the body.
     pub fn solve(
         &self,
@@ -82,7 +82,10 @@ impl Sliding {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let shares = problem.shares(left, near);
+            // The last state must be exact throughout the body, and a step that decreases no merit may fail only
+            // for the inaccuracy of its solve.
+            let accurate = near || stalls > 0 || iteration == options.max_iterations;
+            let shares = problem.shares(left, accurate);
             let response = problem.step(&state, &active, carry, shares, body)?;
             let is_first = approaches == iteration - 1 && approaches < MOST_APPROACHES;
             let next = (is_first && iteration < options.max_iterations)
@@ -124,7 +127,7 @@ impl Sliding {
             if done || iteration == options.max_iterations || stalls > MOST_STALLS {
                 let will_do = response.solved && gap.max(unbalanced) <= problem.unseen();
                 if !(done || will_do) {
-                    return Err(problem.far(&state, &active, iteration, gap));
+                    return Err(problem.far(&state, &active, iteration, (gap, unbalanced)));
                 }
                 return problem.end(state, &active, unbalanced, done, iteration);
             }

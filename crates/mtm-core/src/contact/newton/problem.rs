@@ -147,8 +147,10 @@ impl Problem<'_> {
     }
 
     /// Relative accuracy of the next step, `left` mm from a solution, and that of the forces of its springs.
-    pub fn shares(&self, left: f64, near: bool) -> (f64, f64) {
-        if near {
+    ///
+    /// `accurate`: whether the step is solved within the tolerance of the solver.
+    pub fn shares(&self, left: f64, accurate: bool) -> (f64, f64) {
+        if accurate {
             // What the springs leave open must fit into the balance.
             let needed = LAST_SPRING_SHARE * self.balance() / left;
             return (0.0, needed.clamp(SPRING_ERROR, ROUGH_SHARE));
@@ -297,7 +299,15 @@ impl Problem<'_> {
     }
 
     /// The error for steps that ran out far from a solution, with the nodes that are furthest from one.
-    pub fn far(&self, state: &State, active: &[bool], iterations: usize, gap: f64) -> MtmError {
+    ///
+    /// `left`: the largest gap, and by how much the tangential force would move a node, mm.
+    pub fn far(
+        &self,
+        state: &State,
+        active: &[bool],
+        iterations: usize,
+        (gap, unbalanced): (f64, f64),
+    ) -> MtmError {
         let badness = |i: usize| {
             let (gap, way) = self.left_of(state, i, active[i]);
             gap + way
@@ -306,7 +316,7 @@ impl Problem<'_> {
         order.sort_by(|&a, &b| badness(b).total_cmp(&badness(a)).then(a.cmp(&b)));
         let nodes = order.iter().take(NAMED_NODES);
         let nodes = nodes.map(|&i| self.sliding.nodes[i].node as usize).collect();
-        MtmError::ContactNotConverged { iterations, nodes, gap }
+        MtmError::ContactNotConverged { iterations, nodes, gap, unbalanced }
     }
 }
 
