@@ -52,7 +52,7 @@ class PatientModel(Frozen):
     muscles : Musculature or None
         In the patient's frame; None if the case has none.
     fraction : (m,) float64 or None
-        Share of muscle in each tet.
+        Share of muscle in each tet, blurred as the case states.
     fibre : (m, 3) float64 or None
         Unit direction of the fibres of each tet; zero where there is no muscle.
     landmarks : mapping of str to mapping of str to (3,) float64, mm

@@ -52,7 +52,7 @@ TISSUE = (
     Source("fat modulus", 0.45, "log", _MODULI),
     Source("muscle modulus along", 1.1, "log", _MODULI),
     Source("muscle modulus across", 1.1, "log", _MODULI),
-    Source("fat Poisson's ratio", 0.02, "1", "assumed: models of the face use 0.43 to 0.49"),
+    Source("fat Poisson's ratio", 0.05, "1", "assumed: 0.40 here, 0.43 to 0.49 in other models"),
     Source("muscle Poisson's ratio", 0.03, "1", "assumed: models of the face use 0.4 to 0.49"),
     Source("muscle fraction", 0.2, "share", "assumed: muscles of a template, not of the patient"),
     Source("fibre direction about L", 10.0, "degrees", "assumed"),
