@@ -48,8 +48,9 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
     """
     before, triangles = skin.vertices, skin.triangles.astype(np.int64)
     after = before + displacements
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    ends = np.sort(np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    # As one number each: rows would be sorted twenty times as slowly.
+    edges = np.column_stack(np.divmod(np.unique(ends @ [len(before), 1]), len(before)))
     rest, now = (np.linalg.norm(np.subtract(*v[edges.T]), axis=1) for v in (before, after))
     torn = (now > MOST_STRETCH * rest) & (now - rest > VISIBLE_LENGTH)
     one, other = (_areas(v[triangles]) for v in (before, after))
