@@ -555,7 +555,7 @@ fn steps_that_run_out_near_a_solution_give_a_result() {
     for method in [Method::Cholesky, Method::Pcg] {
         let exact = solve(&tensors, &bounds, with_method(method), &twist(), None).unwrap();
         let mut results = 0;
-        for max_iterations in 1..exact.contact.iterations {
+        for max_iterations in 1..exact.contact_iterations {
             let contact = ContactOptions { max_iterations, ..near_exact() };
             let options = StaticOptions { contact, ..with_method(method) };
             match solve(&tensors, &bounds, options, &twist(), None) {
