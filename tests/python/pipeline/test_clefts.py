@@ -7,7 +7,12 @@ import pytest
 
 import cmfsim
 from cmfsim.pipeline.building.attached_bodies import held_part
-from cmfsim.pipeline.building.clefts import cleft_tets, without_clefts
+from cmfsim.pipeline.building.clefts import (
+    cleft_tets,
+    crushed_tets,
+    without_clefts,
+    without_crushed,
+)
 
 EDGE = 1.0
 
@@ -115,6 +120,62 @@ def test_what_is_left_keeps_its_kinds_and_what_went_is_said(bite):
     assert [f.code for f in findings] == ["clefts-left-out"]
     lost = float(np.sum(mesh.volumes) - np.sum(left.volumes))
     assert f"{lost:.0f} mm³" in findings[0].what
+
+
+def crushed(bite, width=4.0, **motions):
+    mesh, kinds, segments = bite
+    return crushed_tets(
+        np.asarray(mesh.nodes),
+        np.asarray(mesh.tets),
+        kinds,
+        segments,
+        motions={name: cmfsim.rigid_motion(shift) for name, shift in motions.items()},
+        width=width,
+    )
+
+
+def test_tissue_between_plates_that_meet_is_crushed_and_tissue_beside_is_not(bite):
+    mesh = bite[0]
+    middle = np.asarray(mesh.nodes)[np.asarray(mesh.tets)].mean(axis=1)
+    between = (middle[:, 0] < 6.0) & (middle[:, 2] > 2.0) & (middle[:, 2] < 4.0)
+    assert between.sum() > 100
+    for motions in ({"maxilla": (0, 0, -4.2)}, {"maxilla": (0, 0, -2), "mandible": (0, 0, 2.2)}):
+        gone = crushed(bite, **motions)
+        assert gone[between].all()
+        assert not gone[middle[:, 0] > 9.0].any()
+
+
+def test_tissue_that_keeps_room_stays(bite):
+    for shift in ((0, 0, -1.0), (0, 0, 4.0), (3.0, 0, 0)):
+        assert not crushed(bite, maxilla=shift).any(), shift
+    together = (0, 2.0, -4.2)
+    assert not crushed(bite, maxilla=together, mandible=together).any()
+    assert not crushed(bite, width=0.0, maxilla=(0, 0, -4.2)).any()
+    assert not crushed(bite).any()
+    # Three times the width: plates 4 mm apart are not that near.
+    assert not crushed(bite, width=1.3, maxilla=(0, 0, -4.2)).any()
+
+
+def test_a_moved_surface_crushes_as_its_rigid_motion_does(bite):
+    mesh, kinds, segments = bite
+    shift = np.array([0.0, 0.0, -4.2])
+    surface = segments[0].surface
+    moved = cmfsim.MovedSurface(surface, surface.vertices + shift)
+    arrays = (np.asarray(mesh.nodes), np.asarray(mesh.tets), kinds, segments)
+    by_surface = crushed_tets(*arrays, motions={"maxilla": moved}, width=4.0)
+    np.testing.assert_array_equal(by_surface, crushed(bite, maxilla=shift))
+    assert by_surface.any()
+
+
+def test_crushed_tissue_is_reported_with_its_volume(bite):
+    mesh, kinds, segments = bite
+    motions = {"maxilla": cmfsim.rigid_motion((0, 0, -4.2))}
+    left, now, (said,) = without_crushed(mesh, kinds, segments, motions, 4.0)
+    lost = float(np.sum(mesh.volumes) - np.sum(left.volumes))
+    assert (said.code, said.severity) == ("crushed-left-out", "note")
+    assert f"{mesh.n_tets - left.n_tets} tets of {lost:.0f} mm³" in said.what
+    assert len(now.kind) == left.n_nodes
+    assert without_crushed(mesh, kinds, segments, {}, 4.0) == (mesh, kinds, ())
 
 
 def test_a_body_that_hangs_by_an_edge_goes():

@@ -1,18 +1,27 @@
-"""The clefts between segments of bone, where there is no tissue to stretch: mouth and cut."""
+"""Tissue that is removed between segments of bone: in clefts (mouth, cut), and where bones meet."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import Surface, TetMesh
+from cmfsim._core import Surface, SurfaceMotion, TetMesh
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.renumbering import used_nodes
+from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["cleft_tets", "without_clefts"]
+__all__ = ["cleft_tets", "crushed_tets", "without_clefts", "without_crushed"]
+
+# Distances from two segments, taken together and relative to the width of a cleft, up to which
+# tissue cannot move out of their way.
+CONFINED = 3.0
+# Share of its volume below which a tet between two segments counts as crushed.
+CRUSHED = 0.1
+# Distance from a segment, mm, below which a node moves with it alone.
+ON_BONE = 1e-3
 
 
 def without_clefts(
@@ -39,8 +48,6 @@ def without_clefts(
     inside = cleft_tets(nodes, tets, kinds, segments, moved=moved, width=width)
     if not inside.any():
         return mesh, kinds, ()
-    used, kept = used_nodes(tets[~inside])
-    left = TetMesh(nodes[used], kept)
     volume = float(mesh.volumes[inside].sum())
     finding = Finding.note(
         "clefts-left-out",
@@ -52,7 +59,132 @@ def without_clefts(
         "bone; tets stretched across would be inverted and hold the bones back",
         fix="set cleft in [mesh] to another width, or to 0 to keep all tissue",
     )
-    return left, kinds.of_nodes(used), (finding,)
+    return *_without(mesh, kinds, inside), (finding,)
+
+
+def without_crushed(
+    mesh: TetMesh,
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    motions: Mapping[str, Floats | MovedSurface],
+    width: float,
+) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
+    """The mesh without the tets that the plan crushes between segments, and a finding about them.
+
+    Linear tissue turns inside out there at no harm to the rest; in large deformation no position of
+    the nodes between two bones that meet leaves these tets a volume.
+
+    Parameters
+    ----------
+    mesh : TetMesh
+    kinds : NodeKinds
+    segments : sequence of BoneSegment
+        Those that the kinds were found with.
+    motions : mapping of str to (4, 4) float64, mm, or MovedSurface
+        Of the segments that move.
+    width : float, mm
+        As for `crushed_tets`.
+    """
+    crushed = crushed_tets(mesh.nodes, mesh.tets, kinds, segments, motions=motions, width=width)
+    if not crushed.any():
+        return mesh, kinds, ()
+    corners = mesh.nodes[mesh.tets[crushed]].reshape(-1, 3)
+    low, high = (", ".join(f"{x:.0f}" for x in end) for end in (corners.min(0), corners.max(0)))
+    finding = Finding.note(
+        "crushed-left-out",
+        f"{int(crushed.sum())} tets of {float(mesh.volumes[crushed].sum()):.0f} mm³ in total would "
+        f"keep less than {CRUSHED:.0%} of their volume between segments that move towards each "
+        "other, and were removed",
+        where=f"between ({low}) and ({high}) mm",
+        why="bones leave this tissue no room; its tets would be inverted and push the rest aside",
+        fix="check that the plan does not move bones into each other; kinematics linear, or cleft "
+        "0 in [mesh], keeps all tissue",
+    )
+    return *_without(mesh, kinds, crushed), (finding,)
+
+
+def _without(
+    mesh: TetMesh, kinds: NodeKinds, removed: NDArray[np.bool_]
+) -> tuple[TetMesh, NodeKinds]:
+    used, tets = used_nodes(mesh.tets[~removed])
+    return TetMesh(mesh.nodes[used], tets), kinds.of_nodes(used)
+
+
+def crushed_tets(
+    nodes: Floats,
+    tets: NDArray[np.uint32],
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    *,
+    motions: Mapping[str, Floats | MovedSurface],
+    width: float,
+) -> NDArray[np.bool_]:
+    """Which tets a plan crushes between two segments, (m,).
+
+    Nodes on a segment move with it. Those between segments follow all of them with weights 1/d² of
+    the distance d (Shepard 1968). A tet is crushed if this leaves it less than a tenth of its
+    volume. Only tets are judged of which every node has two segments within three times `width`,
+    taken together: other tissue moves out of the way.
+
+    Parameters
+    ----------
+    nodes : (n, 3) float64, mm
+    tets : (m, 4) uint32
+    kinds : NodeKinds
+    segments : sequence of BoneSegment
+    motions : mapping of str to (4, 4) float64, mm, or MovedSurface
+        Of the segments that move.
+    width : float, mm
+        The width of a cleft; 0: no tet.
+    """
+    crushed = np.zeros(len(tets), dtype=bool)
+    if width <= 0.0 or not motions:
+        return crushed
+    reach = CONFINED * width
+    distance = np.full((len(segments), len(nodes)), np.inf)
+    for own, segment in zip(distance, segments, strict=True):
+        surface = segment.surface.searched
+        near = _in_box(nodes, surface, reach)
+        own[near] = _distances(nodes[near], surface)
+        if segment.name in kinds.segments:
+            own[kinds.segment == kinds.segments.index(segment.name)] = 0.0
+    if len(segments) < 2:
+        return crushed
+    confined = np.partition(distance, 1, axis=0)[:2].sum(axis=0) < reach
+    ids = np.flatnonzero(confined[tets].all(axis=1))
+    used, cells = used_nodes(tets[ids])
+    moved = nodes[used] + _blended(nodes[used], distance[:, used], segments, motions)
+
+    def volumes(places: Floats) -> Floats:
+        corners = places[cells]
+        found: Floats = np.linalg.det(corners[:, 1:] - corners[:, :1])
+        return found
+
+    crushed[ids] = volumes(moved) < CRUSHED * volumes(nodes[used])
+    return crushed
+
+
+def _blended(
+    nodes: Floats,
+    distance: Floats,
+    segments: Sequence[BoneSegment],
+    motions: Mapping[str, Floats | MovedSurface],
+) -> Floats:
+    """The displacement of nodes by the segments around them, (n, 3)."""
+    # On a segment its weight outdoes all others.
+    weights = 1.0 / np.maximum(distance, ON_BONE) ** 2
+    total = np.zeros_like(nodes)
+    for own, segment in zip(weights, segments, strict=True):
+        motion = motions.get(segment.name)
+        if motion is None:
+            continue
+        if isinstance(motion, MovedSurface):
+            field = SurfaceMotion(motion.surface.searched, motion.moved_vertices)
+            total += own[:, None] * field.displacement(nodes)
+        else:
+            total += own[:, None] * (nodes @ motion[:3, :3].T + motion[:3, 3] - nodes)
+    blended: Floats = total / weights.sum(axis=0)[:, None]
+    return blended
 
 
 def cleft_tets(
@@ -112,13 +244,18 @@ def _least_at_corners(
     nodes: Floats, tets: NDArray[np.uint32], surface: Surface, reach: float
 ) -> Floats:
     """The distance of each tet's nearest corner from a surface; infinity beyond its box."""
-    vertices = surface.vertices
-    low, high = vertices.min(axis=0) - reach, vertices.max(axis=0) + reach
-    near = np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
+    near = _in_box(nodes, surface, reach)
     distance = np.full(len(nodes), np.inf)
     distance[near] = _distances(nodes[near], surface)
     nearest: Floats = distance[tets].min(axis=1)
     return nearest
+
+
+def _in_box(nodes: Floats, surface: Surface, reach: float) -> NDArray[np.int64]:
+    """The nodes within a surface's box, enlarged by `reach`."""
+    vertices = surface.vertices
+    low, high = vertices.min(axis=0) - reach, vertices.max(axis=0) + reach
+    return np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
 
 
 def _distances(points: Floats, surface: Surface) -> Floats:

@@ -15,7 +15,7 @@ from cmfsim.meshing.node_kinds import (
 )
 from cmfsim.pipeline.building.attached_bodies import held_part
 from cmfsim.pipeline.building.case_checks import cut_segments, untouched
-from cmfsim.pipeline.building.clefts import without_clefts
+from cmfsim.pipeline.building.clefts import without_clefts, without_crushed
 from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets, mean_edge
 from cmfsim.pipeline.building.lips import CaseLipContact, lip_contact, separated_at_seam
 from cmfsim.pipeline.building.motions import PlannedBones
@@ -55,6 +55,11 @@ def nodes_of(
     if case.mesh.file is None:
         mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
         stages.add(noticed)
+        if case.solver.kinematics != "linear":
+            mesh, kinds, noticed = without_crushed(
+                mesh, kinds, bones.segments, bones.motions, case.mesh.cleft
+            )
+            stages.add(noticed)
     mesh, kinds, noticed = held_part(mesh, kinds)
     stages.add(noticed)
     lips = CaseLipContact({}, kinds)
