@@ -30,8 +30,8 @@ HEAD = (
     "| alar width, mm per mm | nasolabial angle, ° per mm |\n"
     "|---|---|---:|---:|---:|---:|---:|---:|"
 )
-# Jung et al. 2018 (tip and upper lip forwards) and Hellak et al. 2015 (width at the alae 3.17 mm and nasolabial
-# angle −6.65° for 5.58 mm).
+# Jung et al. 2018 (tip and upper lip forwards) and Hellak et al. 2015 (width at the alae 3.17 mm,
+# nasolabial angle −6.65° for 5.58 mm).
 PUBLISHED = "| published | | 0.17 | | | 0.21 | 0.57 | −1.2 |"
 CASE = """format = "cmfsim-case"
 version = 1

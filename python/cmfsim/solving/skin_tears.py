@@ -11,7 +11,7 @@ __all__ = ["tear_finding"]
 # Skin fails in tension at a stretch of about 1.5 (Ní Annaidh et al. 2012: 54 % ± 17 % at failure).
 MOST_STRETCH = 1.5
 # Edges that lengthen by less, mm, and triangles of less area, mm², are too small to be seen.
-VISIBLE_LENGTH = 0.5
+VISIBLE_LENGTH = 1.0
 VISIBLE_AREA = 0.5
 
 
@@ -33,7 +33,7 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
     Notes
     -----
     An edge counts as torn if it is stretched by more than half, and becomes longer by at least
-    0.5 mm; a triangle as turned over if its normal turns by more than a right angle, and if it has
+    1 mm; a triangle as turned over if its normal turns by more than a right angle, and if it has
     at least 0.5 mm² before the operation.
 
     Examples
@@ -67,8 +67,8 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
         place = before[triangles[worst]].mean(axis=0)
     if torn.any():
         count = int(torn.sum())
-        stretch = np.where(torn, now / np.maximum(rest, VISIBLE_LENGTH), 0.0)
-        worst = int(stretch.argmax())
+        longer = np.where(torn, now - rest, 0.0)
+        worst = int(longer.argmax())
         place = before[edges[worst]].mean(axis=0)
         facts.insert(
             0,
@@ -83,9 +83,9 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
         ", and ".join(facts),
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
         why="no skin stretches or folds like this: the face there is wrong, usually because bone "
-        "moves far next to tissue that is fixed, or tets are too small or too few between both",
-        fix="look at the face there; move the plane that ends the tissue ([region]) away from the "
-        "bone that moves, check the plan, or use another edge_length",
+        "moves far next to fixed tissue, or because jaws pull lips apart that are one piece",
+        fix="look at the face there and check the plan; next to the end of the tissue, move its "
+        "plane away ([region]); between the lips, set contact = true in [lips]",
     )
 
 

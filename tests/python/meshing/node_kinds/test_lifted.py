@@ -15,9 +15,10 @@ FORWARDS, BACK = (0.0, -5.0, 0.0), (0.0, 5.0, 0.0)
 
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
-    """The demo's head, coarse and without muscles."""
+    """The demo's head, coarse, without muscles and septum, whose nodes are not lifted."""
     made = write_demo_case(tmp_path_factory.mktemp("lifted"), edge_length=10.0)
-    return build_patient(made.case, ("H",), BuildOptions(anatomy=made.anatomy, check=False))
+    case = replace(made.case, node_kinds={"septum": False})
+    return build_patient(case, ("H",), BuildOptions(anatomy=made.anatomy, check=False))
 
 
 def plan_of(translation):
