@@ -53,6 +53,8 @@ def test_muscles_of_a_case(tmp_path):
     assert case(tmp_path, "").muscles is None
     found = case(tmp_path, "[muscles]\n").muscles
     assert (found.template, found.samples, found.mixing) == ("default", 64, "moduli")
+    assert (found.preset, found.fit, found.blur) == ("passive", False, 4.0)
+    assert case(tmp_path, "[muscles]\nblur = 0\n").muscles.blur == 0.0
     found = case(tmp_path, '[muscles]\ntemplate = "atlas"\nsamples = 8\nseed = 3\n').muscles
     assert found.template == tmp_path / "atlas"
     assert (found.samples, found.seed) == (8, 3)
@@ -65,6 +67,7 @@ def test_muscles_of_a_case(tmp_path):
         ("[muscles]\nsamples = 1.5\n", "case.toml:8.*whole"),
         ('[muscles]\nmixing = "modulus"\n', "case.toml:8.*did you mean 'moduli'"),
         ("[muscles]\nsmoothing = -1\n", "case.toml:8.*at least 0"),
+        ("[muscles]\nblur = 31\n", "case.toml:8.*at most 30"),
         ("[postoperative]\n", "case.toml:7.*skin, image or bones"),
         ('[postoperative]\nskin = "a"\nimage = "b"\n', "case.toml:9.*together with skin"),
         ('[postoperative]\nskin = "a"\nbone = "b"\n', "case.toml:9.*did you mean 'bones'"),
