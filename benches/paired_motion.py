@@ -17,7 +17,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,8 @@ STRETCH, NEAR = 4.0, 15.0
 TRIANGLES = 60_000
 # A ground patch: radius and depth, mm.
 GROUND = (7.0, 4.0)
+# Sizes after, as a share of that before, of a bone with other triangles.
+SIZES = (0.96, 1.0, 1.04)
 # Share of resections to be found, and false patches allowed in so many pairs.
 FOUND, FALSE, PAIRS = 0.9, 1, 100
 SITES = {
@@ -107,12 +109,12 @@ def drawn(seed: int) -> cmfsim.HeadParameters:
     )
 
 
-def lighter(surface: cmfsim.SurfaceData) -> cmfsim.SurfaceData:
+def lighter(surface: cmfsim.SurfaceData, triangles: int = TRIANGLES) -> cmfsim.SurfaceData:
     """The surface with fewer triangles, as a template has."""
     import pyvista as pv  # noqa: PLC0415
 
     mesh = pv.PolyData.from_regular_faces(surface.vertices, surface.triangles)
-    few = mesh.decimate(max(1.0 - TRIANGLES / len(surface.triangles), 0.0))
+    few = mesh.decimate(max(1.0 - triangles / len(surface.triangles), 0.0))
     return cmfsim.SurfaceData(np.asarray(few.points, dtype=np.float64), few.regular_faces)
 
 
@@ -230,6 +232,29 @@ def found_motion(pair: Pair) -> tuple[NDArray[np.int64], Floats, tuple[Any, ...]
     return used, x @ found.matrix[:3, :3].T + found.matrix[:3, 3], found.removed
 
 
+def remeshed_error(head: Head, move: str, size: float) -> tuple[float, float]:
+    """The error of a whole mandible's motion, mm, with other triangles and another size after.
+
+    The first is that at the teeth. The second is that of the middle of the bone: a change of size
+    is about it, and is no motion.
+    """
+    before = head.bones["mandible"]
+    x = np.asarray(before.vertices)
+    true = x + moved_mandible(head, x, move, "whole")
+    middle = true.mean(axis=0)
+    after = lighter(
+        cmfsim.SurfaceData(middle + size * (true - middle), before.triangles),
+        len(before.triangles) // 2,
+    )
+    matrix = cmfsim.achieved_plan({"mandible": before}, after).motions["mandible"].matrix
+    off = x @ matrix[:3, :3].T + matrix[:3, 3] - true
+    near = np.linalg.norm(x - head.at["infradentale"], axis=1) < NEAR
+    return (
+        float(np.linalg.norm(off[near], axis=1).mean()),
+        float(np.linalg.norm(off.mean(axis=0))),
+    )
+
+
 def pairs(head: Head, conditions: Sequence[str], *, cut: bool) -> Iterator[tuple[str, str, Pair]]:
     """All pairs of a head: bone, condition, pair."""
     for number, move in enumerate(MOVES):
@@ -252,6 +277,7 @@ class Tally:
     false: int = 0
     cut: int = 0
     found: int = 0
+    remeshed: dict[tuple[str, float], tuple[float, float]] = field(default_factory=dict)
 
     def add(self, head: Head, bone: str, condition: str, pair: Pair) -> None:
         """Enters a pair without resection."""
@@ -280,6 +306,11 @@ class Tally:
             bound = EXACT if condition == "exact" else ALL
             if site == "teeth" and condition != "slip 2" and max(errors) > bound:
                 words.append(f"{head}, {bone}, {condition}: {max(errors):.2f} mm (at most {bound})")
+        words += [
+            f"{head}, other triangles, size {size:g}: {error:.2f} mm (at most {EXACT})"
+            for (head, size), (error, _) in self.remeshed.items()
+            if error > EXACT
+        ]
         if self.found < FOUND * self.cut:
             words.append(f"{self.found} of {self.cut} resections found")
         if self.false > FALSE * max(self.sound / PAIRS, 1.0):
@@ -300,6 +331,13 @@ class Tally:
             "",
             f"Resections found: {self.found} of {self.cut}.",
             f"Patches of sound bone taken for resected: {self.false} in {self.sound} pairs.",
+            "",
+            "| head | size after | mandible with other triangles: teeth | middle |",
+            "|---|---:|---:|---:|",
+        ]
+        lines += [
+            f"| {head} | {size:g} | {teeth:.2f} | {middle:.2f} |"
+            for (head, size), (teeth, middle) in self.remeshed.items()
         ]
         return "\n".join(lines)
 
@@ -308,6 +346,8 @@ def measured(heads: Sequence[Head]) -> Tally:
     """All pairs of some heads."""
     tally = Tally({})
     for head in heads:
+        for size in SIZES:
+            tally.remeshed[head.name, size] = remeshed_error(head, "advance 8, pitch", size)
         for bone, condition, pair in pairs(head, tuple(CONDITIONS), cut=False):
             tally.add(head, bone, condition, pair)
         for bone, _, pair in pairs(head, ("exact", "slip 1, noise, bending"), cut=True):
