@@ -55,6 +55,8 @@ def septum(
     segments: Sequence[BoneSegment],
     moved: Collection[str],
     landmarks: Mapping[str, Mapping[str, ArrayLike]],
+    *,
+    by_vertex: Collection[str] = (),
 ) -> Septum:
     """The septum of a nose whose floor was cut off the skull; empty if nothing was.
 
@@ -67,6 +69,10 @@ def septum(
         Names of the segments that are cut or moved.
     landmarks : mapping of str to mapping of str to (3,) float64, mm
         "skull": nasion, rhinion, mid_philtrum, supradentale; "skin": pronasale, subnasale.
+    by_vertex : collection of str
+        Names of the segments that are followed vertex by vertex. If the skull is one of them, there
+        is no septum: it lies up to 15 mm off the bone, where the noise of a triangle's rotation
+        would move it by millimetres.
 
     Returns
     -------
@@ -82,6 +88,8 @@ def septum(
     skull, pieces = cut_off_skull(segments, moved)
     if not pieces:
         return Septum(kinds, none)
+    if skull.name in by_vertex:
+        return Septum(kinds, none, (_by_vertex(skull.name),))
     marks: dict[str, Floats] = {}
     for kind_of, names in (("skull", SKULL_LANDMARKS), ("skin", SKIN_LANDMARKS)):
         given = landmarks.get(kind_of, {})
@@ -162,6 +170,17 @@ def _nearest(place: Floats, segments: Sequence[BoneSegment]) -> BoneSegment:
         return float(np.linalg.norm(closest[0] - place))
 
     return min(segments, key=distance)
+
+
+def _by_vertex(skull: str) -> Finding:
+    return Finding.note(
+        "septum-left-out",
+        f"the nasal septum is not modelled: {skull} is followed vertex by vertex",
+        where=f"segment {skull}",
+        why="the septum lies too far from the bone for that; without its support, the tip of the "
+        "nose follows the maxilla too far, mostly upwards",
+        fix="if the skull did not move, leave it out of the plan",
+    )
 
 
 def _left_out(missing: Sequence[str]) -> Finding:

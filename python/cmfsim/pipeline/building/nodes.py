@@ -25,6 +25,7 @@ from cmfsim.pipeline.building.tissue_ends import end_findings
 from cmfsim.pipeline.building.tissue_mesh import end_planes
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["made_contacts", "nodes_of"]
 
@@ -85,7 +86,14 @@ def nodes_of(
         stages.drop_repeated()
         lifted = lifted_tissue(mesh.nodes, kinds, bones.segments, moved, options)
         if options.septum:
-            held = septum(mesh.nodes, kinds, bones.segments, moved, head.landmarks)
+            held = septum(
+                mesh.nodes,
+                kinds,
+                bones.segments,
+                moved,
+                head.landmarks,
+                by_vertex=[n for n, m in bones.motions.items() if isinstance(m, MovedSurface)],
+            )
             stages.add(held.findings)
             kinds = held.kinds
             lifted = None if lifted is None else lifted.without(held.nodes)
