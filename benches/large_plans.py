@@ -20,7 +20,9 @@ import cmfsim
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.inversion import least_volume_ratios
 from cmfsim.values.case_parts import CaseMotion
+from marked import publish
 
+NAME = "benches/large_plans.py"
 # Motion of maxilla and mandible body, mm, LPS: y backwards, z up.
 PLANS = {
     "maxilla 5 back": ((0, 5, 0), (0, 0, 0)),
@@ -72,13 +74,14 @@ def row(case: cmfsim.Case, model: str, plan: str, tolerance: float) -> tuple[str
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Builds and solves all plans; prints the table."""
+    """Builds and solves all plans; prints or publishes the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", type=Path, nargs="+")
     parser.add_argument("--models", nargs="+", default=["H"])
     parser.add_argument("--edge", type=float, default=7.0, help="mm")
     parser.add_argument("--plans", type=int, nargs="+", default=range(len(PLANS)))
     parser.add_argument("--tolerance", type=float, default=0.1)
+    parser.add_argument("--markdown", type=Path)
     options = parser.parse_args(words)
     rows, total = [COLUMNS, "|---|---|---:|---|---:|---:|---:|---:|---:|---:|"], 0
     for path in options.cases:
@@ -91,7 +94,7 @@ def main(words: Sequence[str] | None = None) -> int:
                 rows.append(line)
                 total += inverted
     head = f"cmfsim {cmfsim.__version__}, {platform.machine()}; edge {options.edge:g} mm."
-    print(head, "", *rows, sep="\n")
+    publish(options.markdown, NAME, head + "\n\n" + "\n".join(rows))
     return 1 if total else 0
 
 

@@ -65,9 +65,10 @@ def test_hyperelastic_tissue_at_half_its_length_inverts_nowhere(caplog):
     assert not caplog.records
 
 
-@pytest.mark.parametrize(("depth", "sideways"), [(0.7, 0.0), (0.8, 0.0), (0.6, 3.0), (0.7, 3.0)])
+@pytest.mark.parametrize("sideways", [0.0, 3.0])
+@pytest.mark.parametrize("depth", [0.7, 0.85])
 def test_hyperelastic_tissue_under_a_punch_inverts_nowhere(depth, sideways):
-    """Stable neo-Hookean tissue alone, whose energy is finite, leaves 1 to 17 tets inverted."""
+    """Stable neo-Hookean tissue alone, whose energy is finite, leaves up to 18 tets inverted."""
     size = (16.0, 16.0, 8.0)
     nodes, tets = box((8, 8, 4), size, jitter=0.15)
     x, y, z = nodes.T
