@@ -112,7 +112,7 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
         f"{ratios[worst]:.2g} of its volume",
         where=f"({x:.1f}, {y:.1f}, {z:.1f}) mm before the operation",
         why="tissue cannot turn inside out: forces and displacements around these tets are wrong",
-        fix="check whether the plan moves bones into each other, and build the case for this plan "
-        "and these kinematics, which removes tissue that it crushes; if kinematics is "
-        '"corotational", also try "hyperelastic", which resists inversion',
+        fix="use a smaller motion, or larger tets where bones squeeze a thin layer; if "
+        'kinematics is "corotational", also try "hyperelastic", which resists inversion '
+        "longer",
     )
