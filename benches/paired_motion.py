@@ -60,7 +60,7 @@ SLIP_LENGTH, BEND_LENGTH, WAVES = 8.0, 25.0, 400
 # Over which length the mesh stretches between pieces, and how near to a site errors are read, mm.
 STRETCH, NEAR = 4.0, 15.0
 # Triangles of a bone.
-TRIANGLES = 60_000
+TRIANGLES = 30_000
 # A ground patch: radius and depth, mm.
 GROUND = (7.0, 4.0)
 # Sizes after, as a share of that before, of a bone with other triangles.

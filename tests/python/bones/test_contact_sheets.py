@@ -377,7 +377,7 @@ def test_options_come_from_plain_values():
     assert made.fixed_borders == ("inferior",)
     assert [type(r).__name__ for r in made.regions] == ["SlidingBox", "SlidingSphere"]
     for table, complaint in (
-        ({"contact": "bone"}, "no option 'contact'; options are: bone_distance"),
+        ({"contact": "bone"}, "no option 'contact'; did you mean 'contact_surface'"),
         ({"contact_surface": "gum"}, "contact_surface is 'gum'|'gum'"),
         ({"sliding": "no"}, "sliding is 'no': true or false"),
         ({"fixed_borders": "inferior"}, "a list of borders"),
@@ -401,8 +401,9 @@ regions = [{segment = "mandible", centre = [0, -160, 1450], radius = 9}]
     assert made.contact_surface == "bone"
     assert made.regions[0].radius == 9.0
     case.replace('contact_surface = "bone"', 'contact_surfaces = "bone"')
-    line = 1 + case.toml.splitlines().index("[node_kinds]")
-    with pytest.raises(cmfsim.CaseError, match=f"case.toml:{line} node_kinds: there is no option"):
+    line = 1 + case.toml.splitlines().index('contact_surfaces = "bone"')
+    where = f"case.toml:{line} node_kinds.contact_surfaces: there is no option"
+    with pytest.raises(cmfsim.CaseError, match=where):
         cmfsim.build_model(case.write(tmp_path), check=False)
     case.replace("regions = [{", "regions = [3, {")
     with pytest.raises(cmfsim.CaseError, match="regions is not a list of tables"):

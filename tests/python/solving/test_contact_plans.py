@@ -57,15 +57,19 @@ def test_the_face_is_a_continuous_function_of_the_plan(model, solver, plans):
 
 
 def test_a_solve_may_begin_at_another_plan(scene, solver, plans):
-    """Fewer steps, the same end; a solution of another solver is refused."""
+    """Fewer steps and the same end from near; a solution of another solver is refused.
+
+    From far, contact converges as well, for some plans to another equilibrium (docs/contact.md).
+    """
     name = next(n for n, m in plans[0].items() if not np.allclose(m, np.eye(4)))
     near = {**plans[0], name: cmfsim.rigid_motion((0.3, -0.2, 0.1)) @ plans[0][name]}
     start = solver.solve(near)
     for plan, other in ((plans[0], start), (plans[1], start)):
         cold, warm = solver.solve(plan), solver.solve(plan, start=other)
         assert warm.contact_converged
-        assert np.abs(warm.displacements - cold.displacements).max() <= 1e-3
+        assert warm.contact_gap <= max(cold.contact_gap, 1e-3)
         if plan is plans[0]:
+            assert np.abs(warm.displacements - cold.displacements).max() <= 1e-3
             assert warm.contact_iterations < cold.contact_iterations
     bare = {n: replace(s, sliding=(), contact=None) for n, s in scene.segments.items()}
     bound = cmfsim.scene_solver(replace(scene, segments=bare))

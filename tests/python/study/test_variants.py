@@ -35,8 +35,8 @@ VARIANTS = """description = "what matters"
 description = "compressible fat"
 tissue = {young = 0.003, poisson = 0.1}
 [variants.named-default]
-node_kinds.contact_surface = "sheet"
-tissue.preset = "kim2010"
+node_kinds.contact_surface = "bone"
+lips.contact = false
 [variants.other-skin]
 surfaces.skin = "other.ply"
 """

@@ -21,7 +21,7 @@ from cmfsim.solving.simulation import solve_scene
 from cmfsim.study.frontier.choice import Choice
 from cmfsim.study.frontier.memory import peak_memory
 from cmfsim.study.frontier.skin_points import read_points, skin_points, write_points
-from cmfsim.values.skin_motion import carried_points
+from cmfsim.values.skin_motion import SkinEnd, carried_points
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["MOVED_FORMAT", "main"]
@@ -60,7 +60,13 @@ def _build(job: Mapping[str, Any]) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     for model in job["models"]:
         write_scene(folder / f"{model}.npz", model_scene(patient, model))
-    skin = {"nodes": patient.skin_nodes, "triangles": patient.skin.triangles}
+    end = patient.skin_end
+    skin = {
+        "nodes": patient.skin_nodes,
+        "triangles": patient.skin.triangles,
+        "end_vertices": end.vertices,
+        "end_edges": end.edges,
+    }
     write_archive(folder / "skin.npz", SKIN_FORMAT, "skin", {}, skin)
     if job["points"] is not None:
         write_points(Path(job["points"]), *skin_points(patient))
@@ -84,7 +90,8 @@ def _solve(job: Mapping[str, Any]) -> dict[str, Any]:
     nodes = member_of(arrays, "nodes")
     skin = SurfaceData(scene.nodes[nodes], member_of(arrays, "triangles"))
     points, _ = read_points(Path(job["points"]))
-    moved = carried_points(skin, result.displacements[nodes], points)
+    end = SkinEnd(member_of(arrays, "end_vertices"), member_of(arrays, "end_edges"))
+    moved = carried_points(skin, end.continued(result.displacements[nodes]), points)
     write_archive(Path(job["moved"]), MOVED_FORMAT, "moved", {}, {"displacements": moved})
     return answer
 
