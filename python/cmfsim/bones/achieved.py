@@ -51,8 +51,8 @@ _LOG = logging.getLogger(__name__)
 # accuracy of a segmented bone, and far above the rounding of a surface file.
 RIGID_TOLERANCE = 0.1
 # A piece within a bone moved otherwise if the rigid motion of the whole leaves it this far off the
-# bone after, mm rms: a jaw that moved by 1 mm is 0.5 mm off, and noise of 0.3 mm less.
-AS_ONE = 0.4
+# bone after, mm rms, and farther than neighbourhoods deviate from motions of their own.
+AS_ONE = 0.15
 Segments: TypeAlias = Mapping[str, SurfaceData | BoneSegment]
 
 
@@ -466,8 +466,9 @@ def _moved_apart(coherent: CoherentMotion, shape: PairedShape) -> bool:
     off = shape.fit.off.copy()
     for patch in shape.removed:
         off[patch.vertices] = 0.0
+    most = max(AS_ONE, coherent.spread)
     pieces = coherent.pieces if len(coherent.pieces) > 1 else ()
-    return any(float(np.sqrt((off[p.vertices] ** 2).mean())) > AS_ONE for p in pieces)
+    return any(float(np.sqrt((off[p.vertices] ** 2).mean())) > most for p in pieces)
 
 
 def _surfaces(segments: Segments) -> dict[str, SurfaceData]:

@@ -40,11 +40,16 @@ DEVIATES = 0.5
 MOST_DEVIATION = 3.0
 # Where bone bends, or vertices slid, this many times the median deviation.
 UNUSUAL = 2.0
+# That median counts at most this many times that of so many small neighbourhoods, each about its
+# own rigid motion: pieces that moved apart deviate from one motion all over.
+BENDS, NEIGHBOURHOODS = 4.0, 16
 # It is a piece if its own rigid motion leaves this share of that, on this share of its area.
 EXPLAINED, EXPLAINED_AREA = 0.5, 0.6
 # A smaller part, mm², is not a piece of its own.
 LEAST_PIECE = 300.0
 MOST_PIECES = 12
+# Of a part that no single motion explains, so many places are tried, with what lies this near, mm.
+PARTS, PART = 4, 25.0
 # Rounds in which vertices choose a piece, and pieces are fitted to their vertices.
 ROUNDS = 8
 # They are the same when this share of the area changes its piece.
@@ -70,6 +75,8 @@ MOST_FITTED, STEPS, LAST_STEP = 8000, 30, 1e-4
 # went, mm, and lies deeper than the second inside the bone before; the patch reaches as far as its
 # vertices are off by the third: three times the noise of a segmented bone.
 REMOVED, REMOVED_DEPTH, REMOVED_RIM = 1.5, 0.75, 0.75
+# The motion of a piece is known if the median deviation along its normals is below this, mm.
+KNOWN = 0.35
 # Such a patch ends abruptly: this far around it, the median deviation of vertices is at most this
 # share of the largest in the patch. A bone that bends deviates all around.
 RING, RING_SHARE = 6.0, 0.35
@@ -125,6 +132,8 @@ class CoherentMotion:
         How far vertices slid along the bone: the rms of what was taken off.
     noise : float, mm
         The rms of the noise that was averaged out; 0 where it is too small to matter.
+    spread : float, mm
+        The usual rms deviation of a small neighbourhood from its own rigid motion.
     """
 
     motion: MovedSurface
@@ -132,6 +141,7 @@ class CoherentMotion:
     removed: tuple[RemovedBone, ...]
     slip: float
     noise: float
+    spread: float
 
 
 def coherent_motion(motion: MovedSurface) -> CoherentMotion:
@@ -159,7 +169,8 @@ def coherent_motion(motion: MovedSurface) -> CoherentMotion:
     piece that explains their surroundings best, and the pieces are fitted again.
     """
     paired = _Paired(motion)
-    matrices, piece = _pieces(paired)
+    nearby = _usual_nearby(paired)
+    matrices, piece = _pieces(paired, nearby)
     deviation = _Deviation(paired, matrices, piece)
     removed = _removed(paired, matrices, piece, deviation)
     rest, noise = paired.denoised(deviation.rest, removed, deviation.inner)
@@ -169,7 +180,12 @@ def coherent_motion(motion: MovedSurface) -> CoherentMotion:
         mine = np.flatnonzero(piece == number)
         found.append(RigidPiece(matrix, float(paired.areas[mine].sum()), mine))
     return CoherentMotion(
-        MovedSurface(motion.surface, deviation.rigid + rest), tuple(found), removed, slip, noise
+        MovedSurface(motion.surface, deviation.rigid + rest),
+        tuple(found),
+        removed,
+        slip,
+        noise,
+        float(np.sqrt(nearby)),
     )
 
 
@@ -299,30 +315,25 @@ def _step(points: Floats, normals: Floats, off: Floats, weight: Floats) -> Float
     return rigid_motion(found[3:])
 
 
-def _pieces(paired: _Paired) -> tuple[list[Floats], Integers]:
+def _pieces(paired: _Paired, nearby: float) -> tuple[list[Floats], Integers]:
     """The rigid motions of the pieces and the piece of each vertex."""
     pieces = [paired.fitted(np.ones(len(paired.here), dtype=bool))]
     costs = [paired.cost(pieces[0])]
     tried = np.zeros(len(paired.here), dtype=bool)
     while len(pieces) < MOST_PIECES:
         best = np.min(costs, axis=0)
-        usual = _median(best, paired.areas)
+        usual = min(_median(best, paired.areas), BENDS * nearby)
         off = (best > max(DEVIATES**2, UNUSUAL**2 * usual)) & ~tried
         patch = _largest(paired, off)
         area = float(paired.areas[patch].sum())
         if area < LEAST_PIECE:
             break
-        own = paired.fitted(patch)
-        left = paired.cost(own)
-        sound = patch & (left <= EXPLAINED**2 * best)
-        explained = paired.areas[sound].sum() >= max(EXPLAINED_AREA * area, LEAST_PIECE)
-        if explained and _may_be_ground(paired, pieces[0], patch):
-            mean = float(np.average(left[patch], weights=paired.areas[patch]))
-            explained = mean <= max(AS_ONE**2, usual)
-        if not explained:
+        own, left, explained = _explaining(paired, patch, best)
+        if explained < LEAST_PIECE or _is_ground(paired, pieces[0], patch, left, usual):
             tried |= patch
             continue
         pieces, costs = _shared_out(paired, [*pieces, own], [*costs, left])
+        tried[:] = False
     piece = np.argmin(costs, axis=0)
     areas = np.bincount(piece, paired.areas, minlength=len(pieces))
     order = np.argsort(-areas, kind="stable")
@@ -339,6 +350,57 @@ def _largest(paired: _Paired, chosen: Mask) -> Mask:
     sums = np.bincount(label[chosen], paired.areas[chosen])
     patch: Mask = chosen & (label == int(np.argmax(sums)))
     return patch
+
+
+def _usual_nearby(paired: _Paired) -> float:
+    """The usual mean square deviation from rigid motions of small neighbourhoods, mm²."""
+    centre, away, found = 0, np.full(len(paired.here), np.inf), []
+    for _ in range(NEIGHBOURHOODS):
+        off = np.linalg.norm(paired.here - paired.here[centre], axis=1)
+        part = off < PART
+        away = np.minimum(away, off)
+        centre = int(np.argmax(away))
+        if paired.areas[part].sum() < LEAST_PIECE:
+            continue
+        own = paired.fitted(part)
+        rest = paired.there[part] - _carried(own, paired.here[part])
+        square = _square(rest, paired.normals[part] @ own[:3, :3].T)
+        found.append(float(np.average(square, weights=paired.areas[part])))
+    return float(np.median(found)) if found else np.inf
+
+
+def _explaining(paired: _Paired, patch: Mask, best: Floats) -> tuple[Floats, Floats, float]:
+    """The rigid motion that explains most of a patch, its costs, and the area explained, mm².
+
+    That of the whole patch is tried, and those of its parts: several pieces may touch.
+    """
+    parts = [patch]
+    where = np.flatnonzero(patch)
+    centre = int(where[np.argmax(best[where])])
+    away = np.full(len(where), np.inf)
+    for _ in range(PARTS):
+        off = np.linalg.norm(paired.here[where] - paired.here[centre], axis=1)
+        part = np.zeros(len(patch), dtype=bool)
+        part[where[off < PART]] = True
+        if paired.areas[part].sum() >= LEAST_PIECE:
+            parts.append(part)
+        away = np.minimum(away, off)
+        centre = int(where[np.argmax(away)])
+    found: list[tuple[Floats, Floats, float]] = []
+    for part in parts:
+        own = paired.fitted(part)
+        left = paired.cost(own)
+        sound = patch & (left <= EXPLAINED**2 * best)
+        area = float(paired.areas[sound & part].sum())
+        if area >= EXPLAINED_AREA * paired.areas[part].sum():
+            found.append((own, left, float(paired.areas[sound].sum())))
+    return max(found, key=lambda one: one[2], default=(np.eye(4), best, 0.0))
+
+
+def _is_ground(paired: _Paired, matrix: Floats, patch: Mask, left: Floats, usual: float) -> bool:
+    """Whether a small patch that went inwards did not move as one, but was ground off."""
+    mean = float(np.average(left[patch], weights=paired.areas[patch]))
+    return mean > max(AS_ONE**2, usual) and _may_be_ground(paired, matrix, patch)
 
 
 def _may_be_ground(paired: _Paired, matrix: Floats, patch: Mask) -> bool:
@@ -429,6 +491,11 @@ def _removed(
     inside = surface.winding_number(seen) > 0.5
     closest = surface.closest(seen[inside])[0]
     depth[far[inside]] = np.linalg.norm(closest - seen[inside], axis=1)
+    # Only bone whose motion is known shows what is missing from it.
+    out_of_place = np.abs((deviation.rest * deviation.normals).sum(axis=1))
+    for number in range(len(pieces)):
+        if _median(out_of_place[piece == number], paired.areas[piece == number]) > KNOWN:
+            loose[piece == number] = False
     seed = loose & (off > REMOVED) & (depth > REMOVED_DEPTH)
     if not seed.any():
         return ()
