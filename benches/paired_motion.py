@@ -113,7 +113,9 @@ def lighter(surface: cmfsim.SurfaceData, triangles: int = TRIANGLES) -> cmfsim.S
     """The surface with fewer triangles, as a template has."""
     import pyvista as pv  # noqa: PLC0415
 
-    mesh = pv.PolyData.from_regular_faces(surface.vertices, surface.triangles)
+    mesh = pv.PolyData.from_regular_faces(
+        surface.vertices, np.asarray(surface.triangles, dtype=int)
+    )
     few = mesh.decimate(max(1.0 - triangles / len(surface.triangles), 0.0))
     return cmfsim.SurfaceData(np.asarray(few.points, dtype=np.float64), few.regular_faces)
 
@@ -226,7 +228,7 @@ def found_motion(pair: Pair) -> tuple[NDArray[np.int64], Floats, tuple[Any, ...]
     after = cmfsim.SurfaceData(motion.moved_vertices, motion.surface.triangles)
     found = measure_pair(motion.surface, after)
     x = np.asarray(motion.surface.vertices)
-    used = cKDTree(pair.before.vertices).query(x)[1]
+    used = np.asarray(cKDTree(pair.before.vertices).query(x)[1], dtype=np.int64)
     if found.method == "vertices" and found.moved is not None:
         return used, np.asarray(found.moved.moved_vertices), found.removed
     return used, x @ found.matrix[:3, :3].T + found.matrix[:3, 3], found.removed

@@ -11,7 +11,7 @@ __all__ = ["tear_finding"]
 # Skin fails in tension at a stretch of about 1.5 (Ní Annaidh et al. 2012: 54 % ± 17 % at failure).
 MOST_STRETCH = 1.5
 # Edges that lengthen by less, mm, and triangles of less area, mm², are too small to be seen.
-VISIBLE_LENGTH = 1.0
+VISIBLE_LENGTH = 1.5
 VISIBLE_AREA = 0.5
 
 
@@ -33,7 +33,7 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
     Notes
     -----
     An edge counts as torn if it is stretched by more than half, and becomes longer by at least
-    1 mm; a triangle as turned over if its normal turns by more than a right angle, and if it has
+    1.5 mm; a triangle as turned over if its normal turns by more than a right angle, and if it has
     at least 0.5 mm² before the operation.
 
     Examples

@@ -7,9 +7,9 @@ import cmfsim
 from cmfsim.solving.skin_tears import tear_finding
 from shared_values import coarse_demo_patient
 
-# Two triangles with a common edge, 2 mm wide.
+# Two triangles with a common edge, 4 mm wide.
 SQUARE = cmfsim.SurfaceData(
-    [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], np.array([[0, 1, 2], [0, 2, 3]])
+    [[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]], np.array([[0, 1, 2], [0, 2, 3]])
 )
 
 
@@ -23,10 +23,10 @@ def test_edges_stretched_by_more_than_half_are_counted():
     found = stretched(1.6)
     # Both edges along x; the diagonal becomes 1.33 times as long.
     assert "2 edges" in found.what
-    assert "from 2.0 to 3.2 mm" in found.what
+    assert "from 4.0 to 6.4 mm" in found.what
     assert found.code == "skin-torn"
     assert found.severity == "warning"
-    assert found.where == "about (1, 0, 0) mm"
+    assert found.where == "about (2, 0, 0) mm"
 
 
 def test_what_is_too_small_to_be_seen_is_not_counted():

@@ -64,7 +64,7 @@ def _vertex_findings(
             "followed as they are",
             fix="nothing to do; check the picture of the plan",
         )
-    elif not (is_still or found.is_rigid):
+    if not (is_still or found.is_rigid):
         yield _bent_finding(name, where, found.fit)
     if found.slip > SLID:
         why = "bending explains less motion along the surface than the vertices show"

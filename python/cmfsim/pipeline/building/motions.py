@@ -160,8 +160,8 @@ def _with_motions(
                 found = _measured(its_own, is_still=piece.name in REFERENCES)
             parted.append(piece)
             measured[piece.name] = found
-            by_vertex = found.method == "vertices" and found.moved is not None
-            planned[piece.name] = found.moved if by_vertex else found.plan
+            by_vertex = found.moved if found.method == "vertices" else None
+            planned[piece.name] = found.plan if by_vertex is None else by_vertex
     return PlannedBones(tuple(parted), planned, tuple(findings))
 
 

@@ -12,6 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Case, read_scene, replacing, write_scene
 from cmfsim.io.archives import member_of, read_archive, write_archive
@@ -61,7 +63,7 @@ def _build(job: Mapping[str, Any]) -> dict[str, Any]:
     for model in job["models"]:
         write_scene(folder / f"{model}.npz", model_scene(patient, model))
     end = patient.skin_end
-    skin = {
+    skin: dict[str, NDArray[Any]] = {
         "nodes": patient.skin_nodes,
         "triangles": patient.skin.triangles,
         "end_vertices": end.vertices,
