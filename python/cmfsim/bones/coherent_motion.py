@@ -332,7 +332,12 @@ def _pieces(paired: _Paired, nearby: float) -> tuple[list[Floats], Integers]:
         if explained < LEAST_PIECE or _is_ground(paired, pieces[0], patch, left, usual):
             tried |= patch
             continue
-        pieces, costs = _shared_out(paired, [*pieces, own], [*costs, left])
+        more, its_costs = _shared_out(paired, [*pieces, own], [*costs, left])
+        if len(more) <= len(pieces):
+            # Other pieces explain its vertices: it would be found again without end.
+            tried |= patch
+            continue
+        pieces, costs = more, its_costs
         tried[:] = False
     piece = np.argmin(costs, axis=0)
     areas = np.bincount(piece, paired.areas, minlength=len(pieces))
