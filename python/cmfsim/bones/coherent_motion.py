@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, rigid_fit
-from cmfsim.bones.motion import RemovedBone
+from cmfsim.bones.motion import RemovedBone, triangle_areas
 from cmfsim.bones.shape_fit import LEAST_SIGMA, TO_SIGMA, TUKEY, vertex_areas
 from cmfsim.errors import BoundaryInputError, third_party
 from cmfsim.surfaces.topology import connected_labels, edges_of
@@ -198,7 +198,8 @@ class _Paired:
         self.triangles = motion.surface.triangles.astype(np.int64)
         self.ends = edges_of(self.triangles).ends
         self.areas = np.maximum(vertex_areas(motion.surface), 1e-9)
-        self.normals = Surface(motion.surface.vertices, motion.surface.triangles).vertex_normals
+        self.surface = Surface(motion.surface.vertices, motion.surface.triangles)
+        self.normals = self.surface.vertex_normals
 
     @cached_property
     def _walk(self) -> tuple[Any, float]:
@@ -488,13 +489,12 @@ def _removed(
     loose = off > REMOVED_RIM
     depth = np.zeros(len(here))
     far = np.flatnonzero(loose)
-    surface = Surface(paired.motion.surface.vertices, paired.motion.surface.triangles)
     # In the frame before: the present place of a vertex relative to its piece.
     turns = np.array([matrix[:3, :3] for matrix in pieces])[piece[far]]
     shifts = np.array([matrix[:3, 3] for matrix in pieces])[piece[far]]
     seen = np.einsum("nji,nj->ni", turns, paired.there[far] - shifts)
-    inside = surface.winding_number(seen) > 0.5
-    closest = surface.closest(seen[inside])[0]
+    inside = paired.surface.winding_number(seen) > 0.5
+    closest = paired.surface.closest(seen[inside])[0]
     depth[far[inside]] = np.linalg.norm(closest - seen[inside], axis=1)
     # Only bone whose motion is known shows what is missing from it.
     out_of_place = np.abs((deviation.rest * deviation.normals).sum(axis=1))
@@ -505,8 +505,7 @@ def _removed(
     if not seed.any():
         return ()
     label = connected_labels(paired.ends[loose[paired.ends].all(axis=1)], len(here))
-    a, b, c = (here[triangles[:, i]] for i in range(3))
-    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    areas = triangle_areas(here, triangles)
     found = []
     for number in np.unique(label[seed]):
         patch = (label == number) & loose

@@ -25,6 +25,7 @@ __all__ = [
     "moves_as_one",
     "sound_motion",
     "torn_pieces",
+    "triangle_areas",
 ]
 
 # An edge is torn if its ends move apart by more than this, mm, and by more than this share of its
@@ -124,7 +125,7 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
     if not len(sound):
         return (motion,)
     piece = label[sound[:, 0]]
-    areas = np.bincount(piece, weights=_areas(here, sound), minlength=label.max() + 1)
+    areas = np.bincount(piece, weights=triangle_areas(here, sound), minlength=label.max() + 1)
     order = np.argsort(-areas, kind="stable")
     large = [int(n) for n in order if areas[n] >= LEAST_AREA] or [int(order[0])]
     parts = [_part(motion, sound[piece == number]) for number in large]
@@ -181,7 +182,7 @@ def missing_patches(
         return ()
     ends = edges_of(triangles).ends
     label = connected_labels(ends[gone[ends].all(axis=1)], len(here))
-    areas = _areas(here, triangles)
+    areas = triangle_areas(here, triangles)
     found = []
     for number in np.unique(label[gone & (off > REMOVED)]):
         patch = (label == number) & gone
@@ -227,7 +228,8 @@ def _rigid(here: Floats, there: Floats) -> Floats | None:
         return None
 
 
-def _areas(vertices: Floats, triangles: Integers) -> Floats:
+def triangle_areas(vertices: Floats, triangles: Integers) -> Floats:
+    """The area of each triangle, (t,) mm²."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     areas: Floats = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return areas
