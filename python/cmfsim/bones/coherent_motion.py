@@ -8,6 +8,7 @@ far as bending explains it, and only a patch that sank into its own piece, and d
 counts as removed.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -358,14 +359,20 @@ def _largest(paired: _Paired, chosen: Mask) -> Mask:
     return patch
 
 
-def _usual_nearby(paired: _Paired) -> float:
-    """The usual mean square deviation from rigid motions of small neighbourhoods, mm²."""
-    centre, away, found = 0, np.full(len(paired.here), np.inf), []
-    for _ in range(NEIGHBOURHOODS):
-        off = np.linalg.norm(paired.here - paired.here[centre], axis=1)
-        part = off < PART
+def _neighbourhoods(points: Floats, first: int, count: int) -> Iterator[Mask]:
+    """Which points lie near each of some that are far from one another, beginning with one."""
+    centre, away = first, np.full(len(points), np.inf)
+    for _ in range(count):
+        off = np.linalg.norm(points - points[centre], axis=1)
+        yield off < PART
         away = np.minimum(away, off)
         centre = int(np.argmax(away))
+
+
+def _usual_nearby(paired: _Paired) -> float:
+    """The usual mean square deviation from rigid motions of small neighbourhoods, mm²."""
+    found = []
+    for part in _neighbourhoods(paired.here, 0, NEIGHBOURHOODS):
         if paired.areas[part].sum() < LEAST_PIECE:
             continue
         own = paired.fitted(part)
@@ -382,16 +389,11 @@ def _explaining(paired: _Paired, patch: Mask, best: Floats) -> tuple[Floats, Flo
     """
     parts = [patch]
     where = np.flatnonzero(patch)
-    centre = int(where[np.argmax(best[where])])
-    away = np.full(len(where), np.inf)
-    for _ in range(PARTS):
-        off = np.linalg.norm(paired.here[where] - paired.here[centre], axis=1)
+    for near in _neighbourhoods(paired.here[where], int(np.argmax(best[where])), PARTS):
         part = np.zeros(len(patch), dtype=bool)
-        part[where[off < PART]] = True
+        part[where[near]] = True
         if paired.areas[part].sum() >= LEAST_PIECE:
             parts.append(part)
-        away = np.minimum(away, off)
-        centre = int(where[np.argmax(away)])
     found: list[tuple[Floats, Floats, float]] = []
     for part in parts:
         own = paired.fitted(part)
@@ -497,7 +499,7 @@ def _removed(
     closest = paired.surface.closest(seen[inside])[0]
     depth[far[inside]] = np.linalg.norm(closest - seen[inside], axis=1)
     # Only bone whose motion is known shows what is missing from it.
-    out_of_place = np.abs((deviation.rest * deviation.normals).sum(axis=1))
+    out_of_place = np.linalg.norm(out, axis=1)
     for number in range(len(pieces)):
         if _median(out_of_place[piece == number], paired.areas[piece == number]) > KNOWN:
             loose[piece == number] = False
