@@ -1,4 +1,4 @@
-"""Meshes of any format: by our own readers, and by meshio in a process of its own."""
+"""Meshes of any format: by our own readers, and by VTK and meshio in a process of its own."""
 
 import contextlib
 import io as stdio
@@ -57,7 +57,6 @@ READERS: Mapping[str, Callable[[bytes], PlainMesh]] = MappingProxyType(
         ".obj": lambda data: _of_triangles(*read_obj(data), stated_frame(data, ".obj")),
         ".vtp": lambda data: read_vtk_xml(data, "PolyData"),
         ".vtu": lambda data: read_vtk_xml(data, "UnstructuredGrid"),
-        ".vtk": read_vtk_legacy,
         ".msh": read_msh,
     }
 )
@@ -83,6 +82,8 @@ def read_mesh(path: Path) -> PlainMesh:
     check_readable(path)
     suffix = path.suffix.lower()
     with named(path):
+        if suffix == ".vtk":
+            return read_vtk_legacy(path)
         if suffix not in READERS:
             return _by_meshio(path)
         try:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats
 
-__all__ = ["checked_indices", "triangles_of"]
+__all__ = ["checked_indices", "triangles_of", "triangles_of_strips"]
 
 Integers = NDArray[np.int64]
 # A corner may turn inwards by this share of a polygon's area and count as rounding.
@@ -95,6 +95,42 @@ def triangles_of(
     step = np.arange(len(owner)) - np.repeat(np.cumsum(n_fan) - n_fan, n_fan) + 1
     at = starts[owner]
     return np.stack([corners[at], corners[at + step], corners[at + step + 1]], axis=1)
+
+
+def triangles_of_strips(points: Floats, counts: Integers, corners: Integers) -> Integers:
+    """The triangles (t, 3) of strips, each of which shares an edge with the one before.
+
+    Every other triangle of a strip runs the other way round, so that all face the same way. One
+    that names a corner twice joins two parts of a strip and is none.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+    counts : (s,) int64
+        Number of corners of each strip.
+    corners : (sum of counts,) int64
+        From 0 on.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A strip of fewer than three corners, an index that is not there.
+    """
+    few = np.flatnonzero(counts < 3)
+    if len(few):
+        raise CaseInputError(
+            f"strip {few[0]} has {counts[few[0]]} corners: three or more are needed"
+        )
+    begins = np.cumsum(counts) - counts
+    within = np.arange(int(counts.sum())) - np.repeat(begins, counts)
+    # A triangle begins at each corner of a strip but its last two.
+    at = np.flatnonzero(within < np.repeat(counts, counts) - 2)
+    odd = within[at] % 2
+    triangles = np.stack([corners[at + odd], corners[at + 1 - odd], corners[at + 2]], axis=1)
+    checked_indices(triangles, len(points), of="triangle")
+    a, b, c = triangles.T
+    whole: Integers = triangles[(a != b) & (b != c) & (c != a)]
+    return whole
 
 
 def _turned(points: Floats, polygons: Integers, faces: Integers) -> Integers:

@@ -1,255 +1,232 @@
-"""VTK's files before XML (`.vtk`), in words or bytes: surfaces and volumes, read only."""
+"""VTK's files before XML (`.vtk`): read by VTK in the child process, checked here.
+
+VTK's reader forgives: it stops at damage, and passes on what it has. So its complaints are errors
+here, and the counts that the file states are compared with what was read.
+"""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, third_party
+from cmfsim.io.child import Answer, ReaderError, ReadLimits, read_in_child
 from cmfsim.io.plain_mesh import Cells, PlainMesh
-from cmfsim.io.polygons import triangles_of
+from cmfsim.io.polygons import triangles_of, triangles_of_strips
 from cmfsim.io.stated_frames import stated_frame
-from cmfsim.io.text_cursor import Cursor
 from cmfsim.io.vtk_cells import cells_by_type
 
-__all__ = ["read_vtk_legacy"]
+__all__ = ["LIBRARIES", "legacy_answer", "read_vtk_legacy"]
 
-Integers = NDArray[np.int64]
-HEADER = re.compile(r"# vtk DataFile Version [0-9]+\.[0-9]+")
-DATASETS = ("POLYDATA", "UNSTRUCTURED_GRID")
-TYPES = {
-    "unsigned_char": "u1",
-    "char": "i1",
-    "unsigned_short": "u2",
-    "short": "i2",
-    "unsigned_int": "u4",
-    "int": "i4",
-    "vtkidtype": "i4",
-    "unsigned_long": "u8",
-    "long": "i8",
-    "vtktypeint64": "i8",
-    "vtktypeuint64": "u8",
-    "vtktypeint32": "i4",
-    "vtktypeuint32": "u4",
-    "float": "f4",
-    "double": "f8",
+# What the child process imports before the time of a file begins.
+LIBRARIES = ("vtkmodules.vtkIOLegacy", "vtkmodules.util.numpy_support")
+# Words by which VTK's writers begin a file; its third line states how numbers are written.
+HEADER = re.compile(
+    rb"# vtk DataFile Version [0-9]+\.[0-9]+[^\n]*\n[^\n]{0,4096}\n"
+    rb"[ \t]*(?P<form>ASCII|BINARY)[ \t\r]*\n\s*DATASET[ \t]+(?P<kind>[A-Za-z_]+)",
+    re.IGNORECASE,
+)
+READERS: Mapping[str, str] = {
+    "POLYDATA": "vtkPolyDataReader",
+    "UNSTRUCTURED_GRID": "vtkUnstructuredGridReader",
 }
-# Groups of cells of a surface; the first three lie on no face.
-GROUPS = ("VERTICES", "LINES", "TRIANGLE_STRIPS", "POLYGONS")
-# Arrays of a fixed number of components.
-WIDTHS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1}
+# Lines that state how many points and cells there are, and how many numbers those take.
+STATED = re.compile(
+    rb"^[ \t]*(?P<name>POINTS|VERTICES|LINES|POLYGONS|TRIANGLE_STRIPS|CELLS|CELL_TYPES)[ \t]+"
+    rb"(?P<first>[0-9]{1,18})(?:[ \t]+(?P<second>[0-9A-Za-z_]{1,18}))?[ \t\r]*$",
+    re.MULTILINE | re.IGNORECASE,
+)
+# Groups of cells of a surface, by VTK's names.
+GROUPS: Mapping[str, str] = {"POLYGONS": "Polys", "TRIANGLE_STRIPS": "Strips"}
+# From this version on, cells are offsets and corners; before, each row began with its count.
+OFFSETS = re.compile(rb"^[ \t]*OFFSETS[ \t]", re.MULTILINE | re.IGNORECASE)
+# The line before the numbers of an array of a FIELD: name, components, rows, type.
+ARRAY = re.compile(
+    rb"[ \t]*\S+[ \t]+(?P<width>[0-9]{1,9})[ \t]+(?P<rows>[0-9]{1,18})[ \t]+[A-Za-z]\w*\s*"
+)
+LETTERS = re.compile(rb"[A-Za-z]")
+# Processor time, s, and memory, bytes, that a small file may take.
+SECONDS, MEMORY = 4.0, 2**30
 
 
-def read_vtk_legacy(data: bytes) -> PlainMesh:
-    """The mesh of a file; polygons of a surface become triangles.
+def read_vtk_legacy(path: Path) -> PlainMesh:
+    """The mesh of a file; polygons and strips of a surface become triangles.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Not such a file, another kind of data, a keyword that is not known,
-        fewer or more numbers than stated, an index that is not there.
+        (also `ValueError`) Not such a file, another kind of data, whatever VTK complains of, other
+        counts than stated, an index that is not there; VTK is not installed.
     """
-    return _Reader(data).mesh()
+    third_party(LIBRARIES[0].partition(".")[0], "files of .vtk are read", "mesh")
+    data = path.read_bytes()
+    header = HEADER.match(data)
+    if header is None:
+        raise CaseInputError(
+            "is not a VTK file: '# vtk DataFile Version', a title, ASCII or BINARY and DATASET are "
+            "its first lines"
+        )
+    kind = header["kind"].decode().upper()
+    if kind not in READERS:
+        raise CaseInputError(
+            f"holds {kind!r}: a surface (DATASET {' or '.join(READERS)}) is needed"
+        )
+    limits = ReadLimits(SECONDS + len(data) / 2e6, MEMORY + 64 * len(data))
+    try:
+        answer = read_in_child(
+            "cmfsim.io.vtk_legacy:legacy_answer",
+            limits,
+            path=str(path.absolute()),
+            reader=READERS[kind],
+        )
+    except ReaderError as error:
+        raise CaseInputError(
+            f"is cut short or damaged ({error}): export it again, as STL or PLY if you can"
+        ) from error
+    _check_stated(data, answer.arrays, header.end())
+    if header["form"].upper() == b"ASCII":
+        _check_last_array(data)
+    points = answer.arrays["points"]
+    point_data = _named(answer, "point_data")
+    if kind == "POLYDATA":
+        cells = _triangles(points, answer.arrays)
+        return PlainMesh(points, cells, point_data, frame=stated_frame(data, ".vtk"))
+    counts = np.diff(answer.arrays["CELLS.ends"])
+    blocks, rows = cells_by_type(answer.arrays["types"], counts, answer.arrays["CELLS.corners"])
+    cell_data = {
+        name: tuple(values[mine] for mine in rows)
+        for name, values in _named(answer, "cell_data").items()
+    }
+    return PlainMesh(points, blocks, point_data, cell_data)
 
 
-class _Reader:
-    """A file, keyword by keyword."""
+def legacy_answer(path: str, reader: str) -> Answer:
+    """What VTK reads from a file; called in the child process."""
+    vtk: Any = import_module("vtkmodules.vtkIOLegacy")
+    core: Any = import_module("vtkmodules.vtkCommonCore")
+    complaints = core.vtkStringOutputWindow()
+    core.vtkOutputWindow.SetInstance(complaints)
+    source = getattr(vtk, reader)()
+    source.SetFileName(path)
+    for what in ("Scalars", "Vectors", "Normals", "Tensors", "TCoords", "Fields"):
+        getattr(source, f"ReadAll{what}On")()
+    source.Update()
+    said = str(complaints.GetOutput()).strip()
+    read = source.GetOutput()
+    if said or read is None:
+        raise CaseInputError(
+            f"is cut short or damaged (VTK reports: {_first_complaint(said)}): export it again, as "
+            "STL or PLY if you can"
+        )
+    points = read.GetPoints()
+    arrays = {"points": np.zeros((0, 3)) if points is None else _array(points.GetData())}
+    arrays["points"] = arrays["points"].astype(np.float64)
+    if reader == READERS["POLYDATA"]:
+        for name, of in GROUPS.items():
+            _add_cells(arrays, name, getattr(read, f"Get{of}")())
+    else:
+        _add_cells(arrays, "CELLS", read.GetCells())
+        arrays["types"] = np.array(
+            [read.GetCellType(i) for i in range(read.GetNumberOfCells())], dtype=np.int64
+        )
+    names = {}
+    for key, data in (("point_data", read.GetPointData()), ("cell_data", read.GetCellData())):
+        # Texts and bits are no arrays of numbers.
+        found = [data.GetArray(i) for i in range(data.GetNumberOfArrays())]
+        found = [a for a in found if a is not None and not a.IsA("vtkBitArray")]
+        names[key] = [str(array.GetName()) for array in found]
+        arrays |= {f"{key}.{i}": _array(array) for i, array in enumerate(found)}
+    return Answer(names, arrays)
 
-    def __init__(self, data: bytes) -> None:
-        self.file = Cursor(data)
-        self.points: NDArray[np.float64] | None = None
-        self.groups: dict[str, tuple[Integers, Integers]] = {}
-        self.types: Integers | None = None
-        self.data: dict[str, dict[str, NDArray[Any]]] = {"POINT_DATA": {}, "CELL_DATA": {}}
-        self.where, self.rows = "", 0
-        self.frame = stated_frame(data, ".vtk")
 
-    def mesh(self) -> PlainMesh:
-        """What the file holds."""
-        file = self.file
-        if not HEADER.fullmatch(file.raw_line().strip()):
-            raise CaseInputError("is not a VTK file: '# vtk DataFile Version' is its first line")
-        file.raw_line()
-        form = file.raw_line().strip().upper()
-        if form not in {"ASCII", "BINARY"}:
-            raise CaseInputError(f"is {form!r}: ASCII or BINARY is needed")
-        file.order = ">" if form == "BINARY" else ""
-        kind = self._words(file.line() or "", 2)
-        if kind[0] != "DATASET" or kind[1] not in DATASETS:
-            raise CaseInputError(f"holds {' '.join(kind)!r}: DATASET {' or '.join(DATASETS)}")
-        known: dict[str, Callable[[list[str]], None]] = {
-            "POINTS": self._points,
-            "CELLS": self._cells,
-            "CELL_TYPES": self._types,
-            "POINT_DATA": self._begin,
-            "CELL_DATA": self._begin,
-            "SCALARS": self._scalars,
-            "FIELD": self._field,
-            "TEXTURE_COORDINATES": self._texture,
-            "LOOKUP_TABLE": self._table,
-            "METADATA": self._metadata,
-            **dict.fromkeys(GROUPS, self._cells),
-            **dict.fromkeys(WIDTHS, self._array),
-        }
-        while (line := file.line()) is not None:
-            words = line.split()
-            if words[0].upper() not in known:
-                raise CaseInputError(f"{words[0][:40]!r} is not known in a VTK file")
-            known[words[0].upper()]([words[0].upper(), *words[1:]])
-        if self.points is None:
-            raise CaseInputError("has no POINTS: is it cut short?")
-        surface = kind[1] == "POLYDATA"
-        return self._surface(self.points) if surface else self._volume(self.points)
+def _first_complaint(said: str) -> str:
+    """The first error of VTK, without the place in its sources."""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    # "ERROR: In …cxx, line 199", and then "vtkPolyDataReader (0x…): …".
+    texts = [line for line in lines if not line.startswith(("ERROR: In", "Warning: In"))]
+    text = re.sub(r"^\w+ \(0x[0-9a-f]+\): ", "", texts[0]) if texts else "it holds nothing"
+    return text[:100]
 
-    def _surface(self, points: NDArray[np.float64]) -> PlainMesh:
-        if "TRIANGLE_STRIPS" in self.groups:
-            raise CaseInputError("has triangle strips: turn them into triangles before it is saved")
-        corners, counts = self.groups.get("POLYGONS", (np.zeros(0, np.int64),) * 2)
-        if not len(counts):
-            return PlainMesh(points, (), self.data["POINT_DATA"], frame=self.frame)
-        triangles = triangles_of(points, counts, corners)
-        cells = (Cells("triangle", triangles),)
-        return PlainMesh(points, cells, self.data["POINT_DATA"], frame=self.frame)
 
-    def _volume(self, points: NDArray[np.float64]) -> PlainMesh:
-        corners, counts = self.groups.get("CELLS", (np.zeros(0, np.int64),) * 2)
-        if self.types is None or len(self.types) != len(counts):
-            found = "none" if self.types is None else len(self.types)
-            raise CaseInputError(
-                f"has {len(counts)} cells, and types for {found}: is it cut short?"
+def _array(array: Any) -> NDArray[Any]:
+    convert = import_module("vtkmodules.util.numpy_support").vtk_to_numpy
+    return np.array(convert(array))
+
+
+def _add_cells(arrays: dict[str, NDArray[Any]], name: str, cells: Any) -> None:
+    """The corners of cells, and where those of each begin and end."""
+    if cells is None or not cells.GetNumberOfCells():
+        arrays[f"{name}.ends"] = np.zeros(1, dtype=np.int64)
+        arrays[f"{name}.corners"] = np.zeros(0, dtype=np.int64)
+        return
+    arrays[f"{name}.ends"] = _array(cells.GetOffsetsArray()).astype(np.int64)
+    arrays[f"{name}.corners"] = _array(cells.GetConnectivityArray()).astype(np.int64)
+
+
+def _check_stated(data: bytes, arrays: Mapping[str, NDArray[Any]], start: int) -> None:
+    """Refuses other counts than the file states: VTK stops at damage and gives what it has."""
+    by_offsets = OFFSETS.search(data, start) is not None
+    for line in STATED.finditer(data, start):
+        name, first = line["name"].decode().upper(), int(line["first"])
+        if name in {"POINTS", "CELL_TYPES"}:
+            found = len(arrays["points" if name == "POINTS" else "types"])
+            if found != first:
+                raise CaseInputError(
+                    f"is cut short or damaged: it states {first} {name}, {found} were read; export "
+                    "it again"
+                )
+        elif f"{name}.ends" in arrays and line["second"]:
+            ends = arrays[f"{name}.ends"]
+            n, size = len(ends) - 1, len(arrays[f"{name}.corners"])
+            # VTK reads the offsets of no cell as no offsets.
+            wanted = (
+                (max(first - 1, 0), int(line["second"]))
+                if by_offsets
+                else (first, int(line["second"]) - first)
             )
-        blocks, rows = cells_by_type(self.types, counts, corners)
-        cell_data = {
-            name: tuple(values[mine] for mine in rows)
-            for name, values in self.data["CELL_DATA"].items()
-        }
-        return PlainMesh(points, blocks, self.data["POINT_DATA"], cell_data)
+            if (n, size) != wanted or (np.diff(ends) < 0).any() or ends[-1] != size:
+                raise CaseInputError(
+                    f"is cut short or damaged: it states {wanted[0]} {name} with {wanted[1]} "
+                    f"corners, {n} with {size} were read; export it again"
+                )
 
-    def _points(self, words: list[str]) -> None:
-        _, count, kind = self._words(" ".join(words), 3)
-        if self.points is not None:
-            raise CaseInputError("has POINTS twice")
-        n = _count(count)
-        self.points = self._numbers(kind, 3 * n, "POINTS").astype(np.float64).reshape(n, 3)
 
-    def _cells(self, words: list[str]) -> None:
-        name, first, second = self._words(" ".join(words), 3)
-        if name in self.groups:
-            raise CaseInputError(f"has {name} twice")
-        n, size = _count(first), _count(second)
-        before = self.file.at
-        line = self.file.line() if n else ""
-        if line is not None and line.startswith("OFFSETS"):
-            ends = self._numbers(self._words(line, 2)[1], n, f"{name} OFFSETS")
-            line = self.file.line() or ""
-            if not line.startswith("CONNECTIVITY"):
-                raise CaseInputError(f"{name} has no CONNECTIVITY")
-            corners = self._numbers(self._words(line, 2)[1], size, f"{name} CONNECTIVITY")
-            if ends[0] != 0 or ends[-1] != size or (np.diff(ends) < 0).any():
-                raise CaseInputError(f"{name} OFFSETS do not rise from 0 to {size}")
-            self.groups[name] = (corners, np.diff(ends))
+def _check_last_array(data: bytes) -> None:
+    """Refuses words that end within an array: VTK fills up what is missing of one in a FIELD."""
+    count = 0
+    end = len(data)
+    while end > 0:
+        start = data.rfind(b"\n", 0, end - 1) + 1
+        line = data[start:end]
+        if stated := ARRAY.fullmatch(line):
+            wanted = int(stated["width"]) * int(stated["rows"])
+            if count != wanted:
+                raise CaseInputError(
+                    f"is cut short or damaged: its last array states {wanted} numbers, {count} "
+                    "are left; export it again"
+                )
             return
-        self.file.at = before
-        self.groups[name] = _rows(name, self.file.numbers("i4", size, name), n)
-
-    def _types(self, words: list[str]) -> None:
-        n = _count(self._words(" ".join(words), 2)[1])
-        self.types = self.file.numbers("i4", n, "CELL_TYPES")
-
-    def _begin(self, words: list[str]) -> None:
-        self.where, self.rows = words[0], _count(self._words(" ".join(words), 2)[1])
-        n_cells = sum(len(counts) for _, counts in self.groups.values())
-        needed = n_cells if self.where == "CELL_DATA" else len(self._known_points())
-        if self.rows != needed:
-            raise CaseInputError(f"{self.where} has {self.rows} rows: {needed} are needed")
-
-    def _scalars(self, words: list[str]) -> None:
-        width = _count(words[3]) if len(words) > 3 else 1
-        kind = self._words(" ".join(words[:3]), 3)[2]
-        before = self.file.at
-        # The name of a table of colours stands between in most files.
-        if not (self.file.line() or "").upper().startswith("LOOKUP_TABLE"):
-            self.file.at = before
-        self._keep(words[1], kind, width, self.rows)
-
-    def _array(self, words: list[str]) -> None:
-        name, label, kind = self._words(" ".join(words), 3)
-        self._keep(label, kind, WIDTHS[name], self.rows)
-
-    def _texture(self, words: list[str]) -> None:
-        _, label, width, kind = self._words(" ".join(words), 4)
-        self._keep(label, kind, _count(width), self.rows)
-
-    def _field(self, words: list[str]) -> None:
-        for _ in range(_count(self._words(" ".join(words), 3)[2])):
-            line = self.file.line()
-            while line is not None and line.upper().startswith("METADATA"):
-                self._metadata([])
-                line = self.file.line()
-            if line is None:
-                raise CaseInputError("is cut short or damaged: a FIELD lacks an array")
-            label, width, rows, kind = self._words(line, 4)
-            # A field before the points belongs to the file, not to its points or cells.
-            if self.where and _count(rows) != self.rows:
-                raise CaseInputError(f"field {label!r} has {rows} rows: {self.rows} are needed")
-            self._keep(label, kind, _count(width), _count(rows))
-
-    def _keep(self, label: str, kind: str, width: int, rows: int) -> None:
-        values = self._numbers(kind, rows * width, repr(label))
-        if not self.where:
+        # Numbers have letters too: 1e-5, nan.
+        if LETTERS.match(line.lstrip()) and line.lstrip()[:3].lower() not in {b"nan", b"inf"}:
             return
-        if label in self.data[self.where]:
-            raise CaseInputError(f"{self.where} has two arrays {label!r}")
-        self.data[self.where][label] = values if width == 1 else values.reshape(rows, width)
-
-    def _table(self, words: list[str]) -> None:
-        n = _count(self._words(" ".join(words), 3)[2])
-        self.file.numbers("u1" if self.file.order else "f4", 4 * n, "LOOKUP_TABLE")
-
-    def _metadata(self, words: list[str]) -> None:
-        del words
-        while self.file.at < len(self.file.data) and self.file.raw_line().strip():
-            pass
-
-    def _numbers(self, kind: str, count: int, what: str) -> NDArray[Any]:
-        if kind.lower() not in TYPES:
-            raise CaseInputError(f"{what} has type {kind[:40]!r}: {', '.join(TYPES)} are read")
-        return self.file.numbers(TYPES[kind.lower()], count, what)
-
-    def _known_points(self) -> NDArray[np.float64]:
-        if self.points is None:
-            raise CaseInputError("has POINT_DATA before POINTS")
-        return self.points
-
-    def _words(self, line: str, count: int) -> Sequence[str]:
-        words = line.split()
-        if len(words) != count:
-            raise CaseInputError(f"has the line {line[:60]!r}: {count} words are needed")
-        return words
+        count += len(line.split())
+        end = start
 
 
-def _count(word: str) -> int:
-    if not re.fullmatch(r"[0-9]{1,18}", word, re.ASCII):
-        raise CaseInputError(f"has {word[:40]!r} where a number from 0 on is needed")
-    return int(word)
+def _triangles(
+    points: NDArray[np.float64], arrays: Mapping[str, NDArray[Any]]
+) -> tuple[Cells, ...]:
+    found = []
+    for name, cut in (("POLYGONS", triangles_of), ("TRIANGLE_STRIPS", triangles_of_strips)):
+        counts = np.diff(arrays[f"{name}.ends"])
+        if len(counts):
+            found.append(cut(points, counts, arrays[f"{name}.corners"]))
+    return (Cells("triangle", np.concatenate(found)),) if found else ()
 
 
-def _rows(name: str, numbers: Integers, n: int) -> tuple[Integers, Integers]:
-    """Corners and counts of rows that each begin with their count."""
-    if n and len(numbers) % n == 0 and len(numbers):
-        table = numbers.reshape(n, -1)
-        if (table[:, 0] == table.shape[1] - 1).all():
-            return table[:, 1:].reshape(-1), table[:, 0].copy()
-    counts, at, values = list[int](), 0, numbers.tolist()
-    keep = np.ones(len(numbers), dtype=bool)
-    for row in range(n):
-        if at >= len(values) or not 0 <= values[at] < len(values) - at:
-            raise CaseInputError(f"{name} {row} does not fit into the {len(values)} numbers stated")
-        counts.append(values[at])
-        keep[at] = False
-        at += 1 + values[at]
-    if at != len(values):
-        raise CaseInputError(f"{name} states {len(values)} numbers, its {n} rows take {at}")
-    return numbers[keep], np.array(counts, dtype=np.int64)
+def _named(answer: Answer, key: str) -> dict[str, NDArray[Any]]:
+    return {name: answer.arrays[f"{key}.{i}"] for i, name in enumerate(answer.values[key])}

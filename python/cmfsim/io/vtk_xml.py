@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.plain_mesh import Cells, PlainMesh
-from cmfsim.io.polygons import triangles_of
+from cmfsim.io.polygons import triangles_of, triangles_of_strips
 from cmfsim.io.stated_frames import stated_in_field
 from cmfsim.io.strict_xml import strict_parser
 from cmfsim.io.text_numbers import real_numbers, shown, whole_numbers
@@ -89,7 +89,7 @@ def read_vtk_xml(data: bytes, kind: str) -> PlainMesh:
     ------
     CaseError
         (also `ValueError`) Not such a file; a document type or another encoding than UTF-8; an
-        array of another length than stated; triangle strips; an index that is not there.
+        array of another length than stated; an index that is not there.
     """
     root, file = _parsed(data)
     if root.name != "VTKFile" or root.attributes.get("type") != kind:
@@ -125,16 +125,18 @@ def _frame(body: _Element, file: "_Arrays") -> str | None:
 
 def _surface_piece(piece: _Element, file: "_Arrays") -> PlainMesh:
     piece.only("PointData", "CellData", "Points", "Verts", "Lines", "Strips", "Polys")
-    if piece.count("NumberOfStrips", 0):
-        raise CaseInputError("has triangle strips: turn them into triangles before it is saved")
     points, point_data = _points(piece, file)
-    n = piece.count("NumberOfPolys", 0)
-    if not n:
-        _check_empty(piece.all("Polys"), file)
+    found = []
+    for name, cut in (("Polys", triangles_of), ("Strips", triangles_of_strips)):
+        n = piece.count(f"NumberOf{name}", 0)
+        if not n:
+            _check_empty(piece.all(name), file)
+            continue
+        corners, counts = _connectivity(_one(piece, name), n, file)
+        found.append(cut(points, counts, corners))
+    if not found:
         return PlainMesh(points, (), point_data)
-    corners, counts = _connectivity(_one(piece, "Polys"), n, file)
-    triangles = triangles_of(points, counts, corners)
-    return PlainMesh(points, (Cells("triangle", triangles),), point_data)
+    return PlainMesh(points, (Cells("triangle", np.concatenate(found)),), point_data)
 
 
 def _volume_piece(piece: _Element, file: "_Arrays") -> PlainMesh:

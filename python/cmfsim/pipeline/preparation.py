@@ -81,8 +81,8 @@ def _needs(case: Case, *, report: bool, evaluation: bool) -> Iterator[_Need]:
         yield _Need("fast_simplification", "imaging", "coarsens surfaces of bone")
     for path in _surface_files(case):
         yield _Need("meshio", "mesh", "reads surfaces and meshes")
-        if path.lower().endswith(".vtp"):
-            yield _Need("pyvista", "mesh", "reads VTP")
+        if path.lower().endswith(".vtk"):
+            yield _Need("vtkmodules", "mesh", "reads legacy VTK")
     if report:
         yield _Need("jinja2", "report", "writes the report (or use --no-report)")
         yield _Need("pyvista", "mesh", "draws 3-D pictures", is_optional=True)

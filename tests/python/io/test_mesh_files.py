@@ -462,15 +462,103 @@ def test_other_volume_elements_are_refused_not_left_out(tmp_path):
             cmfsim.read_tet_mesh(path)
 
 
-def test_vtk_models_of_slicer_are_read(tmp_path):
-    """Legacy POLYDATA, in bytes and words, old and new, which meshio does not read."""
+def vtk_ball(**arrays):
     pyvista = pytest.importorskip("pyvista")
-    ball = pyvista.Sphere(theta_resolution=8, phi_resolution=8)
-    for binary in (True, False):
-        ball.save(tmp_path / "it.vtk", binary=binary)
-        surface = cmfsim.read_surface(tmp_path / "it.vtk")
-        assert np.allclose(surface.vertices, ball.points, atol=1e-6)
-        assert np.array_equal(surface.triangles, ball.faces.reshape(-1, 4)[:, 1:])
+    ball = pyvista.Sphere(radius=50.0, theta_resolution=8, phi_resolution=8)
+    for name, values in arrays.items():
+        ball.point_data[name] = values(ball.n_points)
+    return ball
+
+
+def vtk_saved(path, poly, version=42, *, binary=True):
+    vtk = pytest.importorskip("vtkmodules.vtkIOLegacy")
+    writer = vtk.vtkPolyDataWriter()
+    writer.SetFileName(str(path))
+    writer.SetInputData(poly)
+    writer.SetFileVersion(version)
+    writer.SetHeader("3D Slicer output. SPACE=RAS")
+    (writer.SetFileTypeToBinary if binary else writer.SetFileTypeToASCII)()
+    assert writer.Write()
+    return path
+
+
+@pytest.mark.parametrize("version", [42, 51])
+@pytest.mark.parametrize("binary", [True, False])
+def test_vtk_models_of_slicer_are_read(version, binary, tmp_path):
+    """Colours, texts and names with blanks beside triangles; lines that end as on Windows."""
+    ball = vtk_ball(
+        RGB=lambda n: np.arange(3 * n).reshape(n, 3).astype(np.uint8),
+        **{"a name": lambda n: np.linspace(-1.0, 1.0, n).astype(np.float32)},
+    )
+    ball.point_data.set_scalars(np.asarray(ball.point_data["RGB"]), "RGB")
+    ball.add_field_data(["a text", "of two"], "names")
+    path = vtk_saved(tmp_path / "it.vtk", ball, version, binary=binary)
+    content = path.read_bytes()
+    for form in (content,) if binary else (content, content.replace(b"\n", b"\r\n")):
+        path.write_bytes(form)
+        mesh = read_mesh(path)
+        assert mesh.frame == "RAS"
+        assert np.allclose(mesh.points, ball.points, atol=1e-4)
+        assert np.array_equal(mesh.cells[0].data, ball.faces.reshape(-1, 4)[:, 1:])
+
+
+def test_vtk_cells_whose_first_bytes_look_like_a_line_are_read(tmp_path):
+    """Cells of 4.2 follow their line at once, and may hold a line feed or none for long."""
+    for n in (10, 200, 2000):
+        lone = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], *[[2.0, 2, 2]] * n])
+        poly = pytest.importorskip("pyvista").PolyData(lone, np.array([3, 0, 1, n + 2] * n))
+        surface = cmfsim.read_surface(vtk_saved(tmp_path / "it.vtk", poly))
+        assert len(surface.triangles) == n
+
+
+def test_triangle_strips_become_triangles_that_face_one_way(tmp_path):
+    vtk = pytest.importorskip("vtkmodules.vtkFiltersCore")
+    xml = pytest.importorskip("vtkmodules.vtkIOXML")
+    ball = vtk_ball()
+    stripper = vtk.vtkStripper()
+    stripper.SetInputData(ball)
+    stripper.Update()
+    strips = stripper.GetOutput()
+    assert strips.GetNumberOfStrips()
+    writer = xml.vtkXMLPolyDataWriter()
+    writer.SetInputData(strips)
+    writer.SetFileName(str(tmp_path / "it.vtp"))
+    writer.Write()
+    for path in (
+        tmp_path / "it.vtp",
+        vtk_saved(tmp_path / "old.vtk", strips),
+        vtk_saved(tmp_path / "new.vtk", strips, 51, binary=False),
+    ):
+        report = cmfsim.check_surface(cmfsim.read_surface(path))
+        assert report.is_closed
+        assert report.inconsistent == 0
+        assert report.volume == pytest.approx(ball.volume, rel=1e-4)
+
+
+STRIP = "# vtk DataFile Version 3.0\nx\nASCII\nDATASET POLYDATA\nPOINTS 5 float\n"
+STRIP += "0 0 0 1 0 0 0 1 0 1 1 0 2 1 0\n"
+
+
+def test_a_corner_twice_in_a_strip_joins_its_parts(tmp_path):
+    text = STRIP + "TRIANGLE_STRIPS 1 7\n6 0 1 2 3 3 4\n"
+    surface = cmfsim.read_surface(saved(tmp_path, "it.vtk", text))
+    assert surface.triangles.tolist() == [[0, 1, 2], [2, 1, 3]]
+
+
+@pytest.mark.parametrize(
+    ("cells", "match"),
+    [
+        ("TRIANGLE_STRIPS 1 4\n3 0 1 5\n", "names vertex 5, but there are 5"),
+        ("POLYGONS 1 4\n3 0 1 -1\n", "names vertex -1"),
+        ("POLYGONS 2 8\n3 0 1 2\n", "cut short or damaged"),
+        ("POLYGONS 1 8\n3 0 1 2 3 0 2 3\n", "cut short or damaged"),
+        ("POLYGONS 1 4\n3 0 1 x\n", "cut short or damaged"),
+        ("POLYGONS 1 4\n3 0 1 2\nHELLO 3\n", "cut short or damaged"),
+        ("", "found nothing"),
+    ],
+)
+def test_what_vtk_passes_on_of_a_damaged_file_is_refused(cells, match, tmp_path):
+    refused(saved(tmp_path, "it.vtk", STRIP + cells), match)
 
 
 def test_files_that_name_other_files_are_refused(tmp_path):
