@@ -57,7 +57,10 @@ def _checked(points: list[tuple[float, ...]], faces: list[tuple[int, ...]]) -> S
 def stl(data: bytes) -> Surface:
     """Corners of each triangle, three new points each."""
     points: list[tuple[float, ...]] = []
-    if len(data) >= 84 and len(data) == 84 + 50 * struct.unpack("<I", data[80:84])[0]:
+    # A few bytes more than the triangles take are none of them.
+    more = len(data) - 84 - 50 * struct.unpack("<I", data[80:84])[0] if len(data) >= 84 else -1
+    is_text = data.lstrip()[:5].lower() == b"solid" and b"\0" not in data
+    if more == 0 or (0 < more < 50 and not is_text):
         for i in range(struct.unpack("<I", data[80:84])[0]):
             row = struct.unpack("<12fH", data[84 + 50 * i : 134 + 50 * i])
             points += [row[3:6], row[6:9], row[9:12]]
@@ -155,7 +158,21 @@ def ply(data: bytes) -> Surface:
         found[name] = rows
     rest = list(words_left) if words_left is not None else body[at:].strip(b"\r\n")
     if rest:
-        raise ValueError("too long")
+        # The header may have missed a row: one more of the last element must not be there.
+        name, _, properties = elements[-1]
+        if name != "face":
+            raise UndecidedError("bytes after the last row")
+        try:
+            for words in properties:
+                many = int(value(words[1])) if words[0] == "list" else 1
+                more = [value(words[2] if words[0] == "list" else words[0]) for _ in range(many)]
+                if words[-1] in {"vertex_indices", "vertex_index"}:
+                    found["more"] = [{"row": more}]
+            extra = found["more"][0]["row"]
+            if len(extra) >= 3 and all(0 <= c < len(found["vertex"]) for c in extra):
+                raise LookupError("too long")
+        except (ValueError, OverflowError, struct.error):
+            pass
     points = [(*row["x"], *row["y"], *row["z"]) for row in found["vertex"]]
     faces = []
     for row in found["face"]:
@@ -178,7 +195,7 @@ def obj(data: bytes) -> Surface:
         if not words:
             continue
         if words[0] == "v":
-            if len(words) not in {4, 5, 7} or (len(words) == 5 and words[4] not in {"1", "1.0"}):
+            if len(words) not in {4, 5, 7, 8} or (len(words) == 5 and _real(words[4]) != 1.0):
                 raise ValueError(line)
             points.append(tuple(map(_real, words[1:4])))
         elif words[0] == "f":

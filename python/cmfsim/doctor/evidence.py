@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import PRESETS, Surface
 from cmfsim.errors import CaseError, CmfsimError
-from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface
+from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface_file
 from cmfsim.io.images import read_image_file
 from cmfsim.io.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
@@ -262,7 +262,9 @@ def _body(
     if not _check_file(case, f"surfaces.{key}", path, findings):
         return None
     try:
-        surface = read_surface(path, units=given.units, frame=given.frame)
+        read = read_surface_file(path, units=given.units, frame=given.frame)
+        findings.extend(read.findings)
+        surface = read.surface
         body = Body(key.removeprefix("bones."), where, surface)
         # Triangles that are all without area pass the reader and fail when the surface is repaired.
         # Coordinates in a wrong unit may fail too; the check of sizes reports the unit.

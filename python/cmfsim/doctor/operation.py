@@ -190,7 +190,7 @@ def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Find
 def _header_frame(path: Path) -> str:
     """The frame that the header of a surface states; LPS where it states none."""
     try:
-        return surface_as_stored(path)[1] or "LPS"
+        return surface_as_stored(path).frame or "LPS"
     except (CmfsimError, OSError):
         # Reported where files are looked for.
         return "LPS"

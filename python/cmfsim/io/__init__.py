@@ -15,7 +15,13 @@ from cmfsim.io.predictions import read_parts, write_prediction
 from cmfsim.io.results import read_result, result_suffixes, write_result
 from cmfsim.io.scenes import read_plan, read_scene, write_scene
 from cmfsim.io.slicer_output import write_slicer_bundle
-from cmfsim.io.surfaces import read_bone_pair, read_moved_surface, read_surface, write_surface
+from cmfsim.io.surfaces import (
+    read_bone_pair,
+    read_moved_surface,
+    read_surface,
+    read_surface_file,
+    write_surface,
+)
 from cmfsim.io.transforms import read_transform, write_transform
 from cmfsim.io.variants import AS_GIVEN, Variant, Variants
 
@@ -40,6 +46,7 @@ __all__ = [
     "read_result",
     "read_scene",
     "read_surface",
+    "read_surface_file",
     "read_tet_mesh",
     "read_transform",
     "replacing",

@@ -24,6 +24,7 @@ from cmfsim.io.stated_frames import stated_frame
 from cmfsim.io.stl import read_stl
 from cmfsim.io.vtk_legacy import read_vtk_legacy
 from cmfsim.io.vtk_xml import read_vtk_xml
+from cmfsim.values.finding import Finding
 
 __all__ = ["read_mesh", "read_tet_mesh", "read_tets"]
 
@@ -38,22 +39,30 @@ PASSED_OVER = frozenset({"vertex", "line", "triangle", "quad", "tetra"})
 
 
 def _of_triangles(
-    points: NDArray[np.float64], triangles: NDArray[np.int64], frame: str | None
+    points: NDArray[np.float64],
+    triangles: NDArray[np.int64],
+    frame: str | None,
+    findings: tuple[Finding, ...] = (),
 ) -> PlainMesh:
     cells = (Cells("triangle", triangles),) if len(triangles) else ()
-    return PlainMesh(points, cells, frame=frame)
+    return PlainMesh(points, cells, frame=frame, findings=findings)
 
 
 def _stl(data: bytes) -> PlainMesh:
-    corners = read_stl(data)
+    corners, findings = read_stl(data)
     triangles = np.arange(3 * len(corners)).reshape(-1, 3)
-    return _of_triangles(corners.reshape(-1, 3), triangles, stated_frame(data, ".stl"))
+    return _of_triangles(corners.reshape(-1, 3), triangles, stated_frame(data, ".stl"), findings)
+
+
+def _ply(data: bytes) -> PlainMesh:
+    points, triangles, findings = read_ply(data)
+    return _of_triangles(points, triangles, stated_frame(data, ".ply"), findings)
 
 
 READERS: Mapping[str, Callable[[bytes], PlainMesh]] = MappingProxyType(
     {
         ".stl": _stl,
-        ".ply": lambda data: _of_triangles(*read_ply(data), stated_frame(data, ".ply")),
+        ".ply": _ply,
         ".obj": lambda data: _of_triangles(*read_obj(data), stated_frame(data, ".obj")),
         ".vtp": lambda data: read_vtk_xml(data, "PolyData"),
         ".vtu": lambda data: read_vtk_xml(data, "UnstructuredGrid"),

@@ -49,6 +49,8 @@ TEMPLATE_SPACES = (3, 4)
 # Larger numbers in a header are none; its data begin within so many bytes.
 MOST_NUMBER = 1e30
 MOST_START = 1 << 30
+# Bytes between a header and its voxels that state extensions.
+EXTENSION = 4
 # Quaternions are written in single precision.
 UNIT_PART = 1e-3
 GZIP = b"\x1f\x8b"
@@ -70,6 +72,7 @@ class _Header:
     turn: NDArray[np.float64]
     rows: NDArray[np.float64]
     has_unit: bool
+    ignored: tuple[str, ...] = ()
 
 
 def is_nifti(begin: bytes) -> bool:
@@ -91,7 +94,7 @@ def read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], tuple[Fin
     try:
         with gzip.open(path, "rb") if packed else path.open("rb") as stream:
             header = _header(path, stream.read(NIFTI_HEADER))
-            values = _voxels(path, stream, header, packed=packed)
+            values, left = _voxels(path, stream, header, packed=packed)
     except (EOFError, OSError, zlib.error) as error:
         raise ImageInputError(
             f"{path.name}: is cut short or damaged ({error}); copy it again"
@@ -100,6 +103,9 @@ def read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], tuple[Fin
     check_affine(path.name, affine, header.size)
     if not header.has_unit:
         findings.append(_no_unit(path, header.spacing))
+    ignored = header.ignored + ((f"{left} bytes after the last voxel",) if left else ())
+    if ignored:
+        findings.append(_ignored(path, ignored))
     return values, affine, tuple(findings)
 
 
@@ -125,7 +131,7 @@ def _header(path: Path, data: bytes) -> _Header:
     _check_magic(path, data[4:8] if long else data[344:348])
     kind, bits = at("hh", 12 if long else 70)
     shape = [int(n) for n in at("8q" if long else "8h", 16 if long else 40)]
-    size = _size(path, shape, int(kind), int(bits))
+    size = _size(path, shape, int(kind))
     spacing = np.array(at("8d" if long else "8f", 104 if long else 76))[:4]
     start = float(at("q" if long else "f", 168 if long else 108)[0])
     scale = at("dd" if long else "ff", 176 if long else 112)
@@ -133,18 +139,35 @@ def _header(path: Path, data: bytes) -> _Header:
     codes = at("ii" if long else "hh", 344 if long else 252)
     turn = np.array(at("6d" if long else "6f", 352 if long else 256))
     rows = np.array(at("12d" if long else "12f", 400 if long else 280)).reshape(3, 4)
-    for name, values in (
-        ("pixdim", spacing),
-        ("quaternion and offset", turn),
-        ("sform", rows),
-        ("slope and intercept", np.array(scale)),
-        ("start of the data", np.array([start])),
+    ignored = []
+    dtype = np.dtype(order + NIFTI_TYPES[int(kind)])
+    if bits != 8 * dtype.itemsize:
+        # The type says it as well, and the length of the file is compared with it.
+        ignored.append(f"bitpix {bits}, which its data type contradicts")
+    if not math.isfinite(scale[0]):
+        # As nibabel and ITK take it.
+        ignored.append(f"scl_slope {scale[0]}: values are as they are stored")
+        scale = (1.0, 0.0)
+    if start == 0.0:
+        ignored.append("vox_offset 0: voxels begin after the header")
+        start = first + EXTENSION
+    if codes[1] > 0 >= codes[0] and not _is_spacing(spacing[1:]) and np.isfinite(rows).all():
+        ignored.append(f"pixdim {spacing[1:].tolist()}: its sform states the size of a voxel")
+        spacing[1:] = np.linalg.norm(rows[:, :3], axis=0)
+    for name, values, is_used in (
+        ("pixdim", spacing[1:], True),
+        ("pixdim[0], the quaternion and offset of its qform", (spacing[0], *turn), codes[0] > 0),
+        ("sform", rows, codes[1] > 0),
+        ("slope and intercept", scale, True),
+        ("start of the data", start, True),
     ):
-        if not np.isfinite(values).all() or np.abs(values).max() > MOST_NUMBER:
+        numbers = np.ravel(values)
+        if is_used and not (np.abs(numbers) <= MOST_NUMBER).all():
             raise ImageInputError(
-                f"{path.name}: {name} is {values.tolist()}: every number must be finite"
+                f"{path.name}: {name} is {numbers.tolist()}: every number must be finite; convert "
+                "the DICOM series again"
             )
-    if (spacing[1:] <= 0.0).any():
+    if not _is_spacing(spacing[1:]):
         raise ImageInputError(f"{path.name}: spacing is {spacing[1:].tolist()}: must be above 0")
     if not first <= start <= MOST_START:
         raise ImageInputError(f"{path.name}: its data begin at byte {start:g}")
@@ -152,7 +175,7 @@ def _header(path: Path, data: bytes) -> _Header:
     turn[3:] *= unit
     return _Header(
         size,
-        np.dtype(order + NIFTI_TYPES[int(kind)]),
+        dtype,
         int(start),
         (float(scale[0]), float(scale[1])),
         unit * spacing[1:],
@@ -161,7 +184,13 @@ def _header(path: Path, data: bytes) -> _Header:
         turn,
         unit * rows,
         units & 7 in NIFTI_UNITS,
+        tuple(ignored),
     )
+
+
+def _is_spacing(steps: NDArray[np.float64]) -> bool:
+    """Whether numbers may be the size of a voxel."""
+    return bool(((steps > 0.0) & (steps <= MOST_NUMBER)).all())
 
 
 def _check_magic(path: Path, magic: bytes) -> None:
@@ -176,22 +205,20 @@ def _check_magic(path: Path, magic: bytes) -> None:
         )
 
 
-def _size(path: Path, shape: list[int], kind: int, bits: int) -> tuple[int, int, int]:
+def _size(path: Path, shape: list[int], kind: int) -> tuple[int, int, int]:
     if not 1 <= shape[0] <= 7 or min(shape[1 : shape[0] + 1]) < 1:
         raise ImageInputError(f"{path.name}: has {shape[0]} axes of {shape[1:]} voxels")
     size = shape[1 : shape[0] + 1]
     if kind in NIFTI_VECTORS:
         check_shape(path.name, size, NIFTI_VECTORS[kind])
-    if kind not in NIFTI_TYPES or 8 * np.dtype(NIFTI_TYPES[kind]).itemsize != bits:
-        raise ImageInputError(
-            f"{path.name}: data type {kind} of {bits} bits: whole or real numbers are needed"
-        )
+    if kind not in NIFTI_TYPES:
+        raise ImageInputError(f"{path.name}: data type {kind}: whole or real numbers are needed")
     check_shape(path.name, size)
     return size[0], size[1], size[2]
 
 
-def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> NDArray[Any]:
-    """The scaled voxels; a packed file is unpacked no further than its header states."""
+def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> tuple[NDArray[Any], int]:
+    """The scaled voxels, and how many bytes follow them: too few for a row of voxels."""
     needed = math.prod(header.size) * header.dtype.itemsize
     there = path.stat().st_size
     most = there * MOST_PACKED if packed else there - header.start
@@ -211,7 +238,8 @@ def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> NDArra
             f"{path.name}: is cut short: {found} of {needed} bytes of voxels; copy it again"
         )
     # The end of a packed file holds its checksum, which is compared by reading past it.
-    if stream.read(1):
+    left = stream.read(min(header.size) * header.dtype.itemsize)
+    if len(left) >= min(header.size) * header.dtype.itemsize:
         raise ImageInputError(
             f"{path.name}: is longer than its header states, which are {needed} bytes of voxels: "
             "the header belongs to another image, or the file is damaged; copy it again"
@@ -219,8 +247,18 @@ def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> NDArra
     values = values.astype(header.dtype.newbyteorder("="), copy=False)
     slope, intercept = header.scale
     if slope == 0.0 or (slope, intercept) == (1.0, 0.0):
-        return values
-    return values * np.float32(slope) + np.float32(intercept)
+        return values, len(left)
+    return values * np.float32(slope) + np.float32(intercept), len(left)
+
+
+def _ignored(path: Path, what: tuple[str, ...]) -> Finding:
+    return Finding.warning(
+        "field-ignored",
+        f"ignored: {'; '.join(what)}",
+        where=path.name,
+        why="its header was written by a program with errors; all else in it agrees",
+        fix="compare the image with the patient, or convert the DICOM series again",
+    )
 
 
 def _no_unit(path: Path, spacing: NDArray[np.float64]) -> Finding:

@@ -32,6 +32,8 @@ STATED = re.compile(
     rb"|[ \t]*(?P<v3>[0-9]+) vertices|[ \t]*(?P<f3>[0-9]+) faces)[ \t\r]*$",
     re.MULTILINE | re.IGNORECASE,
 )
+# The weight that changes nothing, as programs write it.
+ONE = re.compile(rb"\+?0*1\.?0*(?:[eE][-+]?0+)?")
 # Digits of a count; a longer one is a comment of another kind.
 MAX_DIGITS = 18
 
@@ -49,7 +51,7 @@ def read_obj(data: bytes) -> tuple[Floats, Integers]:
     """
     if b"\0" in data:
         raise CaseInputError("is not an OBJ file: it holds zero bytes")
-    lines = data.split(b"\n")
+    lines = data.removeprefix(b"\xef\xbb\xbf").split(b"\n")
     if b"\\" in data:
         lines = _joined(lines)
     vertices: list[list[bytes]] = []
@@ -112,11 +114,16 @@ def _joined(lines: list[bytes]) -> list[bytes]:
 def _points(vertices: list[list[bytes]], numbers: list[int]) -> Floats:
     lengths = set(map(len, vertices))
     if lengths - {4}:
-        # x y z w with w = 1, or x y z and a colour.
+        # x y z w with w = 1, or x y z and a colour of three or four parts.
         for row, number in zip(vertices, numbers, strict=True):
-            if len(row) not in {4, 5, 7} or (len(row) == 5 and row[4] not in {b"1", b"1.0"}):
+            if len(row) not in {4, 5, 7, 8}:
                 raise CaseInputError(
                     f"line {number}: a vertex has {len(row) - 1} numbers: x y z are needed"
+                )
+            if len(row) == 5 and not ONE.fullmatch(row[4]):
+                raise CaseInputError(
+                    f"line {number}: a vertex has the weight {shown(row[4])}: only 1 is read, since "
+                    "programs differ in what other weights do to x y z; export it without weights"
                 )
         vertices = [row[:4] for row in vertices]
     words = [word for _, *xyz in vertices for word in xyz]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats
+from cmfsim.values.finding import Finding
 
 __all__ = ["CELL_CORNERS", "Cells", "PlainMesh"]
 
@@ -58,6 +59,8 @@ class PlainMesh:
         One array for each entry of `cells`.
     frame : str or None
         "LPS" or "RAS" where the file's header states it.
+    findings : tuple of Finding
+        What was ignored on reading, although the file states it.
 
     Raises
     ------
@@ -71,6 +74,7 @@ class PlainMesh:
     point_data: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     cell_data: Mapping[str, tuple[NDArray[Any], ...]] = field(default_factory=dict)
     frame: str | None = None
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         points = self.points

@@ -12,6 +12,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.polygons import triangles_of
 from cmfsim.io.text_numbers import real_numbers, shown, whole_numbers
 from cmfsim.values.checks import Floats
+from cmfsim.values.finding import Finding
 
 __all__ = ["read_ply", "write_ply"]
 
@@ -35,6 +36,8 @@ AXES = (b"x", b"y", b"z")
 CORNERS = (b"vertex_indices", b"vertex_index")
 # Bytes after the last element that are a line end.
 LINE_ENDS = (b"", b"\n", b"\r\n", b"\r")
+# Corners of the least face.
+LEAST_CORNERS = 3
 
 
 @dataclass(frozen=True)
@@ -67,14 +70,14 @@ class _Rows:
     lengths: tuple[Integers | None, ...]
 
 
-def read_ply(data: bytes) -> tuple[Floats, Integers]:
-    """The vertices (n, 3) and triangles (t, 3) of a file. Polygons become triangles.
+def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
+    """The vertices (n, 3), triangles (t, 3) and findings of a file. Polygons become triangles.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) Not PLY; a header that does not end; more or fewer bytes than the header
-        states; indices that are no whole numbers or name no vertex; a coordinate that is not
+        (also `ValueError`) Not PLY; a header that does not end; fewer bytes than the header states,
+        or more that may be another row; indices that are no whole numbers or name no vertex; a coordinate that is not
         finite.
     """
     elements, order, start = _header(data)
@@ -85,7 +88,12 @@ def read_ply(data: bytes) -> tuple[Floats, Integers]:
             raise CaseInputError(f"has {names.count(name)} elements {name!r}: one is needed{extra}")
     source = _Binary(data, start, order) if order else _Text(data, start)
     rows = {element.name: source.rows(element) for element in elements}
-    source.end()
+    left = source.left()
+    if left and _may_be_a_row(source, elements[-1], len(rows["vertex"].columns[0])):
+        raise CaseInputError(
+            f"holds {left} more than its header states, and they read as another "
+            f"{elements[-1].name}: the header states {elements[-1].number}; export it again"
+        )
     vertex, face = (elements[names.index(name)] for name in ("vertex", "face"))
     axes = [_column(vertex, rows["vertex"], (axis,)) for axis in AXES]
     points = np.stack([np.asarray(column, dtype=np.float64) for column, _ in axes], axis=1)
@@ -98,7 +106,31 @@ def read_ply(data: bytes) -> tuple[Floats, Integers]:
             "the corners of faces are not a list of whole numbers: "
             "'property list uchar int vertex_indices' is needed"
         )
-    return points, triangles_of(points, lengths, corners.astype(np.int64))
+    triangles = triangles_of(points, lengths, corners.astype(np.int64))
+    return points, triangles, (_bytes_left(left),) if left else ()
+
+
+def _may_be_a_row(source: "_Binary | _Text", last: _Element, n_vertices: int) -> bool:
+    """Whether what follows the last element may be one more row of it, which no header counts."""
+    try:
+        row = source.rows(_Element(last.name, 1, last.properties))
+    except CaseInputError:
+        return False
+    if last.name != "face":
+        return True
+    corners, lengths = _column(last, row, CORNERS)
+    is_face = lengths is not None and int(lengths[0]) >= LEAST_CORNERS
+    return is_face and bool(((corners >= 0) & (corners < n_vertices)).all())
+
+
+def _bytes_left(left: str) -> Finding:
+    return Finding.warning(
+        "field-ignored",
+        f"{left} after the last row were ignored: they are no row that its header could have "
+        "missed",
+        why="the file may have been changed after it was written",
+        fix="look at the surface; if a part is missing, export it again",
+    )
 
 
 def write_ply(file: BinaryIO, vertices: Floats, triangles: NDArray[np.integer]) -> None:
@@ -222,11 +254,10 @@ class _Binary:
             self._cut(element, kind.itemsize)
         return self._one_by_one(element)
 
-    def end(self) -> None:
-        """Refuses bytes that no element takes."""
+    def left(self) -> str:
+        """What no element takes, in words; empty if there is nothing but a line end."""
         left = len(self.data) - self.at
-        if self.data[self.at : self.at + 3] not in LINE_ENDS:
-            raise CaseInputError(f"holds {left} bytes more than its header states: is it damaged?")
+        return "" if self.data[self.at : self.at + 3] in LINE_ENDS else f"{left} bytes"
 
     def _fields(
         self, number: int, prop: _Property, length: int | None
@@ -326,13 +357,10 @@ class _Text:
             self._short(element, (len(self.words) - self.at) // width)
         return self._one_by_one(element)
 
-    def end(self) -> None:
-        """Refuses words that no element takes."""
+    def left(self) -> str:
+        """What no element takes, in words; empty if there is nothing."""
         left = len(self.words) - self.at
-        if left:
-            raise CaseInputError(
-                f"holds {left} numbers more than its header states: is it damaged?"
-            )
+        return f"{left} words" if left else ""
 
     def _alike(self, element: _Element, lengths: list[int | None], width: int) -> _Rows | None:
         """The rows where all lists have the length of the first row's; None where they do not."""

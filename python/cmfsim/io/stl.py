@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.io.text_numbers import real_numbers, shown
 from cmfsim.values.checks import Floats
+from cmfsim.values.finding import Finding
 
 __all__ = ["read_stl", "write_stl"]
 
@@ -27,8 +28,8 @@ FACET = (
 CORNERS = (8, 9, 10, 12, 13, 14, 16, 17, 18)
 
 
-def read_stl(data: bytes) -> Floats:
-    """The corners (t, 3, 3) of the triangles of a file.
+def read_stl(data: bytes) -> tuple[Floats, tuple[Finding, ...]]:
+    """The corners (t, 3, 3) of the triangles of a file, and findings.
 
     Whether it is text goes by its content: binary files may begin with "solid" as well.
 
@@ -39,13 +40,21 @@ def read_stl(data: bytes) -> Floats:
         solid that does not end; a coordinate that is not finite.
     """
     if len(data) >= HEADER + 4 and len(data) == _length(data):
-        return _read_binary(data)
+        return _read_binary(data), ()
     if data[:1024].lstrip()[:5].lower() == b"solid" and b"\0" not in data:
-        return _read_text(data)
+        return _read_text(data), ()
     if len(data) < HEADER + 4:
         raise CaseInputError(
             f"is not an STL file, or is cut short: {len(data)} bytes, a header has {HEADER + 4}"
         )
+    if 0 < (left := len(data) - _length(data)) < ROW.itemsize:
+        finding = Finding.warning(
+            "field-ignored",
+            f"{left} bytes after the last triangle were ignored: a triangle takes {ROW.itemsize}",
+            why="the file may have been changed after it was written",
+            fix="look at the surface; if a part is missing, export it again",
+        )
+        return _read_binary(data), (finding,)
     raise CaseInputError(
         f"is not an STL file, or is cut short or damaged: it states {_count(data)} triangles, "
         f"which take {_length(data)} bytes, but has {len(data)}; export it again"

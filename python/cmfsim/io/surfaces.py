@@ -1,7 +1,9 @@
 """Triangle surfaces in STL, PLY, OBJ and VTP: reading into LPS mm, and writing."""
 
+import logging
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO
@@ -20,17 +22,39 @@ from cmfsim.io.stl import write_stl
 from cmfsim.io.vtk import data_array, write_vtk
 from cmfsim.values.case_parts import FRAMES, UNITS
 from cmfsim.values.checks import check_one_of
+from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [
+    "SurfaceFile",
     "read_bone_pair",
     "read_moved_surface",
     "read_surface",
-    "read_triangles",
+    "read_surface_file",
     "surface_as_stored",
     "surface_suffixes",
     "write_surface",
 ]
+
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceFile:
+    """A surface with what its file states and what was found on it.
+
+    Attributes
+    ----------
+    surface : SurfaceData
+    frame : str or None
+        The frame that the header states, if it does.
+    findings : tuple of Finding
+    """
+
+    surface: SurfaceData
+    frame: str | None = None
+    findings: tuple[Finding, ...] = ()
 
 
 def read_surface(
@@ -71,11 +95,26 @@ def read_surface(
     >>> import cmfsim
     >>> skin = cmfsim.read_surface("skin.stl", units="mm", frame="RAS")  # doctest: +SKIP
     """
-    surface, stated = surface_as_stored(Path(path), crease_angle)
-    scale = _scale(Path(path), units, frame, stated)
+    read = read_surface_file(path, crease_angle, units=units, frame=frame)
+    for finding in read.findings:
+        _log.warning("%s: %s", finding.where, finding.what)
+    return read.surface
+
+
+def read_surface_file(
+    path: str | os.PathLike[str],
+    crease_angle: float = 60.0,
+    *,
+    units: str = "mm",
+    frame: str | None = None,
+) -> SurfaceFile:
+    """As `read_surface`, with what was ignored on reading, for those who report it."""
+    read = surface_as_stored(Path(path), crease_angle)
+    scale = _scale(Path(path), units, frame, read.frame)
     if (scale == 1.0).all():
-        return surface
-    return SurfaceData(surface.vertices * scale, surface.triangles, crease_angle)
+        return read
+    surface = SurfaceData(read.surface.vertices * scale, read.surface.triangles, crease_angle)
+    return replace(read, surface=surface)
 
 
 def _scale(path: Path, units: str, frame: str | None, stated: str | None) -> NDArray[np.float64]:
@@ -179,13 +218,8 @@ SAME_NEEDED = (
 )
 
 
-def read_triangles(path: Path, crease_angle: float = 60.0) -> SurfaceData:
-    """A surface in the file's own numbers, whatever their frame: as `surface_as_stored`."""
-    return surface_as_stored(path, crease_angle)[0]
-
-
-def surface_as_stored(path: Path, crease_angle: float = 60.0) -> tuple[SurfaceData, str | None]:
-    """A surface in the file's own numbers, and the frame that its header states, if it does.
+def surface_as_stored(path: Path, crease_angle: float = 60.0) -> SurfaceFile:
+    """A surface in the file's own numbers.
 
     Vertices in the same place are made one: STL repeats them for each triangle.
     """
@@ -193,7 +227,9 @@ def surface_as_stored(path: Path, crease_angle: float = 60.0) -> tuple[SurfaceDa
     triangles = _triangles(mesh, path)
     points = mesh.points
     kept, number = _welded(points)
-    return SurfaceData(points[kept], number[triangles], crease_angle), mesh.frame
+    surface = SurfaceData(points[kept], number[triangles], crease_angle)
+    findings = tuple(replace(finding, where=path.name) for finding in mesh.findings)
+    return SurfaceFile(surface, mesh.frame, findings)
 
 
 def _numbered(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], str | None]:

@@ -159,16 +159,17 @@ def test_impossible_nrrd_headers_are_refused(tmp_path, field, text, words):
     ("change", "words"),
     [
         ({"rows": np.full((3, 4), np.inf)}, "finite"),
-        ({"spacing": (1.0, np.nan, 2.0)}, "finite"),
-        ({"spacing": (1.0, 0.0, 2.0)}, "spacing"),
+        ({"spacing": (1.0, np.nan, 2.0), "qform": 1}, "finite"),
+        ({"spacing": (1.0, 0.0, 2.0), "qform": 1}, "spacing"),
+        ({"quaternion": (0.0, np.nan, 0.0), "qform": 1}, "finite"),
         ({"shape": (3, 4, 5, -6, 1, 1, 1, 1)}, "axes"),
         ({"shape": (9, 4, 5, 6, 1, 1, 1, 1)}, "axes"),
         ({"shape": (3, 30000, 30000, 30000, 1, 1, 1, 1)}, "voxels"),
         ({"shape": (3, 900, 900, 900, 1, 1, 1, 1)}, "cut short"),
-        ({"kind": (4, 32)}, "data type"),
+        ({"kind": (16, 32)}, "cut short"),
         ({"kind": (128, 24)}, "3 numbers per voxel"),
         ({"start": 1e20}, "data begin"),
-        ({"scale": (np.nan, 0.0)}, "finite"),
+        ({"scale": (1.0, np.nan)}, "finite"),
         ({"magic": b"ni1\0"}, "pair"),
         ({"magic": b"\0\0\0\0"}, "Analyze"),
         ({"rows": np.zeros((3, 4))}, "voxels are"),
@@ -178,6 +179,46 @@ def test_impossible_nrrd_headers_are_refused(tmp_path, field, text, words):
 @pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
 def test_impossible_nifti_headers_are_refused(tmp_path, change, words, suffix):
     refused(write_nifti(tmp_path / f"a{suffix}", **change), words)
+
+
+STRAIGHT = [[-1, 0, 0, 5], [0, -1, 0, 6], [0, 0, 2, 7]]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"scale": (np.nan, np.nan)}, "scl_slope nan"),
+        ({"scale": (np.inf, 0.0)}, "scl_slope inf"),
+        ({"kind": (4, 32)}, "bitpix 32"),
+        ({"start": 0.0}, "vox_offset 0"),
+        ({"spacing": (1.0, np.nan, 2.0)}, "pixdim"),
+        ({"spacing": (0.0, 0.0, 0.0)}, "pixdim"),
+    ],
+)
+def test_fields_of_a_nifti_that_are_not_needed_are_ignored_and_reported(tmp_path, change, words):
+    found = read_image_file(write_nifti(tmp_path / "a.nii", rows=STRAIGHT, **change))
+    np.testing.assert_array_equal(found.image.values[::-1, ::-1], VALUES[::-1, ::-1])
+    np.testing.assert_allclose(found.image.spacing, (1.0, 1.0, 2.0))
+    (finding,) = found.findings
+    assert (finding.severity, finding.code) == ("warning", "field-ignored")
+    assert words in finding.what
+    # What a code of 0 declares void is not looked at.
+    void = write_nifti(tmp_path / "b.nii", rows=STRAIGHT, quaternion=(np.nan, 0.0, 0.0))
+    assert not codes(void)
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_bytes_after_the_voxels_are_ignored_if_they_are_less_than_a_row(tmp_path, suffix):
+    for more, words in ((7, None), (8, "longer than its header states")):
+        path = write_nifti(tmp_path / f"a{suffix}", rows=STRAIGHT)
+        data = path.read_bytes()
+        data = gzip.decompress(data) if suffix == ".nii.gz" else data
+        data += bytes(more)
+        path.write_bytes(gzip.compress(data) if suffix == ".nii.gz" else data)
+        if words:
+            refused(path, words)
+        else:
+            assert codes(path) == ["field-ignored"]
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,10 @@ OBJ = {
     .replace("\n", "\r\n")
     .replace("v ", "v\t"),
     "continued": CORNERS + "f 1 \\\n3 2\nf 1 2 4\n",
+    "weights of 1": CORNERS.replace("\n", " 1.00000\n") + "f 1 3 2\nf 1 2 4\n",
+    "weights of 1e0": CORNERS.replace("\n", " +1e+00\n") + "f 1 3 2\nf 1 2 4\n",
+    "colours of four parts": CORNERS.replace("\n", " 0.5 0.5 0.5 1.0\n") + "f 1 3 2\nf 1 2 4",
+    "a mark of UTF-8": "\ufeff# by hand\n" + CORNERS + "f 1 3 2\nf 1 2 4\n",
 }
 
 
@@ -74,7 +78,8 @@ BAD_OBJ = {
     "v 0 0 1e999\nf 1 2 3": "line 5: '1e999' is not finite",
     "v 0 0 1e30\nf 1 2 3": "point 4 has the coordinate 1e.30: at most 1e.09 is read, in any unit",
     "f 1//1 2 //3 3": "line 5: '//3' is not a texture or normal",
-    "v 0 0 1 2\nf 1 2 3": "line 5: a vertex has 4 numbers",
+    "v 0 0 1 2\nf 1 2 3": "line 5: a vertex has the weight '2': only 1 is read",
+    "v 0 0 1 2 3\nf 1 2 3": "line 5: a vertex has 5 numbers",
     "fo 1 2 3": "line 5: 'fo' is not known in OBJ",
     "f 1 2 3\n# 5 vertices": "a comment states 5 vertices, the file holds 4",
     "f 1 2 3\n# Faces: 2": "a comment states 2 faces, the file holds 1",
@@ -170,13 +175,50 @@ def test_a_fault_in_ply_is_named(order, change, match, tmp_path):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("change", [-9, -1, 3, 40])
+@pytest.mark.parametrize("change", [-9, -1, 40])
 def test_ply_with_another_length_than_its_header_states_is_refused(order, change, tmp_path):
     content = ply(order, faces=TRIANGLES)
-    content = content[:change] if change < 0 else content + b"1 " * change
+    more = b"1 " if order == "ascii" else bytes(2)
+    content = content[:change] if change < 0 else content + more * change
     if order == "ascii" and change == -1:
         content = content[:-4]
     refused(saved(tmp_path, "it.ply", content), "cut short|more than its header|numbers are left")
+
+
+@pytest.mark.parametrize("order", ["binary_little_endian", "ascii"])
+def test_ply_with_something_left_that_is_no_row_is_read_with_a_warning(order, tmp_path):
+    """Three bytes, zeros, and a text; but not a face more than the header states."""
+    content = ply_of_faces_last(order)
+    more = (b"\0\0\0", bytes(100), b"made by hand") if order != "ascii" else (b"0 0", b"by hand")
+    for extra in more:
+        read = cmfsim.io.read_surface_file(saved(tmp_path, "it.ply", content + extra))
+        assert read.surface.triangles.tolist() == TRIANGLES
+        (finding,) = read.findings
+        assert (finding.severity, finding.code) == ("warning", "field-ignored")
+        assert finding.where == "it.ply"
+        assert str(len(extra.split()) if order == "ascii" else len(extra)) in finding.what
+    face = struct.pack("<B3i", 3, 0, 1, 2) if order != "ascii" else b"3 0 1 2\n"
+    refused(saved(tmp_path, "it.ply", content + face), "they read as another face")
+
+
+def ply_of_faces_last(order):
+    head = (
+        f"ply\nformat {order} 1.0\nelement vertex {len(CUBE)}\nproperty double x\n"
+        f"property double y\nproperty double z\nelement face {len(TRIANGLES)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    if order == "ascii":
+        rows = [" ".join(map(str, row)) for row in CUBE.tolist()]
+        rows += [f"3 {a} {b} {c}" for a, b, c in TRIANGLES]
+        return (head + "\n".join(rows) + "\n").encode()
+    faces = b"".join(struct.pack("<B3i", 3, *t) for t in TRIANGLES)
+    return head.encode() + CUBE.astype("<f8").tobytes() + faces
+
+
+def test_what_was_ignored_in_a_surface_is_logged_where_nobody_asks(tmp_path, caplog):
+    path = saved(tmp_path, "it.ply", ply_of_faces_last("binary_little_endian") + b"\0\0\0")
+    cmfsim.read_surface(path)
+    assert "it.ply: 3 bytes after the last row were ignored" in caplog.text
 
 
 # STL.
@@ -233,6 +275,16 @@ def test_stl_of_another_length_than_its_count_is_refused(ball, tmp_path):
         (binary[:96] + struct.pack("<f", np.inf) + binary[100:], "triangle 0 .* not finite"),
     ):
         refused(saved(tmp_path, "it.stl", content), match)
+
+
+def test_stl_with_a_few_bytes_left_is_read_with_a_warning(ball, tmp_path):
+    """A triangle takes 50 bytes: fewer are none."""
+    binary, corners = ball
+    for more in (1, 2, 49):
+        path = saved(tmp_path, "it.stl", binary + b"\0" * more)
+        read = cmfsim.io.read_surface_file(path)
+        assert np.array_equal(read.surface.vertices[read.surface.triangles], corners)
+        assert [f.code for f in read.findings] == ["field-ignored"]
 
 
 # VTK's XML files.

@@ -17,7 +17,7 @@ from cmfsim.io import (
     Case,
     read_bone_pair,
     read_landmark_file,
-    read_surface,
+    read_surface_file,
     read_transform,
 )
 from cmfsim.io.folders import check_below, check_writable
@@ -95,9 +95,9 @@ def read_anatomy(
     files = {"skin": given_surfaces.skin, **given_surfaces.bones}
     for name, path in files.items():
         progress(f"reading surface {name}")
-        surface = read_surface(path, units=given_surfaces.units, frame=given_surfaces.frame)
-        surfaces[name], repaired = repair_surface(surface, name)
-        findings.extend(repaired)
+        read = read_surface_file(path, units=given_surfaces.units, frame=given_surfaces.frame)
+        surfaces[name], repaired = repair_surface(read.surface, name)
+        findings.extend((*read.findings, *repaired))
     progress("measuring distances from the surfaces")
     spacing = max(case.mesh.edge_length / VOXELS_PER_EDGE, LEAST_VOXEL)
     skin = surfaces.pop("skin")

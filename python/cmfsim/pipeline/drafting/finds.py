@@ -246,7 +246,8 @@ def surface_find(path: Path, label: str) -> SurfaceFind:
     CaseError
         (also `ValueError`) As `read_surface`.
     """
-    surface, stated = surface_as_stored(path)
+    read = surface_as_stored(path)
+    surface, stated = read.surface, read.frame
     if stated is None and is_own_file(path):
         stated = "LPS"
     name = path.name[: -len(path.suffix)]
