@@ -28,6 +28,8 @@ NAMES: Mapping[int, str] = {
     0x00080060: "modality",
     0x0008103E: "series_description",
     0x00100020: "patient_id",
+    0x00180050: "thickness",
+    0x00180088: "slice_spacing",
     0x00181120: "gantry_tilt",
     0x0020000D: "study_uid",
     0x0020000E: "series_uid",
@@ -47,6 +49,7 @@ NAMES: Mapping[int, str] = {
     0x00281052: "intercept",
     0x00281053: "slope",
     0x00281054: "rescale_type",
+    0x3004000C: "frame_offsets",
 }
 # Sequences that are read, and what is in them.
 SEQUENCES: Mapping[int, str] = {
@@ -65,13 +68,18 @@ FLOAT_PIXELS = frozenset({0x7FE00008, 0x7FE00009})
 ITEM, ITEM_END, SEQUENCE_END = 0xFFFEE000, 0xFFFEE00D, 0xFFFEE0DD
 UNDEFINED = 0xFFFFFFFF
 # Value representations whose length takes four bytes, after two that are reserved.
+KINDS = frozenset(
+    kind.encode()
+    for kind in "AE AS AT CS DA DS DT FD FL IS LO LT OB OD OF OL OV OW PN SH SL SQ SS ST SV TM UC UI UL "
+    "UN UR US UT UV".split()
+)
 LONG = frozenset((b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"))  # fmt: skip # noqa: E501
 EXPLICIT_BIG, DEFLATED, IMPLICIT = "1.2.840.10008.1.2.2", "1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2"  # fmt: skip # noqa: E501
 PREAMBLE = 128
 # The group that states how all others are written.
 META_GROUP = 2
 # Longer values are none that is kept, bytes; deeper nesting and more elements are no image's.
-MOST_VALUE = 4096
+MOST_VALUE = 2**16
 MOST_DEPTH = 16
 MOST_ELEMENTS = 3_000_000
 
@@ -104,6 +112,12 @@ class DicomHeader:
     tags: Tags
     has_pixels: bool = False
     frames: tuple[Frame, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """How many frames its pixels have, as far as it states that."""
+        stated = numbers_of(self.text("n_frames") or "1", 1)
+        return 1 if stated is None else max(1, int(stated[0]))
 
     def text(self, name: str) -> str:
         """A value as text; empty where the file does not state it."""
@@ -253,9 +267,40 @@ class _Reader:
         if kind in LONG:
             return tag, kind, self._long(self._bytes(4))
         if not kind.isalpha():
-            message = f"element {tag:08x} has no known kind"
-            raise ValueError(message)
+            return tag, b"UN", self._length_of_no_kind(tag, head)
         return tag, kind, struct.unpack(f"{self.order}H", head[6:])[0]
+
+    def _length_of_no_kind(self, tag: int, head: bytes) -> int:
+        """The length of an element whose kind is none, if what follows it shows which it is.
+
+        Such elements are private ones, that no reader needs. Programs write their lengths in two
+        bytes, in four, or as where no kind is stated.
+        """
+        begin = self.stream.tell()
+        if tag >> 16 & 1 and len(more := self.stream.read(4)) == 4:
+            (short,) = struct.unpack(f"{self.order}H", head[6:])
+            for start, length in (
+                (begin, short),
+                (begin, self._long(head[4:])),
+                (begin + 4, self._long(more)),
+            ):
+                if self._is_followed(tag, start + length):
+                    self.stream.seek(start)
+                    return length
+        raise ImageInputError(
+            f"{self.path.name}: its element {tag >> 16:04x},{tag & 0xFFFF:04x} has no known value "
+            "representation (VR), and what follows it is not found: rewrite the files with a DICOM "
+            "converter (such as gdcmconv or dcmconv), or export the series again"
+        )
+
+    def _is_followed(self, tag: int, place: int) -> bool:
+        """Whether a place is that of an element after this one, of a known kind."""
+        if place + 8 > self.size:
+            return False
+        self.stream.seek(place)
+        head = self.stream.read(8)
+        group, element = struct.unpack(f"{self.order}HH", head[:4])
+        return group << 16 | element > tag and head[4:6] in KINDS
 
     def _sequence(self, found: _Found, tag: int, length: int, depth: int) -> None:
         """Reads the items of a sequence, or passes over it."""

@@ -23,8 +23,8 @@ class Slice:
     @property
     def name(self) -> str:
         """The file's name, and the frame's number where it has several."""
-        frames = len(self.header.frames)
-        return self.header.path.name + (f" frame {self.frame + 1}" if frames else "")
+        many = self.header.count > 1 or self.header.frames
+        return self.header.path.name + (f" frame {self.frame + 1}" if many else "")
 
     def text(self, key: str) -> str:
         """A value of the frame, or of its file."""
@@ -49,16 +49,53 @@ def is_localizer(header: DicomHeader) -> bool:
 
 def slices_of(header: DicomHeader) -> list[Slice]:
     """The slices of a file."""
-    stated = numbers_of(header.text("n_frames") or "1", 1)
-    count = 1 if stated is None else int(stated[0])
+    count = header.count
     if count == 1 and not header.frames:
         return [Slice(header, 0, {})]
+    if not header.frames:
+        return _placed_by_the_first(header)
     if len(header.frames) != count:
         raise ImageInputError(
             f"{header.path.name}: has {count} frames and states the places of "
             f"{len(header.frames)}: export the series as one file per slice"
         )
     return [Slice(header, n, frame.tags) for n, frame in enumerate(header.frames)]
+
+
+def _placed_by_the_first(header: DicomHeader) -> list[Slice]:
+    """The frames of a classic image, which states the place of the first alone.
+
+    They follow it along the normal, as cone-beam scanners write them; `assumed` says by what.
+    """
+    first = Slice(header, 0, {})
+    try:
+        place, across = first.numbers("position", 3), first.numbers("orientation", 6)
+    except ImageInputError as error:
+        raise ImageInputError(
+            f"{header.path.name}: has {header.count} frames and does not state where the first one "
+            "lies (position and orientation): export the series as one file per slice"
+        ) from error
+    normal = np.cross(across[:3], across[3:])
+    steps = np.arange(header.count)
+    offsets = header.numbers("frame_offsets", header.count)
+    assumed = ""
+    if offsets is None:
+        for key, what in (("slice_spacing", "SpacingBetweenSlices"), ("thickness", "SliceThickness")):
+            gap = header.numbers(key, 1)
+            if gap is not None and gap[0] != 0.0:
+                offsets = gap[0] * steps
+                assumed = f"{gap[0]:g} mm apart by {what}"
+                break
+        else:
+            raise ImageInputError(
+                f"{header.path.name}: has {header.count} frames and does not state how far apart "
+                "they are (SpacingBetweenSlices): export the series as one file per slice"
+            )
+    places = place + np.outer(offsets - offsets[0], normal)
+    return [
+        Slice(header, k, {"position": "\\".join(f"{x:.8g}" for x in p), "assumed": assumed})
+        for k, p in enumerate(places.tolist())
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,8 @@ def volume_of(
     name: str, slices: list[Slice], modality: str, findings: list[Finding]
 ) -> tuple[ImageData, str, tuple[Finding, ...]]:
     """The volume of slices, its modality, and what was noticed."""
+    slices, more = _with_orientations(name, slices)
+    findings += more
     slices, more = _without_scouts(name, slices)
     findings += more
     stack = _stack(name, slices)
@@ -62,11 +65,51 @@ def volume_of(
     findings += more
     if len(kept) < len(stack.slices):
         stack, values = stack.kept(kept), values[kept]
-    _check_acquisitions(name, stack)
+    findings += _acquisition_findings(name, stack)
     uneven = _check_steps(name, stack)
+    findings += _assumed_findings(name, stack)
     image, more = _placed(name, stack, values, uneven)
     findings += [*more, *_rescale_findings(name, stack)]
     return image, modality, tuple(findings)
+
+
+def _with_orientations(name: str, slices: list[Slice]) -> tuple[list[Slice], list[Finding]]:
+    """The slices, those that state no orientation with that of all others.
+
+    Their places show that they belong to the row: the steps between slices are checked.
+    """
+    silent = [s for s in slices if not s.text("orientation").strip()]
+    stated = {s.text("orientation") for s in slices if s not in silent}
+    if not silent or len(stated) != 1 or 2 * len(silent) >= len(slices):
+        return slices, []
+    tags = {"orientation": stated.pop()}
+    finding = Finding.warning(
+        "field-ignored",
+        f"{counted(len(silent), 'slice')} without an orientation were taken to have that of all "
+        f"others: {listed([s.name for s in silent])}",
+        where=name,
+        why="a slice that is turned within its plane would be out of place",
+        fix="check these slices visually, or export the series again",
+    )
+    return [replace(s, tags={**s.tags, **tags}) if s in silent else s for s in slices], [finding]
+
+
+def _assumed_findings(name: str, stack: Stack) -> list[Finding]:
+    """A warning where the places of frames are not stated, but follow from that of the first."""
+    assumed = next((a for s in stack.slices if (a := s.text("assumed"))), "")
+    if not assumed:
+        return []
+    return [
+        Finding.warning(
+            "dicom-frames-assumed",
+            f"the file states the place of its first frame alone; the {len(stack.slices)} frames "
+            f"were placed one after the other along its normal, {assumed}",
+            where=name,
+            why="if they run the other way, the head is mirrored: right is left or top is bottom",
+            fix="compare left and right, and the height of the head, with the patient; or export "
+            "the series as one file per slice",
+        )
+    ]
 
 
 def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[Finding]]:
@@ -180,7 +223,7 @@ def _pixels(name: str, stack: Stack) -> NDArray[Any]:
     voxels = columns * rows * len(stack.slices)
     limits = ReadLimits(20.0 + (size + 2 * voxels) / 5e6, 4 * 2**30 + 16 * voxels)
     try:
-        if all(not s.header.frames for s in stack.slices):
+        if all(s.header.count == 1 and not s.header.frames for s in stack.slices):
             return _of_files(stack, limits)
         parts = {path: _of_frames(path, limits) for path in files}
     except ReaderError as error:
@@ -259,20 +302,44 @@ def _place(stack: Stack, i: int) -> str:
     return f"first pixel at {text} mm"
 
 
-def _check_acquisitions(name: str, stack: Stack) -> None:
-    """Refuses slices of several scans that lie between one another."""
+def _off_even(heights: NDArray[np.float64]) -> float:
+    """How far heights are off an even row between the first and the last, mm."""
+    even = np.linspace(heights[0], heights[-1], len(heights))
+    return float(np.abs(heights - even).max())
+
+
+def _acquisition_findings(name: str, stack: Stack) -> list[Finding]:
+    """Refuses slices of several scans between one another, unless their places show one row.
+
+    A slice without a number says nothing about which scan it is from.
+    """
     ranges: dict[str, list[float]] = {}
     for one, height in zip(stack.slices, stack.heights, strict=True):
-        ranges.setdefault(one.text("acquisition_number"), []).append(float(height))
+        if number := one.text("acquisition_number").strip():
+            ranges.setdefault(number, []).append(float(height))
     # One run after the other is how a scanner steps; two runs over one place are two scans.
     spans = sorted((min(h), max(h), number) for number, h in ranges.items())
+    is_even = _off_even(stack.heights) <= ROUNDED
     for (_, high, first), (low, _, second) in itertools.pairwise(spans):
-        if low < high:
+        if low < high and not is_even:
             raise ImageInputError(
-                f"{name}: the slices of acquisitions {first or '-'} and {second or '-'} are "
-                f"interleaved ({low:.2f} to {high:.2f} mm along the normal): two scans or times "
-                "in one series; keep the slices of one acquisition in the folder"
+                f"{name}: the slices of acquisitions {first} and {second} are interleaved "
+                f"({low:.2f} to {high:.2f} mm along the normal): two scans or times in one series; "
+                "keep the slices of one acquisition in the folder"
             )
+        if low < high:
+            return [
+                Finding.warning(
+                    "field-ignored",
+                    f"the slices of acquisitions {first} and {second} alternate, and together "
+                    "they are evenly spaced: they were taken as one scan",
+                    where=name,
+                    why="if they are two scans, the patient may have moved between them",
+                    fix="look for steps in the skin; keep the slices of one acquisition if there "
+                    "are any",
+                )
+            ]
+    return []
 
 
 def _check_steps(name: str, stack: Stack) -> list[int]:
@@ -280,7 +347,6 @@ def _check_steps(name: str, stack: Stack) -> list[int]:
     heights = stack.heights
     steps = np.diff(heights)
     usual = float(np.median(steps))
-    even = heights[0] + np.arange(len(heights)) * (heights[-1] - heights[0]) / len(steps)
     wide = np.flatnonzero(steps >= MOST_STEP * usual)
     if len(wide):
         multiples = steps[wide] / usual
@@ -303,7 +369,7 @@ def _check_steps(name: str, stack: Stack) -> list[int]:
             f"{_steps(stack, narrow)}: more than one scan or reconstruction in the series; keep "
             "one in the folder"
         )
-    if float(np.abs(heights - even).max()) <= ROUNDED:
+    if _off_even(heights) <= ROUNDED:
         return []
     return [int(i) for i in np.flatnonzero(np.abs(steps - usual) > 0.01 * usual)] or [0]
 

@@ -23,6 +23,7 @@ from cmfsim.io.leftovers import abandoned, temporary_file
 
 __all__ = [
     "FORMAT_VERSION",
+    "LINE_IN_MESSAGE",
     "beside",
     "check_numbers",
     "check_plain_toml",
@@ -38,7 +39,9 @@ __all__ = [
     "refuse_constant",
     "replacing",
     "table_of",
+    "toml_hint",
     "toml_module",
+    "utf8_text",
 ]
 
 # Text files (plans, scene descriptions) above this size are not what they say they are, bytes.
@@ -57,6 +60,11 @@ OUTSIDE_TEXTS = re.compile(
     rf"|(?P<deep>{DEEP_KEY})|{KEY_PART}",
     re.DOTALL,
 )
+# Where TOML's error lies; a text between double quotes with a backslash; quotes of word processors.
+LINE_IN_MESSAGE = re.compile(r"\(at line (\d+), column (\d+)\)")
+WINDOWS_TEXT = re.compile(r'"([^"\n]*\\[^"\n]*)"')
+TYPOGRAPHIC = ("\N{LEFT DOUBLE QUOTATION MARK}", "\N{RIGHT DOUBLE QUOTATION MARK}", "\N{DOUBLE LOW-9 QUOTATION MARK}")
+MOST_SHOWN_PATH = 120
 # The units that every file of ours has; others are refused, never taken for these.
 UNITS: Mapping[str, str] = MappingProxyType({"length": "mm", "stress": "MPa", "force": "N"})
 # Characters of a file's name that an error repeats; names that no system takes are longer.
@@ -190,19 +198,59 @@ def read_document(path: Path) -> dict[str, Any]:
     check_readable(path)
     if path.stat().st_size > MAX_TEXT:
         raise CaseInputError(f"is larger than {MAX_TEXT} bytes")
+    text = utf8_text(path.read_bytes())
     try:
-        text = path.read_bytes().decode("utf-8-sig")
         if path.suffix == ".json":
             document = parsed_json(text)
         else:
             check_plain_toml(text)
             document = toml_module().loads(text.replace("\r\n", "\n"))
     except (ValueError, RecursionError) as error:
-        raise CaseInputError(f"cannot be read: {error}") from error
+        hint = toml_hint(text, str(error)) if path.suffix == ".toml" else ""
+        raise CaseInputError(f"cannot be read: {error}{hint}") from error
     if not isinstance(document, dict):
         raise CaseInputError("is not a table of names and values")
     check_numbers(document)
     return document
+
+
+def utf8_text(data: bytes) -> str:
+    """The text of a file in UTF-8, with or without a mark at its beginning.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Another encoding; names the line, and says how to save the file.
+    """
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise CaseInputError(
+            'is UTF-16 (Notepad calls it "Unicode"): save it as UTF-8 in your editor'
+        )
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        shown = data[error.start : error.start + 1].decode("latin-1")
+        raise CaseInputError(
+            f"line {line} is not UTF-8 text (byte {data[error.start]:#04x}, {shown!r} in Latin-1): "
+            "save the file as UTF-8 in your editor"
+        ) from error
+
+
+def toml_hint(text: str, message: str) -> str:
+    """What is probably wrong with a line that is not TOML, and what to write; or nothing."""
+    found = LINE_IN_MESSAGE.search(message)
+    rows = text.split("\n")
+    row = rows[int(found[1]) - 1] if found and int(found[1]) <= len(rows) else ""
+    if path := WINDOWS_TEXT.search(row):
+        slashes = path[1].replace("\\\\", "\\").replace("\\", "/")[:MOST_SHOWN_PATH]
+        return (
+            "; between double quotes a backslash begins a code for a character: write "
+            f'"{slashes}" with slashes, or use single quotes'
+        )
+    if any(quote in row for quote in TYPOGRAPHIC):
+        return "; its quotes are typographic: replace them by straight ones (\")"
+    return ""
 
 
 def check_plain_toml(text: str) -> None:

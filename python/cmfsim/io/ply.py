@@ -77,8 +77,8 @@ def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
     ------
     CaseError
         (also `ValueError`) Not PLY; a header that does not end; fewer bytes than the header states,
-        or more that may be another row; indices that are no whole numbers or name no vertex; a coordinate that is not
-        finite.
+        or more that may be another row; indices that are no whole numbers or name no vertex; a
+        coordinate that is not finite.
     """
     elements, order, start = _header(data)
     names = [element.name for element in elements]
@@ -89,7 +89,7 @@ def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
     source = _Binary(data, start, order) if order else _Text(data, start)
     rows = {element.name: source.rows(element) for element in elements}
     left = source.left()
-    if left and _may_be_a_row(source, elements[-1], len(rows["vertex"].columns[0])):
+    if left and _may_be_a_row(source, elements[-1], elements[names.index("vertex")].number):
         raise CaseInputError(
             f"holds {left} more than its header states, and they read as another "
             f"{elements[-1].name}: the header states {elements[-1].number}; export it again"

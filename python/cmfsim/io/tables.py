@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,12 +14,15 @@ import numpy as np
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.case_changes import CaseChanges
 from cmfsim.io.files import (
+    LINE_IN_MESSAGE,
     check_numbers,
     check_plain_toml,
     check_readable,
     is_there,
     named,
+    toml_hint,
     toml_module,
+    utf8_text,
 )
 from cmfsim.io.toml_lines import KeyPath, line_of, toml_lines
 from cmfsim.values.checks import Floats, nearest
@@ -29,7 +33,11 @@ __all__ = ["UNDECIDED", "Table", "read_tables"]
 MAX_CASE_TEXT = 2**20
 # What `cmfsim init` writes where it cannot tell what is meant.
 UNDECIDED = "?"
-LINE_IN_MESSAGE = re.compile(r"\(at line (\d+), column (\d+)\)")
+
+# Characters below this one command a terminal and stand in no path.
+BLANK = 0x20
+# A drive or a share, of which only Windows knows.
+WINDOWS_PATH = re.compile(r"[A-Za-z]:[\\/]|\\\\")
 
 
 def read_tables(path: Path) -> "Table":
@@ -50,14 +58,12 @@ def read_tables(path: Path) -> "Table":
             f"{path.name}: has {path.stat().st_size} bytes, a case file at most {MAX_CASE_TEXT}"
         )
     try:
-        text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
         with named(path):
+            text = utf8_text(path.read_bytes()).replace("\r\n", "\n")
             check_plain_toml(text)
         values = toml_module().loads(text)
         with named(path):
             check_numbers(values)
-    except UnicodeDecodeError as error:
-        raise CaseInputError(f"{path.name}: is not UTF-8 text ({error})") from error
     except RecursionError as error:
         raise CaseInputError(f"{path.name}: is nested too deeply") from error
     except ValueError as error:
@@ -66,7 +72,8 @@ def read_tables(path: Path) -> "Table":
         message = str(error)
         found = LINE_IN_MESSAGE.search(message)
         place = f":{found[1]}" if found else ""
-        raise CaseInputError(f"{path.name}{place}: is not TOML: {message}") from error
+        hint = toml_hint(text, message)
+        raise CaseInputError(f"{path.name}{place}: is not TOML: {message}{hint}") from error
     lines = toml_lines(text)
     _refuse_undecided(values, lines, text, path.name)
     return Table(values, (), path.name, lines)
@@ -319,8 +326,24 @@ class Table:
         name = self.text(key)
         if "\0" in name:
             self.fail(key, "contains a zero character, which no file name can have")
+        if any(ord(c) < BLANK for c in name):
+            # "C:\new\table.nrrd": TOML takes \n and \t for a line end and a tab.
+            self.fail(
+                key,
+                f"is {name!r}, with a control character: between double quotes a backslash begins "
+                "a code for one; write the path with slashes, or in single quotes",
+            )
+        if os.name != "nt" and WINDOWS_PATH.match(name):
+            self.fail(
+                key,
+                f"is {name!r}, a path of Windows: write where this system has the file, such as "
+                '"/mnt/c/Users/me/ct.nrrd", or copy it into the folder of the case',
+            )
         try:
             path = folder / Path(name).expanduser()
+            if os.name != "nt" and "\\" in name and not os.path.lexists(path):
+                # A relative path, as Windows writes it.
+                path = folder / Path(name.replace("\\", "/"))
         except RuntimeError:
             self.fail(key, f"is {name!r}: no user has this name; write the full path")
         try:

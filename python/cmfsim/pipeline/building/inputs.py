@@ -95,9 +95,9 @@ def read_anatomy(
     files = {"skin": given_surfaces.skin, **given_surfaces.bones}
     for name, path in files.items():
         progress(f"reading surface {name}")
-        read = read_surface_file(path, units=given_surfaces.units, frame=given_surfaces.frame)
-        surfaces[name], repaired = repair_surface(read.surface, name)
-        findings.extend((*read.findings, *repaired))
+        given = read_surface_file(path, units=given_surfaces.units, frame=given_surfaces.frame)
+        surfaces[name], repaired = repair_surface(given.surface, name)
+        findings.extend((*given.findings, *repaired))
     progress("measuring distances from the surfaces")
     spacing = max(case.mesh.edge_length / VOXELS_PER_EDGE, LEAST_VOXEL)
     skin = surfaces.pop("skin")
