@@ -107,7 +107,7 @@ def write_series(
 ) -> None:
     """Nothing; each slice is in a file of its own, called after its number or as given."""
     sitk = import_module("SimpleITK")
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     writer = sitk.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
     writer.SetImageIO("GDCMImageIO")
@@ -164,12 +164,6 @@ def write_enhanced(path: Path, slices: list[DicomSlice]) -> None:
         )
         for s in slices
     )
-    meta = (
-        _element(0x0002, 0x0001, "OB", b"\0\1")
-        + _text(0x0002, 0x0002, "UI", ENHANCED_CT)
-        + _text(0x0002, 0x0003, "UI", "1.2.3.4.5")
-        + _text(0x0002, 0x0010, "UI", "1.2.840.10008.1.2.1")
-    )
     body = (
         _text(0x0008, 0x0008, "CS", "ORIGINAL\\PRIMARY\\AXIAL")
         + _text(0x0008, 0x0016, "UI", ENHANCED_CT)
@@ -189,6 +183,53 @@ def write_enhanced(path: Path, slices: list[DicomSlice]) -> None:
         + _element(0x5200, 0x9229, "SQ", shared)
         + _element(0x5200, 0x9230, "SQ", frames)
         + _element(0x7FE0, 0x0010, "OW", b"".join(p.tobytes() for p in stored))
+    )
+    _write(path, ENHANCED_CT, body)
+
+
+CLASSIC_CT = "1.2.840.10008.5.1.4.1.1.2"
+
+
+def write_classic_frames(
+    path: Path, slices: list[DicomSlice], more: dict[int, str], *, placed: bool = True
+) -> None:
+    """Nothing; all slices are frames of one CT that states the place of the first alone.
+
+    `more` has further numbers in text, by tag.
+    """
+    first = slices[0]
+    rows, columns = first.pixels.shape
+    texts = {
+        0x00080008: ("CS", "ORIGINAL\\PRIMARY\\AXIAL"),
+        0x00080016: ("UI", CLASSIC_CT),
+        0x00080018: ("UI", "1.2.3.4.5"),
+        0x00080060: ("CS", "CT"),
+        0x0020000E: ("UI", "1.2.3"),
+        0x00280004: ("CS", "MONOCHROME2"),
+        0x00280008: ("IS", str(len(slices))),
+        0x00280030: ("DS", _backslashed(first.spacing[::-1])),
+        0x00281052: ("DS", f"{first.intercept:g}"),
+        0x00281053: ("DS", f"{first.slope:g}"),
+        **{tag: ("DS", text) for tag, text in more.items()},
+    }
+    if placed:
+        texts[0x00200032] = ("DS", _backslashed(first.position))
+        texts[0x00200037] = ("DS", _backslashed((*first.row, *first.column)))
+    numbers = {0x00280002: 1, 0x00280010: rows, 0x00280011: columns}
+    numbers |= {0x00280100: 16, 0x00280101: 16, 0x00280102: 15, 0x00280103: 0}
+    elements = {t: _text(t >> 16, t & 0xFFFF, *given) for t, given in texts.items()}
+    elements |= {t: _short(t >> 16, t & 0xFFFF, n) for t, n in numbers.items()}
+    stored = [np.round((s.pixels - s.intercept) / s.slope).astype("<u2") for s in slices]
+    pixels = _element(0x7FE0, 0x0010, "OW", b"".join(p.tobytes() for p in stored))
+    _write(path, CLASSIC_CT, b"".join(elements[tag] for tag in sorted(elements)) + pixels)
+
+
+def _write(path: Path, kind: str, body: bytes) -> None:
+    meta = (
+        _element(0x0002, 0x0001, "OB", b"\0\1")
+        + _text(0x0002, 0x0002, "UI", kind)
+        + _text(0x0002, 0x0003, "UI", "1.2.3.4.5")
+        + _text(0x0002, 0x0010, "UI", "1.2.840.10008.1.2.1")
     )
     length = _element(0x0002, 0x0000, "UL", len(meta).to_bytes(4, "little"))
     path.write_bytes(bytes(128) + b"DICM" + length + meta + body)

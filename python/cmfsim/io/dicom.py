@@ -1,5 +1,9 @@
 """A CT from a folder of DICOM files, or a file of several frames: which series is meant."""
 
+import contextlib
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +17,14 @@ from cmfsim.io.image_headers import check_shape
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["read_dicom_file", "read_dicom_folder"]
+__all__ = ["dicom_files", "dicom_places", "read_dicom_file", "read_dicom_folder"]
 
 # A folder with more files is not one patient's scan.
 MOST_FILES = 20_000
+# How far below a folder its series go on.
+MOST_DEPTH = 6
+# Bytes before the mark of DICOM.
+PREAMBLE = 128
 # A series of fewer slices is a scout or a sample, no second volume that might be meant.
 LEAST_VOLUME = 10
 # The largest series is meant where no other has more than this part of its slices.
@@ -45,7 +53,7 @@ class Series:
     @property
     def count(self) -> int:
         """Its slices."""
-        return sum(max(1, len(h.frames)) for h in self.headers)
+        return sum(h.count for h in self.headers)
 
     def described(self) -> str:
         """Number, description, slices and spacing, as a person tells series apart."""
@@ -84,7 +92,7 @@ def read_dicom_folder(
     ImageError
         (also `ValueError`) No CT, several that may be meant, slices that do not make a volume.
     """
-    headers, findings = _headers(folder)
+    headers, findings = _headers(folder, series)
     chosen, more = _chosen(folder, _series(headers), series)
     findings += more
     slices = [s for header in chosen.headers for s in slices_of(header)]
@@ -120,28 +128,118 @@ def _check_modality(name: str, found: set[str]) -> None:
         )
 
 
-def _headers(folder: Path) -> tuple[list[DicomHeader], list[Finding]]:
-    """The DICOM images of a folder, by file name, and what else is there."""
+def dicom_files(folder: Path) -> list[Path]:
+    """The files that a folder of DICOM may be read from: its own, and DICOM files below it."""
+    own = sorted(p for p in folder.iterdir() if p.is_file())
+    return [*own, *(p for p in _below(folder) if _is_marked(p))]
+
+
+def dicom_places(folders: Sequence[Path]) -> list[tuple[Path, str | None]]:
+    """Where the images in some folders are read, and which series of a place is meant.
+
+    Folders that have parts of one series are one place: the folder that all of them lie in. The
+    series is None where the place holds nothing else.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        That directly hold DICOM files.
+    """
+    held = {folder: _series_in(folder) for folder in folders}
+    # A DICOMDIR alone is no image.
+    groups: list[tuple[list[Path], Counter[str]]] = []
+    for folder, counts in held.items():
+        if not counts:
+            continue
+        joined = [g for g in groups if set(g[1]) & set(counts) - {""}]
+        paths = [p for g in joined for p in g[0]]
+        groups = [g for g in groups if g not in joined]
+        groups.append(([*paths, folder], sum((g[1] for g in joined), counts)))
+    places: list[tuple[Path, str | None]] = []
+    for paths, counts in groups:
+        if len(paths) == 1:
+            places.append((paths[0], None))
+            continue
+        place = Path(os.path.commonpath(paths))
+        others = [f for f in held if held[f] and f not in paths and f.is_relative_to(place)]
+        largest = max(sorted(counts), key=lambda uid: counts[uid])
+        places.append((place, largest if others else None))
+    return sorted(places)
+
+
+def _series_in(folder: Path) -> Counter[str]:
+    """How many images of each series a folder holds; those that are damaged are found later."""
+    counts: Counter[str] = Counter()
+    for path in sorted(p for p in folder.iterdir() if p.is_file()):
+        with contextlib.suppress(ImageInputError, OSError):
+            header = dicom_header(path)
+            if header is not None and header.has_pixels:
+                counts[header.text("series_uid")] += 1
+    return counts
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    """The plain files in the folders below a folder, in a fixed order; hidden ones left out."""
+    for place, folders, names in os.walk(folder):
+        here = Path(place)
+        deep = len(here.relative_to(folder).parts) >= MOST_DEPTH
+        folders[:] = [] if deep else sorted(f for f in folders if f[0] != ".")
+        if here != folder:
+            yield from (p for name in sorted(names) if (p := here / name).is_file())
+
+
+def _is_marked(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(PREAMBLE + 4)[PREAMBLE:] == b"DICM"
+
+
+def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[Finding]]:
+    """The DICOM images of a folder, by file name, and what else is there.
+
+    A series goes on in folders below: scanners and disks write some hundred files to each. Of
+    these, only the series of the folder itself are taken, or the one that is asked for.
+    """
     paths = sorted(p for p in folder.iterdir() if p.is_file())
-    if len(paths) > MOST_FILES:
-        raise ImageInputError(
-            f"{folder.name}: holds {len(paths)} files, more than {MOST_FILES}: name the folder of "
-            "one series"
-        )
+    _check_number(folder, len(paths))
     headers, others = [], []
     for path in paths:
         header = dicom_header(path)
         if header is None:
             others.append(path.name)
-        elif header.has_pixels and header.text("sop_class") != DIRECTORY:
+        elif _is_image(header):
             headers.append(header)
+    below, damaged = _headers_below(folder, {*map(_key, headers)}, wanted)
+    if not headers and damaged:
+        raise ImageInputError(damaged[0])
+    findings = _below_findings(folder, headers, below)
+    headers += below
     if not headers:
-        below = sorted(p.name for p in folder.iterdir() if p.is_dir())
-        hint = f"; it has the folders {', '.join(below[:5])}: name one of them" if below else ""
         raise ImageInputError(
-            f"{folder.name}: the folder holds no DICOM image ({len(paths)} files){hint}"
+            f"{folder.name}: neither the folder nor those below it hold a DICOM image "
+            f"({len(paths)} files in it)"
         )
-    findings = []
+    if damaged:
+        findings.append(
+            Finding.warning(
+                "dicom-other-files",
+                f"skipped {counted(len(damaged), 'file')} in folders below: {damaged[0]}",
+                where=folder.name,
+                why="it may be a slice of this series",
+                fix="copy it again, or remove it",
+            )
+        )
+    missing = [p.name for p in sorted(folder.iterdir()) if p.is_symlink() and not p.exists()]
+    if missing:
+        findings.append(
+            Finding.warning(
+                "dicom-other-files",
+                f"skipped {counted(len(missing), 'link')} to files that are not here: "
+                f"{listed(missing)}",
+                where=folder.name,
+                why="slices at the ends of a series are not missed when they are absent",
+                fix="fetch the files (with DataLad: datalad get)",
+            )
+        )
     if others:
         findings.append(
             Finding.note(
@@ -154,12 +252,72 @@ def _headers(folder: Path) -> tuple[list[DicomHeader], list[Finding]]:
     return headers, findings
 
 
+def _headers_below(
+    folder: Path, own: set[tuple[str, str]], wanted: str | None
+) -> tuple[list[DicomHeader], list[str]]:
+    """The images in folders below that belong to a folder, and why others cannot be read."""
+    headers, damaged = list[DicomHeader](), list[str]()
+    for path in _below(folder):
+        if not _is_marked(path):
+            continue
+        _check_number(folder, len(headers))
+        try:
+            header = dicom_header(path)
+        except ImageInputError as error:
+            damaged.append(str(error))
+            continue
+        if header is None or not _is_image(header):
+            continue
+        is_wanted = wanted is not None and _is_meant(header, wanted)
+        if not own or is_wanted or (header.text("series_uid") and _key(header) in own):
+            headers.append(header)
+    return headers, damaged
+
+
+def _below_findings(
+    folder: Path, own: list[DicomHeader], below: list[DicomHeader]
+) -> list[Finding]:
+    places = Counter(h.path.parent.relative_to(folder).as_posix() for h in below)
+    if len(places) + bool(own) < 2:
+        return []
+    parts = [f"{name} ({n})" for name, n in sorted(places.items())]
+    return [
+        Finding.note(
+            "dicom-folders",
+            f"images were also read from folders below: {listed(parts)}",
+            where=folder.name,
+            why="a series is known by its UID, not by its folder",
+        )
+    ]
+
+
+def _check_number(folder: Path, count: int) -> None:
+    if count > MOST_FILES:
+        raise ImageInputError(
+            f"{folder.name}: holds {count} files, more than {MOST_FILES}: name the folder of one "
+            "series"
+        )
+
+
+def _is_image(header: DicomHeader) -> bool:
+    return header.has_pixels and header.text("sop_class") != DIRECTORY
+
+
+def _key(header: DicomHeader) -> tuple[str, str]:
+    """What images of one series share: slices of several modalities under one UID are several."""
+    return header.text("series_uid"), header.text("modality")
+
+
+def _is_meant(header: DicomHeader, wanted: str) -> bool:
+    """Whether an image is of the series of a UID or number."""
+    return wanted.strip() in {header.text("series_uid"), header.text("series_number").strip()}
+
+
 def _series(headers: list[DicomHeader]) -> list[Series]:
-    """The series of a folder; slices of several modalities under one UID are several."""
+    """The series of a folder."""
     groups: dict[tuple[str, str], list[DicomHeader]] = {}
     for header in headers:
-        key = (header.text("series_uid"), header.text("modality"))
-        groups.setdefault(key, []).append(header)
+        groups.setdefault(_key(header), []).append(header)
     return [Series(uid, tuple(group)) for (uid, _), group in sorted(groups.items())]
 
 
@@ -169,9 +327,7 @@ def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Seri
     how = 'write series = "NUMBER or UID" beside the folder in the case file, or keep one series'
     how += " in the folder"
     if wanted is not None:
-        meant = [
-            s for s in found if wanted.strip() in {s.uid, s.first.text("series_number").strip()}
-        ]
+        meant = [s for s in found if _is_meant(s.first, wanted)]
         if len(meant) != 1:
             raise ImageInputError(
                 f"{folder.name}: series {wanted!r} was requested, which {len(meant)} of "

@@ -4,6 +4,7 @@ Only what stands before the pixels is read. Nested sequences are read as well, f
 enhanced multi-frame image are placed there. Pixels are decoded elsewhere, by a third-party reader.
 """
 
+import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -68,12 +69,11 @@ FLOAT_PIXELS = frozenset({0x7FE00008, 0x7FE00009})
 ITEM, ITEM_END, SEQUENCE_END = 0xFFFEE000, 0xFFFEE00D, 0xFFFEE0DD
 UNDEFINED = 0xFFFFFFFF
 # Value representations whose length takes four bytes, after two that are reserved.
-KINDS = frozenset(
-    kind.encode()
-    for kind in "AE AS AT CS DA DS DT FD FL IS LO LT OB OD OF OL OV OW PN SH SL SQ SS ST SV TM UC UI UL "
-    "UN UR US UT UV".split()
-)
 LONG = frozenset((b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"))  # fmt: skip # noqa: E501
+# All value representations.
+KINDS = LONG | frozenset(
+    re.findall(rb"[A-Z]{2}", b"AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US")
+)
 EXPLICIT_BIG, DEFLATED, IMPLICIT = "1.2.840.10008.1.2.2", "1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2"  # fmt: skip # noqa: E501
 PREAMBLE = 128
 # The group that states how all others are written.

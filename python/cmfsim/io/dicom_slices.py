@@ -12,6 +12,10 @@ from cmfsim.io.dicom_headers import DicomHeader, numbers_of
 __all__ = ["Slice", "Stack", "counted", "is_localizer", "listed", "slices_of"]
 
 
+# Where a classic image of several frames states how far apart they are, by the names of DICOM.
+GAPS = {"slice_spacing": "SpacingBetweenSlices", "thickness": "SliceThickness"}
+
+
 @dataclass(frozen=True)
 class Slice:
     """One slice: where it lies, and the file and frame of its pixels."""
@@ -80,7 +84,7 @@ def _placed_by_the_first(header: DicomHeader) -> list[Slice]:
     offsets = header.numbers("frame_offsets", header.count)
     assumed = ""
     if offsets is None:
-        for key, what in (("slice_spacing", "SpacingBetweenSlices"), ("thickness", "SliceThickness")):
+        for key, what in GAPS.items():
             gap = header.numbers(key, 1)
             if gap is not None and gap[0] != 0.0:
                 offsets = gap[0] * steps

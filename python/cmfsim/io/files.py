@@ -63,7 +63,7 @@ OUTSIDE_TEXTS = re.compile(
 # Where TOML's error lies; a text between double quotes with a backslash; quotes of word processors.
 LINE_IN_MESSAGE = re.compile(r"\(at line (\d+), column (\d+)\)")
 WINDOWS_TEXT = re.compile(r'"([^"\n]*\\[^"\n]*)"')
-TYPOGRAPHIC = ("\N{LEFT DOUBLE QUOTATION MARK}", "\N{RIGHT DOUBLE QUOTATION MARK}", "\N{DOUBLE LOW-9 QUOTATION MARK}")
+TYPOGRAPHIC = "\N{LEFT DOUBLE QUOTATION MARK}\N{RIGHT DOUBLE QUOTATION MARK}"
 MOST_SHOWN_PATH = 120
 # The units that every file of ours has; others are refused, never taken for these.
 UNITS: Mapping[str, str] = MappingProxyType({"length": "mm", "stress": "MPa", "force": "N"})
@@ -183,9 +183,15 @@ def beside(folder: Path, where: str, name: object) -> Path:
 
 
 def is_below(path: Path, folder: Path) -> bool:
-    """Whether a path leads into a folder once its links are followed."""
+    """Whether a path leads into a folder once its links are followed.
+
+    A data set of git-annex or DataLad keeps its files below `.git`, and links to them: these links
+    lead into it as well.
+    """
     try:
-        return path.resolve().is_relative_to(folder.resolve())
+        real, top = path.resolve(), folder.resolve()
+        stores = (place / ".git" / "annex" / "objects" for place in (top, *top.parents))
+        return real.is_relative_to(top) or any(real.is_relative_to(store) for store in stores)
     except (OSError, RuntimeError, ValueError):
         # Links that lead round in a circle, a name that no system takes.
         return False
@@ -249,7 +255,7 @@ def toml_hint(text: str, message: str) -> str:
             f'"{slashes}" with slashes, or use single quotes'
         )
     if any(quote in row for quote in TYPOGRAPHIC):
-        return "; its quotes are typographic: replace them by straight ones (\")"
+        return '; its quotes are typographic: replace them by straight ones (")'
     return ""
 
 

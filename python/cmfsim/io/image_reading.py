@@ -77,7 +77,9 @@ def _read(path: str, kind: str) -> Any:
         image = reader.Execute()
     except RuntimeError as error:
         raise ImageInputError(
-            f"{name}: is cut short or damaged ({_last_line(error)}); copy it again"
+            f"{name}: cannot be read, because it is cut short, damaged or unusual "
+            f"({_last_line(error)[:100]}): copy it again; if other programs show it, save it anew "
+            "(DICOM: with gdcmconv or dcmconv)"
         ) from error
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise ImageInputError(

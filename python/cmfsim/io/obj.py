@@ -123,7 +123,7 @@ def _points(vertices: list[list[bytes]], numbers: list[int]) -> Floats:
             if len(row) == 5 and not ONE.fullmatch(row[4]):
                 raise CaseInputError(
                     f"line {number}: a vertex has the weight {shown(row[4])}: only 1 is read, "
-                    "since programs differ in what other weights do to x y z; export it without weights"
+                    "since programs differ in what others do to x y z; export it without weights"
                 )
         vertices = [row[:4] for row in vertices]
     words = [word for _, *xyz in vertices for word in xyz]

@@ -326,13 +326,6 @@ class Table:
         name = self.text(key)
         if "\0" in name:
             self.fail(key, "contains a zero character, which no file name can have")
-        if any(ord(c) < BLANK for c in name):
-            # "C:\new\table.nrrd": TOML takes \n and \t for a line end and a tab.
-            self.fail(
-                key,
-                f"is {name!r}, with a control character: between double quotes a backslash begins "
-                "a code for one; write the path with slashes, or in single quotes",
-            )
         if os.name != "nt" and WINDOWS_PATH.match(name):
             self.fail(
                 key,
@@ -347,9 +340,16 @@ class Table:
         except RuntimeError:
             self.fail(key, f"is {name!r}: no user has this name; write the full path")
         try:
-            is_there(path)
+            found = is_there(path)
         except CaseInputError as error:
             self.fail(key, f"names {error}")
+        if not found and any(ord(c) < BLANK for c in name):
+            # "C:\new\table.nrrd": TOML takes \n and \t for a line end and a tab.
+            self.fail(
+                key,
+                f"is {name!r}, with a control character: between double quotes a backslash begins "
+                "a code for one; write the path with slashes, or in single quotes",
+            )
         return path
 
     def table(self, key: str) -> "Table":

@@ -1,5 +1,6 @@
 """DICOM series as scanners and archives give them: placed rightly, or refused by name."""
 
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 import cmfsim
 import ct_variants as variants
 from cmfsim import ImageData, ImageError
+from cmfsim.io.dicom import dicom_files, dicom_places
+from cmfsim.io.dicom_headers import dicom_header
 from cmfsim.io.image_grids import of_slices
 from cmfsim.io.images import read_image_file
-from dicom_series import axial, tilted, write_enhanced, write_series
+from dicom_series import axial, tilted, write_classic_frames, write_enhanced, write_series
 from real_heads import data_folder
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
@@ -206,6 +209,90 @@ def test_acquisitions_one_after_the_other_are_one_scan(tmp_path):
     same(read_image_file(tmp_path / "ct"), noisy())
 
 
+def test_slices_without_an_acquisition_number_belong_to_any(tmp_path):
+    slices = [s.with_tags(t0020_0012="1" if k % 3 else "") for k, s in enumerate(axial(noisy()))]
+    write_series(tmp_path / "ct", slices)
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    assert not found.findings
+
+
+def test_acquisitions_that_alternate_on_one_even_row_are_one_scan_with_a_warning(tmp_path):
+    slices = [s.with_tags(t0020_0012=str(1 + k % 2)) for k, s in enumerate(axial(noisy()))]
+    write_series(tmp_path / "ct", slices)
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    (finding,) = found.findings
+    assert (finding.severity, finding.code) == ("warning", "field-ignored")
+    assert "acquisitions 1 and 2" in finding.what
+
+
+def explicit_series(folder):
+    """Nothing; slices whose elements state their kinds."""
+    folder.mkdir()
+    for k, one in enumerate(axial(noisy())):
+        write_classic_frames(folder / f"{k}.dcm", [one], {})
+
+
+def with_elements(path, more):
+    """Nothing; a file has further elements in bytes, before the UID of the series."""
+    data = path.read_bytes()
+    at = data.index(b"\x20\x00\x0e\x00UI")
+    path.write_bytes(data[:at] + more + data[at:])
+
+
+def private(kind, length, value=b"abcd"):
+    return struct.pack("<HH", 0x0009, 0x1001) + kind + length + value
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        private(b"\0\0", struct.pack("<H", 4)),
+        private(b"--", b"\0\0" + struct.pack("<I", 4)),
+    ],
+)
+def test_private_elements_of_no_known_kind_are_passed_over(tmp_path, odd):
+    explicit_series(tmp_path / "ct")
+    for path in (tmp_path / "ct").iterdir():
+        with_elements(path, odd)
+    same(read_image_file(tmp_path / "ct"), noisy())
+
+
+def test_a_private_element_without_any_kind_is_passed_over(tmp_path):
+    explicit_series(tmp_path / "ct")
+    with_elements(tmp_path / "ct" / "3.dcm", private(b"", struct.pack("<I", 4)))
+    assert dicom_header(tmp_path / "ct" / "3.dcm").text("series_uid") == "1.2.3"
+
+
+def test_an_element_whose_end_is_not_found_is_named_with_a_remedy(tmp_path):
+    explicit_series(tmp_path / "ct")
+    with_elements(tmp_path / "ct" / "3.dcm", private(b"\0\0", struct.pack("<H", 9999)))
+    refused(tmp_path / "ct", "3.dcm", "0009,1001", "gdcmconv")
+    # This one the reader of pixels does not pass over.
+    explicit_series(tmp_path / "odd")
+    with_elements(tmp_path / "odd" / "3.dcm", private(b"??", struct.pack("<H", 4)))
+    refused(tmp_path / "odd", "3.dcm", "gdcmconv")
+    # One that is not private may be needed.
+    public = struct.pack("<HH", 0x0008, 0x0070) + b"\0\0" + struct.pack("<H", 4) + b"abcd"
+    explicit_series(tmp_path / "other")
+    with_elements(tmp_path / "other" / "3.dcm", public)
+    refused(tmp_path / "other", "3.dcm", "0008,0070")
+
+
+def test_a_slice_without_orientation_has_that_of_all_others_with_a_warning(tmp_path):
+    explicit_series(tmp_path / "ct")
+    path = tmp_path / "ct" / "3.dcm"
+    head, tag, rest = path.read_bytes().partition(b"\x20\x00\x37\x00DS")
+    (length,) = struct.unpack("<H", rest[:2])
+    path.write_bytes(head + rest[2 + length :])
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    (finding,) = found.findings
+    assert (finding.severity, finding.code) == ("warning", "field-ignored")
+    assert "3.dcm" in finding.what
+
+
 def test_scouts_are_skipped_and_reported(tmp_path):
     slices = axial(noisy())
     scout = slices[0].with_tags(t0008_0008="ORIGINAL\\PRIMARY\\LOCALIZER")
@@ -325,6 +412,102 @@ def test_missing_frames_and_frames_of_several_scales_are_refused(tmp_path):
     slices[2] = replace(slices[2], intercept=-1000.0)
     write_enhanced(tmp_path / "scales.dcm", slices)
     refused(tmp_path / "scales.dcm", "different rescale")
+
+
+@pytest.mark.parametrize("gap", [{0x00180088: "2"}, {0x00180050: "2"}, {0x3004000C: "offsets"}])
+def test_frames_of_a_classic_image_follow_the_first(tmp_path, gap):
+    """As cone-beam scanners write it; a warning where the file does not state the places."""
+    if 0x3004000C in gap:
+        gap = {0x3004000C: "\\".join(str(2.0 * k) for k in range(SHAPE[2]))}
+    write_classic_frames(tmp_path / "ct.dcm", axial(noisy()), gap)
+    found = read_image_file(tmp_path / "ct.dcm")
+    same(found, noisy())
+    assert codes(found) == (set() if 0x3004000C in gap else {"dicom-frames-assumed"})
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "ct.dcm").rename(tmp_path / "folder" / "ct")
+    same(read_image_file(tmp_path / "folder"), noisy())
+
+
+def test_frames_of_a_classic_image_without_place_or_distance_are_refused(tmp_path):
+    write_classic_frames(tmp_path / "a.dcm", axial(noisy()), {})
+    refused(tmp_path / "a.dcm", "SpacingBetweenSlices", "one file per slice")
+    write_classic_frames(tmp_path / "b.dcm", axial(noisy()), {0x00180088: "2"}, placed=False)
+    refused(tmp_path / "b.dcm", "position and orientation", "one file per slice")
+
+
+# Folders ---------------------------------------------------------------------------------------
+
+
+def parted(folder, places, **options):
+    """A series of which each slice lies in the folder of its place."""
+    write_series(folder / "all", axial(noisy()), **options)
+    for path, place in zip(sorted((folder / "all").iterdir()), places, strict=True):
+        (folder / place).mkdir(parents=True, exist_ok=True)
+        path.rename(folder / place / path.name)
+    (folder / "all").rmdir()
+
+
+@pytest.mark.parametrize("places", [["."] * 4 + ["MORE"] * 4, ["a"] * 3 + ["b/c"] * 5])
+def test_a_series_goes_on_in_folders_below(tmp_path, places):
+    parted(tmp_path / "ct", places)
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    (finding,) = found.findings
+    assert finding.code == "dicom-folders"
+    assert f"{places[-1]} ({places.count(places[-1])})" in finding.what
+
+
+def test_other_series_below_a_folder_are_none_of_its_own(tmp_path):
+    """A scan after the operation, in a folder below, unless it is asked for."""
+    after = noisy().with_values(noisy().values + np.int16(5))
+    write_series(tmp_path / "ct", axial(noisy()))
+    write_series(tmp_path / "ct" / "after", axial(after), uid="1.2.4", study="1.5")
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    assert not found.findings
+    same(read_image_file(tmp_path / "ct", series="1.2.4"), after)
+    assert dicom_places([tmp_path / "ct", tmp_path / "ct" / "after"]) == [
+        (tmp_path / "ct", None),
+        (tmp_path / "ct" / "after", None),
+    ]
+
+
+def test_folders_with_parts_of_one_series_are_one_place(tmp_path):
+    parted(tmp_path, ["a"] * 3 + ["b"] * 5)
+    folders = [tmp_path / "a", tmp_path / "b"]
+    assert dicom_places(folders) == [(tmp_path, None)]
+    write_series(tmp_path / "after", axial(noisy()), uid="1.2.4", study="1.5")
+    # The folder of both holds another series now: which one is meant, its UID says.
+    assert dicom_places([*folders, tmp_path / "after"]) == [
+        (tmp_path, "1.2.3"),
+        (tmp_path / "after", None),
+    ]
+    same(read_image_file(tmp_path, series="1.2.3"), noisy())
+    refused(tmp_path, "2 CT series")
+
+
+def test_a_change_in_a_folder_below_changes_the_hash_of_a_series(tmp_path):
+    parted(tmp_path / "ct", ["."] * 4 + ["MORE"] * 4)
+    before = dicom_files(tmp_path / "ct")
+    assert [p.parent.name for p in before] == ["ct"] * 4 + ["MORE"] * 4
+    (tmp_path / "ct" / "MORE" / "notes.txt").write_text("by hand")
+    assert dicom_files(tmp_path / "ct") == before
+
+
+def test_slices_that_are_links_are_read_and_broken_links_reported(tmp_path):
+    """As DataLad leaves a folder: each file links into a store, some of it not fetched."""
+    write_series(tmp_path / "store", axial(noisy()))
+    (tmp_path / "ct").mkdir()
+    for path in (tmp_path / "store").iterdir():
+        (tmp_path / "ct" / path.name).symlink_to(f"../store/{path.name}")
+    same(read_image_file(tmp_path / "ct"), noisy())
+    (tmp_path / "store" / "1.2.3_0007.dcm").unlink()
+    found = read_image_file(tmp_path / "ct")
+    assert found.image.values.shape[2] == SHAPE[2] - 1
+    (finding,) = found.findings
+    assert (finding.severity, finding.code) == ("warning", "dicom-other-files")
+    assert "1.2.3_0007.dcm" in finding.what
+    assert "datalad get" in finding.fix
 
 
 # Real data -------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from cmfsim.io import (
     read_surface_file,
     read_transform,
 )
+from cmfsim.io.dicom import dicom_files
 from cmfsim.io.folders import check_below, check_writable
 from cmfsim.io.images import read_image_file
 from cmfsim.io.models import is_model_file
@@ -311,10 +313,9 @@ def _files(case: Case) -> Iterator[Path]:
 
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
-    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-    for file in files:
+    for file in dicom_files(path) if path.is_dir() else [path]:
         if path.is_dir():
-            digest.update(f"{file.name}\n".encode())
+            digest.update(os.fsencode(f"{file.relative_to(path).as_posix()}\n"))
         with file.open("rb") as stream:
             while chunk := stream.read(CHUNK):
                 digest.update(chunk)

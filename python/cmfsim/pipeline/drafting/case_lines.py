@@ -1,11 +1,11 @@
 """Lines of a case file with their reasons, and questions where nobody but a person can decide."""
 
-import json
+import os
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-__all__ = ["Taken", "Text", "clean", "quoted"]
+__all__ = ["Taken", "Text", "clean", "legible", "quoted"]
 
 # Characters of a line before its comment goes to lines of its own.
 WIDTH = 100
@@ -52,9 +52,26 @@ def clean(text: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
+def legible(name: str) -> str:
+    """The name of a file as text: bytes that are not UTF-8 are read as Latin-1."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return os.fsencode(name).decode("latin-1")
+    return name
+
+
 def quoted(text: str) -> str:
-    """A TOML string."""
-    return json.dumps(text, ensure_ascii=any(not c.isprintable() for c in text))
+    """A TOML string.
+
+    Raises
+    ------
+    UnicodeEncodeError
+        (also `ValueError`) The text is the name of a file that is not UTF-8: no case can name it.
+    """
+    text.encode()
+    kept = (c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in text)
+    return f'"{"".join(kept)}"'
 
 
 @dataclass

@@ -66,12 +66,19 @@ def choose_images(found: Sequence[ImageFind]) -> Images:
         _check_values(images, before[0])
     elif before:
         names = " or ".join(find.label for find in before)
-        choices = tuple(f'"{find.label}": {_said(find)}' for find in before)
+        choices = tuple(_choice(find) for find in before)
         images.question = (f"{names}: which one is before the operation?", choices)
         images.taken += [
             Taken(find.label, "", images.question[0], question=True) for find in before
         ]
     return images
+
+
+def _choice(find: ImageFind) -> str:
+    """What may be written for an image, and what it is."""
+    path = find.label.removesuffix(f" (series {find.series})")
+    series = "" if find.series is None else f' with series = "{find.series}" on a line of its own'
+    return f'"{path}"{series}: {_said(find)}'
 
 
 def _no_ct(find: ImageFind) -> str:

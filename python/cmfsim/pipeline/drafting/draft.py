@@ -10,7 +10,7 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.io.landmarks import write_landmarks
 from cmfsim.io.surfaces import write_surface
-from cmfsim.pipeline.drafting.case_lines import Taken, Text, quoted
+from cmfsim.pipeline.drafting.case_lines import Taken, Text, legible, quoted
 from cmfsim.pipeline.drafting.choices import Images, Marks, choose_images, choose_landmarks
 from cmfsim.pipeline.drafting.finds import EXTRACTED, LandmarkFind, SurfaceFind
 from cmfsim.pipeline.drafting.gathering import Gathered
@@ -106,7 +106,7 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
     for entry in taken:
         mark = "?" if entry.question or not entry.taken_for else entry.taken_for
         text.comment(f"{entry.label}: {mark} ({entry.why})", hang=4)
-    text.lines += ["", 'format = "cmfsim-case"', "version = 1", f"name = {quoted(name)}"]
+    text.lines += ["", 'format = "cmfsim-case"', "version = 1", f"name = {quoted(legible(name))}"]
     achieved = not draft.plan.motions and _has_after(draft)
     if achieved:
         text.value(
@@ -213,6 +213,8 @@ def _write_image(draft: _Draft) -> None:
         low, high = images.ct.values
         why = f"{images.ct.words}, {low:g} to {high:g}"
         text.value("file", quoted(_image_path(draft)), why)
+        if images.ct.series is not None:
+            text.value("series", quoted(images.ct.series), "the folder holds others as well")
         if not np.allclose(images.ct.to_world, np.eye(4), rtol=0.0, atol=SAME):
             text.comment(
                 "The scene turns this volume; the case is in the volume's own coordinates."

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.files import is_below
+from cmfsim.io.dicom import dicom_places
 from cmfsim.io.images import read_image_file
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file
 from cmfsim.io.stated_frames import is_own_file
@@ -44,6 +44,9 @@ SCENES = (".mrml", ".mrb")
 EXTRACTED = "from_scene"
 # Files by which a folder is known as one that cmfsim wrote.
 OURS = ("prediction.json", "build.json", "metrics.json", "cmfsim-scene.mrml")
+# Why files are not read.
+NOT_UTF8 = "its name is not UTF-8, so a case file cannot name it: rename it"
+NOT_HERE = "is a link to a file that is not here: fetch it (with DataLad: datalad get)"
 # What a DICOM file holds after its preamble.
 PREAMBLE = 128
 
@@ -113,6 +116,8 @@ class ImageFind:
         Its lowest and highest corner.
     error : str
         Why it cannot be read; empty if it can.
+    series : str or None
+        UID of the DICOM series that is meant, where the folder holds several.
     """
 
     label: str
@@ -123,6 +128,7 @@ class ImageFind:
     words: str = ""
     box: Floats | None = None
     error: str = ""
+    series: str | None = None
     findings: tuple[Finding, ...] = ()
     to_world: Floats = field(default_factory=lambda: np.eye(4))
     chain: tuple[str, ...] = ()
@@ -169,7 +175,20 @@ class Listing:
     transforms: list[Path] = field(default_factory=list)
     markups: list[Path] = field(default_factory=list)
     scenes: list[Path] = field(default_factory=list)
-    dicom: list[Path] = field(default_factory=list)
+    dicom: list[tuple[Path, str | None]] = field(default_factory=list)
+    unread: dict[tuple[Path, str], list[Path]] = field(default_factory=dict)
+
+    def skip(self, path: Path, why: str) -> None:
+        """Notes a file that is not read."""
+        self.unread.setdefault((path.parent, why), []).append(path)
+
+    def others(self, folder: Path) -> list[OtherFind]:
+        """What is not read, and why."""
+        return [
+            OtherFind(path.relative_to(folder).as_posix(), why)
+            for (_, why), paths in self.unread.items()
+            for path in paths
+        ]
 
 
 def listing(folder: Path) -> Listing:
@@ -182,7 +201,7 @@ def listing(folder: Path) -> Listing:
     """
     found = Listing()
     dicom: dict[Path, None] = {}
-    for count, path in enumerate(_files(folder)):
+    for count, path in enumerate(_files(folder, found)):
         if count >= MAX_FILES:
             raise CaseInputError(
                 f"{folder}: contains more than {MAX_FILES} files: give the folder of one patient"
@@ -211,12 +230,15 @@ def listing(folder: Path) -> Listing:
             kind.append(path)
         elif path.parent not in dicom and _is_dicom(path):
             dicom[path.parent] = None
-    found.dicom = list(dicom)
+    found.dicom = dicom_places(list(dicom))
     return found
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    """The plain files of a folder in a fixed order; hidden ones and cmfsim's results left out."""
+def _files(folder: Path, found: Listing) -> Iterator[Path]:
+    """The plain files of a folder in a fixed order; hidden ones and cmfsim's results left out.
+
+    Links are followed: the folder is the user's own. Files that no case can name are noted.
+    """
     for place, folders, names in os.walk(folder):
         here = Path(place)
         if here != folder and any(name in names for name in OURS):
@@ -226,8 +248,23 @@ def _files(folder: Path) -> Iterator[Path]:
         folders[:] = [] if deep else sorted(f for f in folders if f[0] != "." and f != EXTRACTED)
         for name in sorted(names):
             path = here / name
-            if name[0] != "." and path.is_file() and is_below(path, folder):
+            if name[0] == ".":
+                continue
+            if not _is_utf8(path.relative_to(folder).as_posix()):
+                found.skip(path, NOT_UTF8)
+            elif path.is_symlink() and not path.exists():
+                found.skip(path, NOT_HERE)
+            elif path.is_file():
                 yield path
+
+
+def _is_utf8(name: str) -> bool:
+    """Whether a name can stand in a case file, which is UTF-8."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _is_dicom(path: Path) -> bool:
@@ -261,14 +298,14 @@ def is_closed(surface: SurfaceData) -> bool:
     return not len(edges_of(triangles[distinct]).border)
 
 
-def image_find(path: Path, label: str) -> ImageFind:
-    """An image file or DICOM folder, read; why, where it cannot be."""
+def image_find(path: Path, label: str, series: str | None = None) -> ImageFind:
+    """An image file, or a series of a DICOM folder, read; why, where it cannot be."""
     name = path.name.partition(".")[0] if path.is_file() else path.name
     role = name_role(name)
     try:
-        read = read_image_file(path)
+        read = read_image_file(path, series=series)
     except (CmfsimError, OSError) as error:
-        return ImageFind(label, role, path, error=str(error))
+        return ImageFind(label, role, path, error=str(error), series=series)
     image = read.image
     spacing = np.abs(image.spacing)
     size = " × ".join(str(n) for n in image.values.shape)
@@ -283,6 +320,7 @@ def image_find(path: Path, label: str) -> ImageFind:
         (float(image.values.min()), float(image.values.max())),
         f"{size} voxels of {steps} mm",
         box,
+        series=series,
         findings=read.findings,
     )
 

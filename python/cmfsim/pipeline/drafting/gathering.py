@@ -84,6 +84,7 @@ def gather(
     """
     found = Gathered(folder)
     paths = listing(folder)
+    found.others += paths.others(folder)
     named_by_scene = _gather_scene(found, paths, scene, unpacked, progress)
 
     def rest(of: list[Path]) -> list[Path]:
@@ -107,9 +108,9 @@ def gather(
         _gather_files(found, paths, progress)
     _gather_landmarks(found, rest(paths.markups))
     # A folder of DICOM is named last where it is the case's own: it holds all else as well.
-    inside = [path for path in paths.dicom if path != folder]
-    own = [path for path in paths.dicom if path == folder]
-    _gather_images(found, [*rest(paths.images), *inside, *own], progress)
+    files = [(path, None) for path in rest(paths.images)]
+    places = sorted(paths.dicom, key=lambda place: place[0] == folder)
+    _gather_images(found, [*files, *places], progress)
     found.by_slicer = bool(found.scene) or any(
         _by_slicer(path) for path in (*paths.surfaces, *paths.labels)
     )
@@ -127,18 +128,20 @@ def _gather_landmarks(found: Gathered, paths: list[Path]) -> None:
             _read(found, path, landmark_find, found.landmarks)
 
 
-def _gather_images(found: Gathered, paths: list[Path], progress: Callable[[str], None]) -> None:
+def _gather_images(
+    found: Gathered, places: list[tuple[Path, str | None]], progress: Callable[[str], None]
+) -> None:
     """Adds the images of files and folders; the CT of a scene comes before them."""
     has_ct = any(not image.role.is_after and not image.error for image in found.images)
-    for path in paths:
-        label = found.shown(path)
+    for path, series in places:
+        label = found.shown(path) + ("" if series is None else f" (series {series})")
         if has_ct and not name_role(path.name).is_after:
             found.others.append(OtherFind(label, f"the scene {found.scene} has another CT"))
         elif len(found.images) >= MAX_IMAGES:
             found.others.append(OtherFind(label, f"more than {MAX_IMAGES} images: not looked at"))
         else:
             progress(f"reading {label}")
-            found.images.append(image_find(path, label))
+            found.images.append(image_find(path, label, series))
 
 
 def _gather_scene(
