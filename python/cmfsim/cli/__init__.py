@@ -20,7 +20,7 @@ from cmfsim.cli.exit_codes import BAD_INPUT, CLOSED, DONE, FAILED
 from cmfsim.cli.memory import keep_freed_memory
 from cmfsim.cli.notices import FindingsError
 from cmfsim.cli.parsing import make_parser
-from cmfsim.cli.terminal import ProgressHandler, print_error
+from cmfsim.cli.terminal import ProgressHandler, print_error, spell_out
 from cmfsim.errors import CmfsimError, error_text
 
 __all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED", "main"]
@@ -49,6 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The process is this command's; a caller's stays as it is.
         keep_freed_memory()
     _open_closed_streams()
+    if arguments is None:
+        spell_out(sys.stdout, sys.stderr)
     try:
         code = _command(words)
         # Here, not at the end of the interpreter, where nobody would catch it.

@@ -29,6 +29,7 @@ from cmfsim.values.solver_options import CONTACTS
 
 __all__ = ["make_parser"]
 
+MOST_PORT = 65535
 # How `predict` and `evaluate` take models.
 MODEL_CHOICES: dict[str, Any] = {
     "metavar": "MODEL",
@@ -271,9 +272,23 @@ def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
         help="solve plans exactly while the page is open, on this machine only, until Ctrl-C",
     )
     add_band_options(plan)
-    plan.add_argument("--port", metavar="N", type=int, default=0, help="port (default: a free one)")
+    plan.add_argument(
+        "--port",
+        metavar="N",
+        type=_port,
+        default=0,
+        help="port from 1024 to 65535 (default: a free one)",
+    )
     plan.add_argument("--no-open", action="store_true", help="do not open the page")
     plan.set_defaults(run=plan_command.plan)
+
+
+def _port(text: str) -> int:
+    """A port that a user may listen on; 0 for a free one."""
+    if not text.isdecimal() or not (text == "0" or 1024 <= int(text) <= MOST_PORT):
+        message = f"{text!r} is no port: use 1024 to {MOST_PORT}, or leave it out for a free one"
+        raise argparse.ArgumentTypeError(message)
+    return int(text)
 
 
 def _add_evaluate(commands: Any, changed: argparse.ArgumentParser) -> None:

@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import socket
 import sys
 import time
 import webbrowser
@@ -37,7 +38,7 @@ from cmfsim.planning.replanning import (
     plan_band,
     planning_model,
 )
-from cmfsim.planning.server import check_serving, serve_planning
+from cmfsim.planning.server import open_port, serve_planning
 
 __all__ = ["TRIALS", "plan"]
 
@@ -61,8 +62,8 @@ def plan(options: argparse.Namespace) -> int:
     """Builds a case and writes its planning page."""
     case = case_of(options)
     prepare(case, {PAGE_FILE, PLAN_FILE}.__contains__)
-    if options.serve:
-        check_serving()
+    # Before the work: a port that is taken is not reported a minute later.
+    listener = open_port(options.port) if options.serve else None
     begun = time.perf_counter()
     notices = Notices(quiet=options.quiet)
     made = _made(options, case, notices)
@@ -73,8 +74,8 @@ def plan(options: argparse.Namespace) -> int:
         made_for = str(made.planning.patient.summary.get("plan_key", ""))
         write_plan(case.output / PLAN_FILE, made.found.plan, made_for=made_for)
     seconds = time.perf_counter() - begun
-    if options.serve:
-        _serve(options, made, case.file.name)
+    if listener is not None:
+        _serve(options, made, case.file.name, listener)
         return DONE
     if options.json:
         answer = {
@@ -144,7 +145,9 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
     return _Made(planning, content, errors, found)
 
 
-def _serve(options: argparse.Namespace, made: _Made, case_file: str) -> None:
+def _serve(
+    options: argparse.Namespace, made: _Made, case_file: str, listener: socket.socket
+) -> None:
     """Serves the page until it is interrupted; its address is printed first."""
 
     def started(url: str) -> None:
@@ -156,7 +159,7 @@ def _serve(options: argparse.Namespace, made: _Made, case_file: str) -> None:
             webbrowser.open(url)
 
     serve_planning(
-        made.planning, made.content, case_file=case_file, port=options.port, on_start=started
+        made.planning, made.content, case_file=case_file, port=listener, on_start=started
     )
 
 

@@ -1,5 +1,6 @@
 """Output of the command line for people: errors, log lines, the stage of the work."""
 
+import codecs
 import logging
 import os
 import shutil
@@ -19,12 +20,22 @@ __all__ = [
     "escaped",
     "in_colour",
     "print_error",
+    "spell_out",
 ]
 
 # Back to the start of the line and erase it.
 CLEAR_LINE = "\r\x1b[K"
 # Time between two updates of the line that shows the stage, s.
 TICK = 0.2
+# What stands for characters of our texts where a terminal or file has another encoding.
+SPELLED = {
+    "\N{MINUS SIGN}": "-", "\N{EN DASH}": "-", "\N{EM DASH}": "-", "\N{MULTIPLICATION SIGN}": "x",
+    "\N{DEGREE SIGN}": " deg", "\N{PLUS-MINUS SIGN}": "+/-", "\N{MIDDLE DOT}": "*",
+    "\N{HORIZONTAL ELLIPSIS}": "...", "\N{RIGHTWARDS ARROW}": "->", "\N{SUPERSCRIPT TWO}": "2",
+    "\N{SUPERSCRIPT THREE}": "3", "\N{LESS-THAN OR EQUAL TO}": "<=", "\N{MICRO SIGN}": "u",
+    "\N{GREATER-THAN OR EQUAL TO}": ">=", "\N{GREEK SMALL LETTER NU}": "nu",
+    "\N{GREEK SMALL LETTER MU}": "u", "\N{ALMOST EQUAL TO}": "~",
+}  # fmt: skip
 
 
 class ProgressHandler(logging.Handler):
@@ -100,6 +111,26 @@ class StageProgress:
     def _write(self, text: str) -> None:
         self._stream.write(text)
         self._stream.flush()
+
+
+def spell_out(*streams: TextIO) -> None:
+    """Makes streams write what their encoding lacks in other characters: "-" for a minus sign.
+
+    Output that goes to a file or pipe has the encoding of the system, such as cp1252, and an error
+    there would end a command whose work is done.
+    """
+    codecs.register_error("cmfsim-spelled", _spelled)
+    for stream in streams:
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="cmfsim-spelled")
+
+
+def _spelled(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    bad = error.object[error.start : error.end]
+    text = (SPELLED.get(c) or c.encode("ascii", "backslashreplace").decode() for c in bad)
+    return "".join(text), error.end
 
 
 def print_error(error: BaseException) -> None:

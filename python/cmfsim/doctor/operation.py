@@ -12,7 +12,7 @@ from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
 from cmfsim.errors import CaseError, CmfsimError, LandmarkError
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.io.transforms import motion_in_lps
-from cmfsim.values.case_parts import CaseOsteotomy
+from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import Finding
@@ -43,8 +43,19 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
             )
         available |= set(cut.segments)
         yield from _check_procedure(evidence, cut, where)
+    cut_up = {CUT_UP[p]: cut for cut in case.osteotomies if (p := cut.procedure or "") in CUT_UP}
     for name in case.plan:
-        if name not in available:
+        if name in cut_up:
+            cut = cut_up[name]
+            yield Finding.error(
+                "plan-unknown-segment",
+                f"the plan moves {name!r}, which {cut.procedure} cuts into "
+                f"{', '.join(cut.segments)}",
+                where=case.where(f"plan.{name}"),
+                why="after the cut no segment has this name, and which piece is meant is unclear",
+                fix=f"write [plan.{cut.segments[0]}] for the piece with the teeth",
+            )
+        elif name not in available:
             yield Finding.error(
                 "plan-unknown-segment",
                 f"the plan moves {name!r}",

@@ -343,11 +343,15 @@ def _limit(seconds: float, memory: int) -> None:
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
     spent = used.ru_utime + used.ru_stime
-    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    resource.setrlimit(resource.RLIMIT_CPU, (int(spent + seconds) + 1, hard))
+    _set_limit(resource, resource.RLIMIT_CPU, int(spent + seconds) + 1)
     if sys.platform == "linux":
         with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
             held = int(file.read().split()[0]) * resource.getpagesize()
-        _, hard = resource.getrlimit(resource.RLIMIT_AS)
         # Libraries that a request loads first count as well: room for them.
-        resource.setrlimit(resource.RLIMIT_AS, (held + memory + 2 * 2**30, hard))
+        _set_limit(resource, resource.RLIMIT_AS, held + memory + 2 * 2**30)
+
+
+def _set_limit(resource: Any, which: int, limit: int) -> None:
+    """Sets a limit as far as the user's own (ulimit) allows: below theirs, theirs holds."""
+    _, hard = resource.getrlimit(which)
+    resource.setrlimit(which, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))

@@ -12,6 +12,8 @@ from cmfsim.io.dicom_headers import DicomHeader, numbers_of
 __all__ = ["Slice", "Stack", "counted", "is_localizer", "listed", "slices_of"]
 
 
+# More frames than this are no head's.
+MOST_FRAMES = 20_000
 # Where a classic image of several frames states how far apart they are, by the names of DICOM.
 GAPS = {"slice_spacing": "SpacingBetweenSlices", "thickness": "SliceThickness"}
 
@@ -71,6 +73,11 @@ def _placed_by_the_first(header: DicomHeader) -> list[Slice]:
 
     They follow it along the normal, as cone-beam scanners write them; `assumed` says by what.
     """
+    if header.count > MOST_FRAMES:
+        raise ImageInputError(
+            f"{header.path.name}: states {header.count} frames, more than {MOST_FRAMES}: is it "
+            "damaged?"
+        )
     first = Slice(header, 0, {})
     try:
         place, across = first.numbers("position", 3), first.numbers("orientation", 6)

@@ -256,8 +256,8 @@ def _check_subfolders(folder: Path, names: Sequence[str]) -> None:
     """Refuses a subfolder that leads elsewhere, or that is none."""
     for parent in sorted({(folder / name).parent for name in names} - {folder}):
         if parent.is_symlink() or (os.path.lexists(parent) and not parent.is_dir()):
-            what = "a link that points outside the output folder" if parent.is_symlink() else "a "
-            "file"
+            is_link = parent.is_symlink()
+            what = "a link that points outside the output folder" if is_link else "a file"
             raise CaseInputError(f"{parent}: is {what}, but a folder of results is needed")
 
 

@@ -21,6 +21,7 @@ from cmfsim.values.tissue_data import DEFAULT_PRESET
 
 __all__ = [
     "BAND_COVERAGE",
+    "CUT_UP",
     "DIRECTIONS",
     "FRAMES",
     "LIP_CONTACT",
@@ -58,6 +59,8 @@ PROCEDURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "genioplasty": ("chin",),
     }
 )
+# The bone that a procedure cuts up, so that no segment has its name afterwards.
+CUT_UP: Mapping[str, str] = MappingProxyType({"bsso": "mandible"})
 # Edge length of the mesh where a case states none, mm: some 400 000 tets of a face with its neck,
 # whose edges are 2.9 mm long on average, half of an edge where tissue is thin.
 EDGE_LENGTH = 4.0

@@ -283,7 +283,7 @@ def test_an_element_whose_end_is_not_found_is_named_with_a_remedy(tmp_path):
 def test_a_slice_without_orientation_has_that_of_all_others_with_a_warning(tmp_path):
     explicit_series(tmp_path / "ct")
     path = tmp_path / "ct" / "3.dcm"
-    head, tag, rest = path.read_bytes().partition(b"\x20\x00\x37\x00DS")
+    head, _, rest = path.read_bytes().partition(b"\x20\x00\x37\x00DS")
     (length,) = struct.unpack("<H", rest[:2])
     path.write_bytes(head + rest[2 + length :])
     found = read_image_file(tmp_path / "ct")

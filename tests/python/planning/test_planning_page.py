@@ -11,6 +11,7 @@ import http.client
 import json
 import re
 import threading
+import time
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -23,7 +24,7 @@ from cmfsim.cli.plan_command import _correction_text
 from cmfsim.planning.page.page import joined_scripts
 from cmfsim.planning.replanning import plan_distance
 from cmfsim.planning.replanning.expected_error import plan_near
-from cmfsim.planning.server import PlanningServer
+from cmfsim.planning.server import PlanningServer, open_port
 
 pytest.importorskip("skimage")
 pytest.importorskip("meshio")
@@ -941,7 +942,7 @@ def test_requests_that_are_not_the_pages_own_are_refused(server, planning):
     token = urlsplit(url).path.strip("/")
     assert len(token) >= 43
     for path in ("/", "/x/", f"/{token[:-1]}/", f"/{token}x/", "/%00/", f"/{token}/../x"):
-        assert asked(f"{origin}{path}")[0] in {404, 405, 307}, path
+        assert asked(f"{origin}{path}")[0] == 404, path
     for other in ("evil.example", f"localhost:{port}", f"evil.example:{port}", "127.0.0.1"):
         assert asked(url, Host=other)[0] == 403
     assert asked(url, Origin="http://evil.example")[0] == 403
@@ -958,6 +959,16 @@ def test_requests_that_are_not_the_pages_own_are_refused(server, planning):
     assert asked(solve, good, Content_Type="application/json")[0] == 403
     assert asked(solve, good, **{**sent, "Origin": "null"})[0] == 403
     assert asked(solve, method="GET")[0] == 405
+    # Checked before it is redirected, or answered as no method of this server.
+    for where, method, answer in (
+        (url.rstrip("/"), "GET", 405),
+        (f"{url}solve/", "POST", 404),
+        (url, "DELETE", 405),
+    ):
+        assert asked(where, method=method, Host="evil.example")[0] == 403
+        status, _, headers = asked(where, method=method)
+        assert status == answer
+        assert headers["X-Frame-Options"] == "DENY"
 
 
 def test_plans_that_are_none_get_an_error_and_no_solution(server, planning):
@@ -970,12 +981,85 @@ def test_plans_that_are_none_get_an_error_and_no_solution(server, planning):
         ('{"motions": [[1, 2]]}', b"16 finite numbers"),
         (plan_body(planning, planning.reference).replace("1.0", "NaN", 1), b"16 finite"),
         (plan_body(planning, planning.reference).replace("1.0", "1e999", 1), b"16 finite"),
+        (plan_body(planning, planning.reference).replace("1.0", '"1.0"', 1), b"lists of numbers"),
+        (plan_body(planning, planning.reference).replace("1.0", "true", 1), b"lists of numbers"),
+        (plan_body(planning, planning.reference).replace("1.0", "null", 1), b"lists of numbers"),
+        ('{"motions": "1 0 0"}', b"lists of numbers"),
         (plan_body(planning, far), b"more than 1000 mm"),
         (plan_body(planning, mirror), b"maxilla"),
     ):
         status, text, _ = asked(f"{server.url}solve", body, **sent)
         assert status == 400
         assert said in text, text
+
+
+@pytest.fixture
+def held(server, planning, monkeypatch):
+    """Solving waits for the test: the shifts that were begun, how to go on, and how to send one."""
+    begun, go, connections = [], threading.Event(), []
+
+    def solved(plan):
+        begun.append(round(float(plan["maxilla"][1, 3]), 3))
+        go.wait(20)
+        return server._responses.PlainTextResponse("solved")
+
+    monkeypatch.setattr(server, "_solved", solved)
+
+    def posted(shift):
+        parts = urlsplit(server.url)
+        connections.append(http.client.HTTPConnection(parts.hostname, parts.port, timeout=30))
+        plan = dict(planning.reference) | {"maxilla": cmfsim.rigid_motion((0, shift, 0))}
+        headers = {"Origin": origin_of(server.url), "Content-Type": "application/json"}
+        body = plan_body(planning, plan)
+        connections[-1].request("POST", f"{parts.path}solve", body, headers)
+        return connections[-1]
+
+    yield begun, go, posted
+    go.set()
+    for connection in connections:
+        connection.close()
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_of_plans_that_wait_the_newest_is_solved_and_the_others_refused(held):
+    begun, go, posted = held
+    first = posted(-1.0)
+    wait_for(lambda: begun == [-1.0])
+    older = posted(-2.0)
+    # Refused at once where the next arrives, while the first is still solved.
+    newer = posted(-3.0)
+    assert older.getresponse().status == 409
+    go.set()
+    assert first.getresponse().status == 200
+    assert newer.getresponse().status == 200
+    assert begun == [-1.0, -3.0]
+
+
+def test_nothing_is_solved_for_a_page_that_has_gone(held):
+    begun, go, posted = held
+    first = posted(-1.0)
+    wait_for(lambda: begun == [-1.0])
+    posted(-2.0).close()
+    time.sleep(0.3)
+    go.set()
+    assert first.getresponse().status == 200
+    last = posted(-4.0)
+    assert last.getresponse().status == 200
+    assert begun == [-1.0, -4.0]
+
+
+def test_a_port_is_held_from_the_start_and_one_that_is_taken_is_named():
+    pytest.importorskip("uvicorn")
+    with open_port() as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(OSError, match=f"port {port} cannot be used .*--port"):
+            open_port(port)
 
 
 def test_the_served_page_swaps_in_the_exact_face(browser, server, planning):

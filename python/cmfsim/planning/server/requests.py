@@ -86,8 +86,10 @@ def plan_of_body(planning: PlanningModel, body: bytes) -> dict[str, Floats]:
         Anything else; a motion that is not rigid, or longer than a metre.
     """
     try:
-        values = json.loads(body)
-        rows = np.array(values["motions"], dtype=np.float64)
+        given = json.loads(body)["motions"]
+        if not _are_numbers(given):
+            raise RefusedError(400, "motions are needed as lists of numbers")
+        rows = np.array(given, dtype=np.float64)
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
         raise RefusedError(400, "motions are needed as JSON") from error
     if rows.shape != (len(planning.segments), 16) or not np.isfinite(rows).all():
@@ -102,6 +104,15 @@ def plan_of_body(planning: PlanningModel, body: bytes) -> dict[str, Floats]:
         return planning.whole(plan)
     except (BoundaryError, CaseInputError) as error:
         raise RefusedError(400, str(error)) from error
+
+
+def _are_numbers(given: object) -> bool:
+    """Whether a value is lists of numbers: numpy takes texts, true and null for some as well."""
+    return isinstance(given, list) and all(
+        isinstance(row, list)
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in row)
+        for row in given
+    )
 
 
 def _centres(planning: PlanningModel) -> dict[str, Floats]:

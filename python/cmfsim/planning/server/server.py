@@ -5,8 +5,9 @@ import contextlib
 import json
 import secrets
 import socket
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from cmfsim.planning.server.requests import (
     plan_of_body,
 )
 
-__all__ = ["PlanningServer", "check_serving", "serve_planning"]
+__all__ = ["PlanningServer", "open_port", "serve_planning"]
 
 # Local address only: no other machine on the network can connect.
 HOST = "127.0.0.1"
@@ -34,6 +35,11 @@ SAFE_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
+# Methods of requests, all of which are checked before they are answered.
+METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
+NOT_FOUND = RefusedError(404, "not found")
+# Status of an answer that nobody waits for any more.
+GONE = 408
 # Time that open connections have to finish after Ctrl-C, s.
 LAST_SECONDS = 1
 
@@ -47,8 +53,8 @@ class PlanningServer:
     content : PageContent
     case_file : str
         For the command that the page shows.
-    port : int
-        0 picks a free one.
+    port : int or socket
+        0 picks a free one; or what `open_port` returned.
 
     Attributes
     ----------
@@ -69,7 +75,7 @@ class PlanningServer:
         content: PageContent,
         *,
         case_file: str = "case.toml",
-        port: int = 0,
+        port: int | socket.socket = 0,
     ) -> None:
         self._planning = planning
         self._token = secrets.token_urlsafe(32)
@@ -77,19 +83,15 @@ class PlanningServer:
         self._uvicorn = _module("uvicorn")
         self._responses = _module("starlette.responses")
         application = self._application()
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        try:
-            self._socket.bind((HOST, port))
-            # Listens from now on, so that a page opened immediately waits for its response.
-            self._socket.listen()
-        except OSError:
-            self._socket.close()
-            raise
+        self._socket = open_port(port) if isinstance(port, int) else port
+        # Listens from now on, so that a page opened immediately waits for its response.
+        self._socket.listen()
         self._address = f"{HOST}:{self._socket.getsockname()[1]}"
         self.url = f"http://{self._address}/{self._token}/"
         config = self._uvicorn.Config(
             application,
-            log_level="warning",
+            # What is still solved at Ctrl-C is given up: no reason for a traceback.
+            log_level="critical",
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=LAST_SECONDS,
@@ -109,8 +111,7 @@ class PlanningServer:
 
     def _application(self) -> Any:
         applications, routing = _module("starlette.applications"), _module("starlette.routing")
-        # Created in the serving loop: plans are solved one at a time, with all threads.
-        turn: list[asyncio.Lock] = []
+        line = _Line()
 
         async def page(request: Any) -> Any:
             return self._guarded(request, sends=False) or self._responses.HTMLResponse(
@@ -121,29 +122,40 @@ class PlanningServer:
             refused = self._guarded(request, sends=True)
             if refused is not None:
                 return refused
-            turn[:] = turn or [asyncio.Lock()]
             try:
                 body = await _limited_body(request)
                 plan = plan_of_body(self._planning, body)
-                async with turn[0]:
-                    return await asyncio.to_thread(self._solved, plan)
+                async with line.turn():
+                    # Nothing is solved for a page that has gone.
+                    if not await request.is_disconnected():
+                        return await _in_thread(self._solved, plan)
             except RefusedError as error:
                 return self._refusal(error)
             except CmfsimError as error:
                 return self._refusal(RefusedError(422, str(error)))
+            return self._refusal(RefusedError(GONE, "the page has gone"))
 
-        return applications.Starlette(
+        async def nothing(request: Any) -> Any:
+            there = request.path_params["token"].partition("/")[2] in {"", "solve"}
+            error = RefusedError(405, "method not allowed") if there else NOT_FOUND
+            return self._guarded(request, sends=False) or self._refusal(error)
+
+        application = applications.Starlette(
             routes=[
                 routing.Route("/{token}/", page, methods=["GET"]),
                 routing.Route("/{token}/solve", solve, methods=["POST"]),
+                routing.Route("/{token:path}", nothing, methods=METHODS),
             ]
         )
+        # Starlette would redirect before any check.
+        application.router.redirect_slashes = False
+        return application
 
     def _guarded(self, request: Any, *, sends: bool) -> Any:
         """The refusal of a request that the page did not send; None otherwise."""
         try:
             check_headers(request.headers, self._address, sends=sends)
-            check_token(request.path_params["token"], self._token)
+            check_token(request.path_params["token"].partition("/")[0], self._token)
         except RefusedError as error:
             return self._refusal(error)
         return None
@@ -169,6 +181,66 @@ class PlanningServer:
         )
 
 
+class _Line:
+    """Plans are solved one at a time, with all threads; of those that wait, the newest is next."""
+
+    def __init__(self) -> None:
+        self._is_solving = False
+        self._waiting: asyncio.Future[bool] | None = None
+
+    @contextlib.asynccontextmanager
+    async def turn(self) -> AsyncIterator[None]:
+        """A context in which nothing else is solved.
+
+        Raises
+        ------
+        RefusedError
+            A newer plan came while this one waited.
+        """
+        if self._is_solving:
+            if self._waiting is not None and not self._waiting.done():
+                self._waiting.set_result(False)
+            mine = self._waiting = asyncio.get_running_loop().create_future()
+            if not await mine:
+                raise RefusedError(409, "a newer plan is solved instead")
+        self._is_solving = True
+        try:
+            yield
+        finally:
+            if self._waiting is not None and not self._waiting.done():
+                # The turn passes on without a gap.
+                self._waiting.set_result(True)
+            else:
+                self._is_solving = False
+
+
+async def _in_thread(work: Callable[[Any], Any], argument: Any) -> Any:
+    """What a function returns, called in a thread that does not keep the process from ending."""
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[Any] = loop.create_future()
+
+    def settle(result: Any, error: BaseException | None) -> None:
+        if answer.done():
+            return
+        if error is None:
+            answer.set_result(result)
+        else:
+            answer.set_exception(error)
+
+    def run() -> None:
+        result, failed = None, None
+        try:
+            result = work(argument)
+        except Exception as error:  # noqa: BLE001 (raised again where it is waited for)
+            failed = error
+        # The loop has ended where the process is about to.
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(settle, result, failed)
+
+    threading.Thread(target=run, daemon=True).start()
+    return await answer
+
+
 async def _limited_body(request: Any) -> bytes:
     """The body, as far as its limit: a length that was stated may be untrue."""
     body = b""
@@ -184,7 +256,7 @@ def serve_planning(
     content: PageContent,
     *,
     case_file: str = "case.toml",
-    port: int = 0,
+    port: int | socket.socket = 0,
     on_start: Callable[[str], None] | None = None,
 ) -> None:
     """Serves a planning page on this machine until it is interrupted (Ctrl-C).
@@ -196,8 +268,8 @@ def serve_planning(
         Of the same model.
     case_file : str
         For the command that the page shows.
-    port : int
-        0 picks a free one.
+    port : int or socket
+        0 picks a free one; or what `open_port` returned.
     on_start : callable, optional
         Called with the address of the page, including the token of this launch.
 
@@ -222,16 +294,29 @@ def serve_planning(
         server.run()
 
 
-def check_serving() -> None:
-    """Checks that pages can be served, before any work is done.
+def open_port(port: int = 0) -> socket.socket:
+    """A socket that holds a port of this machine; `PlanningServer` takes it in place of a number.
 
     Raises
     ------
     CaseError
         (also `ValueError`) Starlette or Uvicorn, of the extra `serve`, is not installed.
+    OSError
+        The port is taken, or may not be used.
     """
     for name in ("starlette.applications", "uvicorn"):
         _module(name)
+    opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        opened.bind((HOST, port))
+    except OSError as error:
+        opened.close()
+        raise OSError(
+            error.errno,
+            f"port {port} cannot be used ({error.strerror}): choose another with --port, or leave "
+            "it out for a free one",
+        ) from error
+    return opened
 
 
 def _module(name: str) -> Any:
