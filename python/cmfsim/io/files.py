@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, BinaryIO
 
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.leftovers import abandoned, temporary_file
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "check_readable",
     "check_units",
     "check_version",
+    "deleted_meanwhile",
     "is_below",
     "is_there",
     "known_keys",
@@ -93,10 +94,20 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             # Windows renames no open file.
             temporary.replace(path)
     except BaseException as error:
+        is_lost = isinstance(error, FileNotFoundError) and not temporary.exists()
         temporary.unlink(missing_ok=True)
+        if is_lost:
+            raise deleted_meanwhile(path.parent) from error
         if isinstance(error, OSError) and error.filename is None and error.errno is not None:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def deleted_meanwhile(folder: Path) -> CmfsimError:
+    """The error of a folder that went while results were written to it: no fault of the input."""
+    return CmfsimError(
+        f"{folder}: was deleted or moved while results were written to it: run the command again"
+    )
 
 
 def check_readable(path: Path, error: type[ValueError] = CaseInputError) -> None:

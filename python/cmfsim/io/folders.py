@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from cmfsim.errors import CaseInputError
+from cmfsim.io.files import deleted_meanwhile
 from cmfsim.io.leftovers import abandoned, holding, temporary_folder
 
 __all__ = ["check_below", "check_writable", "finish_writing", "replacing_files"]
@@ -72,6 +73,8 @@ def replacing_files(
     ------
     CaseError
         (also `ValueError`) A subfolder that files are to be written to is a link or a file.
+    CmfsimError
+        The folder was deleted meanwhile.
     OSError
         The folder cannot be made or written to; names it.
     """
@@ -89,6 +92,11 @@ def replacing_files(
                         gone = [n for n in dict.fromkeys(left) if n not in names]
                         gone = [n for n in gone if _is_plain(n) and is_ours(n)]
                         _take_places(fresh, folder, names, gone)
+                except FileNotFoundError as error:
+                    if fresh.exists():
+                        raise
+                    raise deleted_meanwhile(folder) from error
+                else:
                     return names
                 finally:
                     shutil.rmtree(fresh, ignore_errors=True)

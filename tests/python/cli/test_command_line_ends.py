@@ -1,9 +1,11 @@
 """How commands end: messages, exit codes and JSON of errors, closed outputs, killed parents."""
 
 import importlib.util
+import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -14,6 +16,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
+from cmfsim.cli.terminal import spell_out
 from head_case import HeadCase
 
 pytest.importorskip("meshio")
@@ -347,3 +350,53 @@ def test_the_processes_of_a_study_end_with_it(case, tmp_path, number):
     finally:
         parent.kill()
         parent.wait()
+
+
+# Terminals, limits and ports.
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
+def test_output_in_another_encoding_ends_no_command(encoding, case):
+    """The minus sign U+2212 ended a finished prediction with exit code 2."""
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"}
+    done = run("doctor", case, env=environment)
+    assert done.returncode == 0, done.stderr
+    said = done.stdout.decode(encoding)
+    assert "pitch -2.0" in said
+    assert ("°" in said) == (encoding == "cp1252")
+
+
+def test_characters_without_another_spelling_are_escaped():
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    spell_out(stream)
+    print("−5 × 3 ≥ 2 … \N{SNOWMAN} \udce9", file=stream, end="", flush=True)
+    assert stream.buffer.getvalue() == b"-5 x 3 >= 2 ... \\u2603 \\udce9"
+
+
+@pytest.mark.parametrize("port", ["80", "65536", "-1", "x", "1e4"])
+def test_a_port_that_is_none_is_refused_before_any_work(port, case, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["plan", str(case), "--serve", "--port", port])
+    assert ended.value.code == 2
+    assert "use 1024 to 65535" in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_is_reported_before_any_work(case, capsys):
+    pytest.importorskip("uvicorn")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        begun = time.monotonic()
+        assert main(["plan", str(case), "--serve", "--port", str(port)]) == 1
+    assert f"port {port} cannot be used" in capsys.readouterr().err
+    assert time.monotonic() - begun < 5.0
+
+
+def test_a_sagittal_split_leaves_no_mandible_to_plan(tmp_path, capsys):
+    """Found by name, before anything is segmented or cut."""
+    path = write_head(
+        tmp_path, "[plan.mandible]", '[[osteotomies]]\nprocedure = "bsso"\n[plan.mandible]'
+    )
+    assert main(["doctor", str(path), "-q"]) == 2
+    said = capsys.readouterr().out
+    assert "[plan-unknown-segment]" in said
+    assert "write [plan.mandible_body]" in said

@@ -18,7 +18,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.io import finish_writing, replacing_files
+from cmfsim.io import finish_writing, replacing, replacing_files
 from head_case import HeadCase
 from shared_values import without_pictures
 
@@ -241,6 +241,46 @@ def test_a_disk_that_is_read_only_is_said_before_the_work(small_disk, case, caps
             assert f"{small_disk}: the output folder is not writable" in err
             assert "checking the case" not in err
             assert "reading" not in err
+
+
+def test_a_folder_that_is_deleted_meanwhile_is_a_failure_with_its_reason(tmp_path):
+    """Not bad input, exit code 2, as a missing file is."""
+    folder = tmp_path / "out"
+
+    def fill(fresh):
+        (fresh / "a.txt").write_text("a")
+        shutil.rmtree(folder)
+        (fresh / "b.txt").write_text("b")
+        return ["a.txt", "b.txt"]
+
+    with pytest.raises(cmfsim.CmfsimError, match=r"out: was deleted or moved while") as caught:
+        replacing_files(folder, None, lambda _: True, fill)
+    assert not isinstance(caught.value, ValueError | OSError)
+    (tmp_path / "page").mkdir()
+    with (
+        pytest.raises(cmfsim.CmfsimError, match=r"page: was deleted or moved while"),
+        replacing(tmp_path / "page" / "plan.html"),
+    ):
+        shutil.rmtree(tmp_path / "page")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda p: p.write_text("x"), "is a file"),
+        (lambda p: p.symlink_to(p.parents[1]), "is a link"),
+    ],
+)
+def test_a_subfolder_that_is_none_is_named_as_what_it_is(make, said, tmp_path):
+    make(tmp_path / "M")
+
+    def fill(fresh):
+        (fresh / "M").mkdir()
+        (fresh / "M" / "a.txt").write_text("a")
+        return ["M/a.txt"]
+
+    with pytest.raises(cmfsim.CaseError, match=f"M: {said}.*, but a folder of results is needed"):
+        replacing_files(tmp_path, None, lambda _: True, fill)
 
 
 def test_a_file_in_the_place_of_the_folder_and_a_broken_case_are_bad_input(case, tmp_path, capsys):

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -14,6 +16,7 @@ from cmfsim.io import child
 from cmfsim.io.child import Answer, ReaderError, ReadLimits, read_in_child
 
 HERE = "child_tasks"
+FOLDER = Path(__file__).parents[1]
 
 
 def test_values_and_arrays_come_back_as_they_were_made():
@@ -111,3 +114,21 @@ def test_one_process_serves_many_files():
         read_in_child(f"{HERE}:fail", kind="ImageError")
     assert isinstance(read_in_child(f"{HERE}:arrays", count=1), Answer)
     assert child._children[0].process.pid == process
+
+
+LIMITED = """
+import resource, sys
+from cmfsim.io.child import read_in_child
+which, limit = getattr(resource, sys.argv[1]), int(sys.argv[2])
+resource.setrlimit(which, (limit, limit))
+print(read_in_child("child_tasks:arrays", count=1).values["name"])
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits as Linux has them")
+@pytest.mark.parametrize(("name", "limit"), [("RLIMIT_AS", 2**31), ("RLIMIT_CPU", 20)])
+def test_limits_of_the_user_below_those_of_a_reader_hold_and_break_nothing(name, limit):
+    """`ulimit -v` and `ulimit -t` broke every reader: a hard limit cannot be exceeded."""
+    line = [sys.executable, "-c", LIMITED, name, str(limit)]
+    done = subprocess.run(line, capture_output=True, check=False, text=True, cwd=FOLDER)
+    assert (done.returncode, done.stdout) == (0, "five\n"), done.stderr

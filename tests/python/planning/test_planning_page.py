@@ -9,7 +9,11 @@ import gzip
 import hashlib
 import http.client
 import json
+import os
 import re
+import signal
+import subprocess
+import sys
 import threading
 import time
 from urllib.parse import urlsplit
@@ -1052,6 +1056,39 @@ def test_nothing_is_solved_for_a_page_that_has_gone(held):
     last = posted(-4.0)
     assert last.getresponse().status == 200
     assert begun == [-1.0, -4.0]
+
+
+SLOW = """
+import time
+from cmfsim.planning.server import server
+
+class Planning:
+    def solve(self, plan):
+        print("solving", flush=True)
+        time.sleep(60.0)
+
+server.page_text = lambda *_, **__: "page"
+server.plan_of_body = lambda *_: {}
+server.serve_planning(Planning(), None, on_start=lambda url: print(url, flush=True))
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")
+def test_ctrl_c_ends_a_server_that_solves_without_a_traceback():
+    pytest.importorskip("uvicorn")
+    line = [sys.executable, "-c", SLOW]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(line, text=True, **pipes) as process:
+        url = process.stdout.readline().strip()
+        parts = urlsplit(url)
+        connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=30)
+        headers = {"Origin": origin_of(url), "Content-Type": "application/json"}
+        connection.request("POST", f"{parts.path}solve", "{}", headers)
+        assert process.stdout.readline() == "solving\n"
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+        connection.close()
+    assert (process.returncode, said) == (0, "")
 
 
 def test_a_port_is_held_from_the_start_and_one_that_is_taken_is_named():

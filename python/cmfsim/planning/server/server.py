@@ -312,9 +312,8 @@ def open_port(port: int = 0) -> socket.socket:
     except OSError as error:
         opened.close()
         raise OSError(
-            error.errno,
             f"port {port} cannot be used ({error.strerror}): choose another with --port, or leave "
-            "it out for a free one",
+            "it out for a free one"
         ) from error
     return opened
 
