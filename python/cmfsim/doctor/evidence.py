@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface_fil
 from cmfsim.io.images import read_image_file
 from cmfsim.io.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
-from cmfsim.surfaces.repair import RepairOptions, repair_surface
+from cmfsim.surfaces.repair import INNER_WALL, RepairOptions, repair_surface
 from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -52,9 +52,20 @@ class Body:
         return check_surface(self.surface)
 
     @cached_property
+    def _repair(self) -> tuple[SurfaceData, tuple[Finding, ...]]:
+        options = RepairOptions(outer_wall=self.name == "skin")
+        return repair_surface(self.surface, self.name, options)
+
+    @property
     def repaired(self) -> SurfaceData:
         """The surface closed and outward, as `build` would make it."""
-        return repair_surface(self.surface, self.name, RepairOptions())[0]
+        return self._repair[0]
+
+    @property
+    def walls(self) -> tuple[Finding, ...]:
+        """A finding where an inner wall is dropped."""
+        found = (f for f in self._repair[1] if f.code == INNER_WALL)
+        return tuple(replace(finding, where=self.where) for finding in found)
 
     @cached_property
     def index(self) -> Surface:

@@ -15,6 +15,8 @@ from cmfsim.doctor.landmarks import (
 from cmfsim.doctor.places import place_text
 from cmfsim.errors import ImageError
 from cmfsim.registration import side_vectors, wrong_sides
+from cmfsim.surfaces.checks import check_surface
+from cmfsim.surfaces.repair import INNER_WALL
 from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -38,6 +40,8 @@ BONE_SHARE = (0.04, 1.15)
 ELSEWHERE_SHARE = 0.4
 # Another frame explains this if no more than this share is outside in it.
 FITTING_SHARE = 0.05
+# Mean thickness below which a skin is a shell, mm: a whole head has 40 and more.
+SHELL_THICKNESS = 20.0
 # Distance of bone outside the skin above which it is reported, mm: the accuracy of two surfaces.
 THROUGH_SKIN = 0.1
 # Distances of a set of landmarks from its surface, mm, at which it fits, and at which another frame
@@ -69,6 +73,9 @@ def check_placement(evidence: Evidence) -> list[Finding]:
     findings: list[Finding] = []
     for name, body in evidence.bones.items():
         findings += _check_bone_inside(evidence, name, body)
+        if any(finding.code == INNER_WALL for finding in findings):
+            # The skin's fault, the same for every bone.
+            break
     if any(finding.severity == "error" for finding in findings):
         return findings
     turned = False
@@ -434,6 +441,17 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
     closest = skin.index.closest(points[outside])[0]
     depth[outside] = np.linalg.norm(closest - points[outside], axis=1)
     share = float(outside.mean())
+    if share > ELSEWHERE_SHARE and (thickness := _shell_thickness(skin, body)) is not None:
+        yield Finding.error(
+            INNER_WALL,
+            f"{share:.0%} of bone {name} lies outside the skin, which is a shell some "
+            f"{thickness:.0f} mm thick around it: its outer and inner wall are joined",
+            where=skin.where,
+            why="between the bone and the inner wall there would be no tissue",
+            fix="export the skin as a solid, its outer wall alone (in 3D Slicer: fill the segment, "
+            "or undo Hollow)",
+        )
+        return
     if share > ELSEWHERE_SHARE:
         turned = float((skin.index.winding_number(points * HALF_TURN) < 0.5).mean())
         is_frame = turned <= FITTING_SHARE
@@ -457,6 +475,26 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
         why="no tissue covers it, so the skin there is bone",
         fix="correct the surface there; build cuts the bone off at the skin",
     )
+
+
+def _shell_thickness(skin: Body, bone: Body) -> float | None:
+    """The mean thickness of a skin that is a shell around a bone, mm; None if it is none."""
+    low, high = (f(skin.repaired.vertices) for f in (_lowest, _highest))
+    is_around = (_lowest(bone.samples) >= low).all() and (_highest(bone.samples) <= high).all()
+    # A shell has two walls, and the area of both.
+    report = check_surface(skin.repaired, crossings=False)
+    thickness = 2.0 * report.volume / report.area
+    return thickness if is_around and 0.0 < thickness < SHELL_THICKNESS else None
+
+
+def _lowest(points: Floats) -> Floats:
+    lowest: Floats = points.min(axis=0)
+    return lowest
+
+
+def _highest(points: Floats) -> Floats:
+    highest: Floats = points.max(axis=0)
+    return highest
 
 
 # Depth below its surface at which a bone is tested for being inside another, mm: surfaces that

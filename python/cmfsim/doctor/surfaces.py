@@ -49,6 +49,7 @@ def check_surfaces(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _check_body(body: Body) -> Iterator[Finding]:
+    yield from body.walls
     yield from _check_borders(body)
     yield from _check_orientation(body)
     yield from _check_edges(body)
@@ -144,7 +145,7 @@ def _check_pieces(body: Body) -> Iterator[Finding]:
     largest, *others = report.components
     # Inside out, a piece within another is a hollow and belongs there.
     solid = [piece for piece in others if piece.volume * report.volume >= 0.0]
-    if not solid:
+    if not solid or body.walls:
         return
     share = sum(piece.area for piece in solid) / largest.area
     yield Finding(

@@ -21,7 +21,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["RepairOptions", "clean_surface", "repair_surface"]
+__all__ = ["INNER_WALL", "RepairOptions", "clean_surface", "repair_surface"]
 
 Integers = NDArray[np.int64]
 
@@ -40,6 +40,9 @@ class RepairOptions:
         them, 1 keeps only the largest.
     close_borders : bool
         Whether borders are closed by caps.
+    outer_wall : bool
+        Whether a large piece inside the largest is dropped: the inner wall of a skin that was saved
+        as a shell. Hollows of air are far smaller.
 
     Raises
     ------
@@ -50,6 +53,7 @@ class RepairOptions:
     weld_distance: float = 1e-7
     keep_share: float = 0.01
     close_borders: bool = True
+    outer_wall: bool = False
 
     def __post_init__(self) -> None:
         for name, high in (("weld_distance", 0.01), ("keep_share", 1.0)):
@@ -136,6 +140,10 @@ def repair_surface(
         what = f"{dropped} small pieces are dropped (below {options.keep_share:.0%} of the largest)"
         note("surface-debris", what, "debris would become islands of bone or skin")
     triangles, n_turned = _outward(vertices, triangles)
+    if options.outer_wall:
+        triangles, wall = _without_inner_wall(vertices, triangles)
+        if wall:
+            findings.append(_wall_finding(name, wall))
     if n_turned:
         what = f"{n_turned} of {len(triangles)} triangles are flipped"
         note("surface-turned", what, "normals that point inwards swap inside and outside")
@@ -172,6 +180,44 @@ def _cap_finding(name: str, length: float, centre: Floats, bulge: float) -> Find
         why="only a closed surface has an inside and an outside"
         + ("" if flat else "; this cap is far from flat, so its shape is only a guess"),
         fix="check the cap; if it is wrong, close the surface yourself",
+    )
+
+
+# The code of findings on a skin that was saved as a shell.
+INNER_WALL = "surface-inner-wall"
+# Share of the outer wall's volume that an inner wall encloses at least: a shell 15 mm thick has a
+# half, and airways and sinuses together a twentieth.
+WALL_SHARE = 0.3
+
+
+def _without_inner_wall(vertices: Floats, triangles: Integers) -> tuple[Integers, float]:
+    """Triangles without inner walls, and which share of the volume the largest of them enclosed."""
+    labels = component_labels(edges_of(triangles), len(triangles))
+    middle = vertices[triangles].mean(axis=(0, 1))
+    a, b, c = (vertices[triangles[:, i]] - middle for i in range(3))
+    volumes = np.abs(np.bincount(labels, weights=(a * np.cross(b, c)).sum(axis=1) / 6.0))
+    outer = int(np.argmax(volumes))
+    large = [p for p in np.flatnonzero(volumes > WALL_SHARE * volumes[outer]) if p != outer]
+    if not large:
+        return triangles, 0.0
+    body = _compact(vertices, triangles[labels == outer], 180.0)
+    samples = np.array([vertices[triangles[labels == p][0]].mean(axis=0) for p in large])
+    inside = np.abs(Surface(body.vertices, body.triangles).winding_number(samples)) > 0.5
+    walls = np.array(large)[inside]
+    if not len(walls):
+        return triangles, 0.0
+    return triangles[~np.isin(labels, walls)], float(volumes[walls].max() / volumes[outer])
+
+
+def _wall_finding(name: str, share: float) -> Finding:
+    return Finding.warning(
+        INNER_WALL,
+        f"the {name} has an inner wall, which encloses {share:.0%} of the outer one's volume; the "
+        "outer wall alone is used",
+        where=name,
+        why="a skin saved as a shell (Hollow tool, threshold of the skin alone) has two walls, and "
+        "bone inside the inner one would lie outside the skin",
+        fix="look at the skin; export it as a solid if the wrong wall was kept",
     )
 
 

@@ -12,6 +12,7 @@ from cmfsim.cli import main
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.muscles import check_muscles
 from cmfsim.registration import REFERENCE_PLACES
+from cmfsim.surfaces.topology import edges_of
 from head_case import HeadCase
 
 DATA = Path(os.environ.get("CMFSIM_DATA") or Path(__file__).parents[4] / "shared/data")
@@ -99,6 +100,24 @@ def with_debris(head, name):
         name,
         vertices=lambda v: np.concatenate([v, extra]),
         triangles=lambda t: np.concatenate([t, t + len(extra)]),
+    )
+
+
+def with_inner_wall(head, *, inwards=True, joined=False):
+    """A skin saved as a shell some 6 mm thick, whose walls may be joined round the neck."""
+    outer, faces = head.surfaces["skin"].vertices, head.surfaces["skin"].triangles
+    inner = (outer - [3, -100, 1500]) * 0.95 + [3, -100, 1500]
+    faces = faces.astype(int)
+    ring = np.zeros((0, 3), dtype=int)
+    if joined:
+        faces = faces[outer[faces][:, :, 2].min(axis=1) > np.asarray(outer)[:, 2].min() + 20.0]
+        (a, b), n = edges_of(faces).border.T, len(outer)
+        ring = np.concatenate([np.stack([b, a, a + n], 1), np.stack([b, a + n, b + n], 1)])
+    wall = faces[:, ::-1] if inwards else faces
+    head.change(
+        "skin",
+        vertices=lambda v: np.concatenate([v, inner]),
+        triangles=lambda _: np.concatenate([faces, wall + len(outer), ring]),
     )
 
 
@@ -204,6 +223,17 @@ DEFECTS = {
         folded,
         "warning",
         "surface-crossing",
+    ),
+    "skin with an inner wall": (with_inner_wall, "warning", "surface-inner-wall"),
+    "skin with an inner wall that faces outwards": (
+        lambda h: with_inner_wall(h, inwards=False),
+        "warning",
+        "surface-inner-wall",
+    ),
+    "skin with walls that are joined": (
+        lambda h: with_inner_wall(h, joined=True),
+        "error",
+        "surface-inner-wall",
     ),
     "skin with an island": (lambda h: with_debris(h, "skin"), "warning", "surface-islands"),
     "fork": (with_fork, "warning", "surface-non-manifold"),

@@ -27,7 +27,7 @@ from cmfsim.io.images import read_image_file
 from cmfsim.io.models import is_model_file
 from cmfsim.io.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
-from cmfsim.surfaces.repair import repair_surface
+from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMesh, CaseMotion
 from cmfsim.values.checks import Floats
@@ -98,7 +98,8 @@ def read_anatomy(
     for name, path in files.items():
         progress(f"reading surface {name}")
         given = read_surface_file(path, units=given_surfaces.units, frame=given_surfaces.frame)
-        surfaces[name], repaired = repair_surface(given.surface, name)
+        options = RepairOptions(outer_wall=name == "skin")
+        surfaces[name], repaired = repair_surface(given.surface, name, options)
         findings.extend((*given.findings, *repaired))
     progress("measuring distances from the surfaces")
     spacing = max(case.mesh.edge_length / VOXELS_PER_EDGE, LEAST_VOXEL)

@@ -102,7 +102,9 @@ def _surfaces(case: Case, given: CasePostoperative) -> Postoperative:
     if given.skin is not None:
         surface = read_surface(given.skin, units=given.units, frame=given.frame)
         # Inside out would turn every sign.
-        skin, noticed = repair_surface(surface, "skin", RepairOptions(close_borders=False))
+        skin, noticed = repair_surface(
+            surface, "skin", RepairOptions(close_borders=False, outer_wall=True)
+        )
         skin = _carried(skin, matrix)
     return Postoperative(
         skin, {}, {n: _carried(s, matrix) for n, s in bones.items()}, matrix, noticed
