@@ -62,6 +62,11 @@ def plan(options: argparse.Namespace) -> int:
     """Builds a case and writes its planning page."""
     case = case_of(options)
     prepare(case, {PAGE_FILE, PLAN_FILE}.__contains__)
+    for name, least in (("trials", 1), ("corrections", 0)):
+        if getattr(options, name) < least:
+            raise CaseInputError(
+                f"--{name} is {getattr(options, name)}: a whole number of {least} or more is needed"
+            )
     # Before the work: a port that is taken is not reported a minute later.
     listener = open_port(options.port) if options.serve else None
     begun = time.perf_counter()

@@ -381,6 +381,14 @@ def test_a_port_that_is_none_is_refused_before_any_work(port, case, capsys):
     assert "use 1024 to 65535" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [("--trials", "0"), ("--corrections", "-1")])
+def test_counts_of_a_page_are_checked_before_any_work(words, case, capsys):
+    assert main(["plan", str(case), *words]) == 2
+    said = capsys.readouterr().err
+    assert f"{words[0]} is {words[1]}" in said
+    assert "reading" not in said
+
+
 def test_a_port_that_is_taken_is_reported_before_any_work(case, capsys):
     pytest.importorskip("uvicorn")
     with socket.create_server(("127.0.0.1", 0)) as taken:

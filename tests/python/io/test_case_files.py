@@ -1,5 +1,6 @@
 """A case file says what a case is, and an error in it names file, line and key."""
 
+import os
 import re
 
 import numpy as np
@@ -263,6 +264,61 @@ def test_files_that_are_no_case_files_are_refused(tmp_path):
     (tmp_path / "raw.toml").write_bytes(b'name = "\xff"')
     with pytest.raises(cmfsim.CaseError, match="UTF-8"):
         cmfsim.Case.load(tmp_path / "raw.toml")
+
+
+SKIN = 'skin = "../scans/skin.ply"'
+PATHS = {
+    "windows": (r'skin = "C:\Users\me\skin.ply"', "is not TOML", '"C:/Users/me/skin.ply"'),
+    "share": (r'skin = "\\\\server\\data\\skin.ply"', "a path of Windows", "/mnt/"),
+    "share unescaped": (r'skin = "\\server\data\skin.ply"', "is not TOML", "single quotes"),
+    "drive with codes": (r'skin = "C:\new\table.ply"', "control character", "single quotes"),
+    "codes": (r'skin = "new\table.ply"', "control character", "single quotes"),
+    "single quotes": (r"skin = 'D:\a\skin.ply'", "a path of Windows", "/mnt/"),
+    "typographic": ("skin = \u201cskin.ply\u201d", "is not TOML", "typographic"),
+}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows reads its own paths")
+@pytest.mark.parametrize("name", PATHS)
+def test_a_path_that_toml_or_this_system_does_not_read_has_a_remedy(name, tmp_path):
+    line, *words = PATHS[name]
+    with pytest.raises(cmfsim.CaseError) as caught:
+        load(tmp_path, FULL.replace(SKIN, line, 1))
+    said = str(caught.value)
+    assert said.startswith("case.toml:")
+    assert len(said) <= 400
+    for word in words:
+        assert word in said
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows reads its own paths")
+def test_a_relative_path_with_backslashes_is_that_with_slashes(tmp_path):
+    case = load(tmp_path, FULL.replace(SKIN, "skin = 'surfaces\\skin.ply'", 1))
+    assert case.surfaces.skin == tmp_path / "surfaces" / "skin.ply"
+    # Unless there is a file of this very name.
+    (tmp_path / "surfaces\\skin.ply").write_bytes(b"")
+    case = load(tmp_path, FULL.replace(SKIN, "skin = 'surfaces\\skin.ply'", 1))
+    assert case.surfaces.skin.name == "surfaces\\skin.ply"
+
+
+@pytest.mark.parametrize(
+    ("encoding", "words"),
+    [
+        ("latin-1", ("line 2 is not UTF-8", "'ö' in Latin-1", "save the file as UTF-8")),
+        ("utf-16", ("is UTF-16", "save it as UTF-8")),
+    ],
+)
+def test_another_encoding_is_named_with_a_remedy(encoding, words, tmp_path):
+    (tmp_path / "case.toml").write_bytes(("# a\n# Höhe\n" + FULL).encode(encoding))
+    with pytest.raises(cmfsim.CaseError) as caught:
+        cmfsim.Case.load(tmp_path / "case.toml")
+    for word in ("case.toml", *words):
+        assert word in str(caught.value)
+
+
+def test_a_mark_of_utf_8_and_windows_line_ends_change_nothing(tmp_path):
+    (tmp_path / "case.toml").write_bytes(FULL.replace("\n", "\r\n").encode("utf-8-sig"))
+    assert cmfsim.Case.load(tmp_path / "case.toml").name == load(tmp_path, FULL).name
 
 
 def test_the_posterior_plane_is_given_or_placed_from_landmarks_or_depth():
