@@ -306,6 +306,29 @@ def test_a_header_does_not_lead_out_of_its_folder(tmp_path, name, kind):
 
 
 @pytest.mark.parametrize("kind", ["nhdr", "mhd"])
+def test_a_data_file_in_the_store_of_git_annex_is_read(tmp_path, kind):
+    """As DataLad keeps files: links into its own data set, above the folder of the patient."""
+    store = tmp_path / ".git" / "annex" / "objects" / "x1"
+    store.mkdir(parents=True)
+    (store / "MD5E-s240").write_bytes(VALUES.T.tobytes())
+    folder = tmp_path / "sub-01"
+    folder.mkdir()
+    (folder / "a.raw").symlink_to("../.git/annex/objects/x1/MD5E-s240")
+    if kind == "nhdr":
+        path = write_nrrd(folder / "a.nhdr", data=False, data_file="a.raw")
+    else:
+        path = write_meta(folder / "a.mhd", data=False, ElementDataFile="a.raw")
+    np.testing.assert_array_equal(read_image(path).values, VALUES)
+    # Another data set's store is elsewhere.
+    other = tmp_path / "other" / ".git" / "annex" / "objects"
+    other.mkdir(parents=True)
+    (other / "b").write_bytes(VALUES.T.tobytes())
+    (folder / "a.raw").unlink()
+    (folder / "a.raw").symlink_to("../other/.git/annex/objects/b")
+    refused(path, "data file")
+
+
+@pytest.mark.parametrize("kind", ["nhdr", "mhd"])
 def test_a_data_file_beside_or_below_its_header_is_read(tmp_path, kind):
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "a.raw").write_bytes(VALUES.T.tobytes())
