@@ -59,7 +59,12 @@ def stl(data: bytes) -> Surface:
     points: list[tuple[float, ...]] = []
     # A few bytes more than the triangles take are none of them.
     more = len(data) - 84 - 50 * struct.unpack("<I", data[80:84])[0] if len(data) >= 84 else -1
-    is_text = data.lstrip()[:5].lower() == b"solid" and b"\0" not in data
+    text = data.removeprefix(b"\xef\xbb\xbf").rstrip(b"\0\x1a")
+    is_text = text.lstrip()[:5].lower() == b"solid" and b"\0" not in text
+    if data[80:84] == bytes(4) and more % 50 == 0 and more > 0 and not is_text:
+        data = data[:80] + struct.pack("<I", more // 50) + data[84:]
+        more = 0
+    data = text if is_text and more else data
     if more == 0 or (0 < more < 50 and not is_text):
         for i in range(struct.unpack("<I", data[80:84])[0]):
             row = struct.unpack("<12fH", data[84 + 50 * i : 134 + 50 * i])
@@ -185,13 +190,14 @@ def ply(data: bytes) -> Surface:
 
 def obj(data: bytes) -> Surface:
     """Vertices and faces, line by line."""
-    text = data.decode("latin-1")
+    text = data.removeprefix(b"\xef\xbb\xbf").rstrip(b"\0\x1a").decode("latin-1")
     if "\\" in text:
         raise UndecidedError("continued lines")
+    text = text if "\n" in text else text.replace("\r", "\n")
     points: list[tuple[float, ...]] = []
     faces: list[tuple[int, ...]] = []
     for line in text.split("\n"):
-        words = [w for w in re.split("[ \t\r\x0b\x0c]+", line) if w]
+        words = [w for w in re.split("[ \t\r\x0b\x0c]+", line.partition("#")[0]) if w]
         if not words:
             continue
         if words[0] == "v":
@@ -201,7 +207,7 @@ def obj(data: bytes) -> Surface:
         elif words[0] == "f":
             corners = []
             for word in words[1:]:
-                if not re.fullmatch(r"[-+]?[0-9]+(/(-?[0-9]+)?(/-?[0-9]+)?)?", word, re.ASCII):
+                if not re.fullmatch(r"[-+]?[0-9]+(/(-?[0-9]+)?(/(-?[0-9]+)?)?)?", word, re.ASCII):
                     raise ValueError(line)
                 number = _whole(word.split("/")[0])
                 if number == 0 or number < -len(points):

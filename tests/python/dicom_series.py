@@ -205,6 +205,7 @@ def write_classic_frames(
         0x00080018: ("UI", "1.2.3.4.5"),
         0x00080060: ("CS", "CT"),
         0x0020000E: ("UI", "1.2.3"),
+        0x00200052: ("UI", "1.2.9"),
         0x00280004: ("CS", "MONOCHROME2"),
         0x00280008: ("IS", str(len(slices))),
         0x00280030: ("DS", _backslashed(first.spacing[::-1])),

@@ -48,7 +48,7 @@ class Series:
     @property
     def modality(self) -> str:
         """The modality, such as "CT" or "MR"; empty where it is not stated."""
-        return self.first.text("modality")
+        return next((m for h in self.headers if (m := h.text("modality"))), "")
 
     @property
     def count(self) -> int:
@@ -316,8 +316,11 @@ def _is_meant(header: DicomHeader, wanted: str) -> bool:
 def _series(headers: list[DicomHeader]) -> list[Series]:
     """The series of a folder."""
     groups: dict[tuple[str, str], list[DicomHeader]] = {}
+    stated = {uid: modality for uid, modality in map(_key, headers) if modality}
     for header in headers:
-        groups.setdefault(_key(header), []).append(header)
+        uid, modality = _key(header)
+        # A slice that states no modality has that of its series.
+        groups.setdefault((uid, modality or stated.get(uid, "")), []).append(header)
     return [Series(uid, tuple(group)) for (uid, _), group in sorted(groups.items())]
 
 

@@ -184,15 +184,18 @@ def _stack(name: str, slices: list[Slice]) -> Stack:
     if (usual <= 0.0).any() or (usual > 100.0).any():
         raise ImageInputError(f"{name}: pixel spacing is {usual.tolist()} mm")
     for key, what in (("photometric", "kinds of pixel"), ("frame_of_reference", "frames")):
-        stated = {s.text(key) for s in slices}
+        # A slice that states nothing contradicts none.
+        stated = {s.text(key) for s in slices} - {""}
         if len(stated) > 1:
             raise ImageInputError(
                 f"{name}: the series mixes {what} ({', '.join(sorted(stated))}): keep the slices "
                 "of one volume in the folder"
             )
-    if slices[0].text("photometric") not in {"", "MONOCHROME2"}:
+    kinds = {s.text("photometric") for s in slices} - {"", "MONOCHROME2"}
+    if kinds:
         raise ImageInputError(
-            f"{name}: pixels are {slices[0].text('photometric')}: a CT has MONOCHROME2"
+            f"{name}: pixels are {', '.join(kinds)}: a CT has MONOCHROME2, in which more is "
+            "brighter; export the original series again from the scanner or archive"
         )
     columns, rows = (int(n) for n in next(iter(sizes)))
     check_shape(name, [columns, rows, len(slices)])

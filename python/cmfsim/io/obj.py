@@ -22,7 +22,7 @@ PASSED_OVER = frozenset(
 )
 # What follows a vertex in a corner, 1/2/3, 1//3 or 1/2, if it is none of these.
 BAD_REFERENCE = re.compile(
-    rb"(?<![0-9/])/[^ \t\r\n]*|/(?!(?:-?[0-9]+)?(?:/-?[0-9]+)?(?:[ \t\r\n]|$))[^ \t\r\n]*"
+    rb"(?<![0-9/])/[^ \t\r\n]*|/(?!(?:-?[0-9]+)?(?:/(?:-?[0-9]+)?)?(?:[ \t\r\n]|$))[^ \t\r\n]*"
 )
 REFERENCE = re.compile(rb"/[^ \t\r\n]*")
 # Counts that this program, MeshLab and 3ds Max state in comments of their own.
@@ -32,6 +32,9 @@ STATED = re.compile(
     rb"|[ \t]*(?P<v3>[0-9]+) vertices|[ \t]*(?P<f3>[0-9]+) faces)[ \t\r]*$",
     re.MULTILINE | re.IGNORECASE,
 )
+# A mark of UTF-8 before a text, and what some programs write after one.
+UTF8, ENDS = b"\xef\xbb\xbf", b"\0\x1a"
+LINE_FEED = 10
 # The weight that changes nothing, as programs write it.
 ONE = re.compile(rb"\+?0*1\.?0*(?:[eE][-+]?0+)?")
 # Digits of a count; a longer one is a comment of another kind.
@@ -49,9 +52,14 @@ def read_obj(data: bytes) -> tuple[Floats, Integers]:
         (also `ValueError`) A line that is none of OBJ, with its number; vertex 0 or one that is not
         there; a coordinate that is not finite; other counts than a comment states.
     """
+    data = data.removeprefix(UTF8).rstrip(ENDS)
     if b"\0" in data:
         raise CaseInputError("is not an OBJ file: it holds zero bytes")
-    lines = data.removeprefix(b"\xef\xbb\xbf").split(b"\n")
+    if b"\r" in data and b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
+    lines = data.split(b"\n")
+    if any(m.start() and data[m.start() - 1] != LINE_FEED for m in re.finditer(b"#", data)):
+        lines = [line if line[:1] == b"#" else line.partition(b"#")[0] for line in lines]
     if b"\\" in data:
         lines = _joined(lines)
     vertices: list[list[bytes]] = []

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.polygons import triangles_of
+from cmfsim.io.polygons import triangles_of, triangles_of_strips
 from cmfsim.io.text_numbers import real_numbers, shown, whole_numbers
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -36,6 +36,8 @@ AXES = (b"x", b"y", b"z")
 CORNERS = (b"vertex_indices", b"vertex_index")
 # Bytes after the last element that are a line end.
 LINE_ENDS = (b"", b"\n", b"\r\n", b"\r")
+# What stands between two strips of a list.
+STRIP_END = -1
 # Corners of the least face.
 LEAST_CORNERS = 3
 
@@ -82,10 +84,11 @@ def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
     """
     elements, order, start = _header(data)
     names = [element.name for element in elements]
-    for name in ("vertex", "face"):
+    # Scans have one list of strips in place of faces.
+    kind = "tristrips" if "tristrips" in names and "face" not in names else "face"
+    for name in ("vertex", kind):
         if names.count(name) != 1:
-            extra = "; triangle strips are not read" if "tristrips" in names else ""
-            raise CaseInputError(f"has {names.count(name)} elements {name!r}: one is needed{extra}")
+            raise CaseInputError(f"has {names.count(name)} elements {name!r}: one is needed")
     source = _Binary(data, start, order) if order else _Text(data, start)
     rows = {element.name: source.rows(element) for element in elements}
     left = source.left()
@@ -94,20 +97,32 @@ def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
             f"holds {left} more than its header states, and they read as another "
             f"{elements[-1].name}: the header states {elements[-1].number}; export it again"
         )
-    vertex, face = (elements[names.index(name)] for name in ("vertex", "face"))
+    vertex, face = (elements[names.index(name)] for name in ("vertex", kind))
     axes = [_column(vertex, rows["vertex"], (axis,)) for axis in AXES]
     points = np.stack([np.asarray(column, dtype=np.float64) for column, _ in axes], axis=1)
     if not np.isfinite(points).all():
         bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
         raise CaseInputError(f"vertex {bad} is not finite: every coordinate must be finite")
-    corners, lengths = _column(face, rows["face"], CORNERS)
+    corners, lengths = _column(face, rows[kind], CORNERS)
     if lengths is None or corners.dtype.kind == "f":
         raise CaseInputError(
             "the corners of faces are not a list of whole numbers: "
             "'property list uchar int vertex_indices' is needed"
         )
-    triangles = triangles_of(points, lengths, corners.astype(np.int64))
+    corners = corners.astype(np.int64)
+    if kind == "face":
+        triangles = triangles_of(points, lengths, corners)
+    else:
+        triangles = triangles_of_strips(points, *_strips(corners, lengths))
     return points, triangles, (_bytes_left(left),) if left else ()
+
+
+def _strips(corners: Integers, lengths: Integers) -> tuple[Integers, Integers]:
+    """How many corners each strip has, and all of these: in a list, -1 ends a strip."""
+    rows = np.repeat(np.arange(len(lengths)), lengths)
+    number = rows + np.cumsum(corners == STRIP_END)
+    kept = corners != STRIP_END
+    return np.unique(number[kept], return_counts=True)[1], corners[kept]
 
 
 def _may_be_a_row(source: "_Binary | _Text", last: _Element, n_vertices: int) -> bool:

@@ -25,6 +25,8 @@ FACET = (
     *(b"vertex", b"", b"", b"") * 3,
     *(b"endloop", b"endfacet"),
 )
+# A mark of UTF-8 before a text, and what some programs write after one.
+UTF8, ENDS = b"\xef\xbb\xbf", b"\0\x1a"
 CORNERS = (8, 9, 10, 12, 13, 14, 16, 17, 18)
 
 
@@ -41,12 +43,23 @@ def read_stl(data: bytes) -> tuple[Floats, tuple[Finding, ...]]:
     """
     if len(data) >= HEADER + 4 and len(data) == _length(data):
         return _read_binary(data), ()
-    if data[:1024].lstrip()[:5].lower() == b"solid" and b"\0" not in data:
-        return _read_text(data), ()
+    text = data.removeprefix(UTF8).rstrip(ENDS)
+    if text[:1024].lstrip()[:5].lower() == b"solid" and b"\0" not in text:
+        return _read_text(text), ()
     if len(data) < HEADER + 4:
         raise CaseInputError(
             f"is not an STL file, or is cut short: {len(data)} bytes, a header has {HEADER + 4}"
         )
+    if _count(data) == 0 and len(data) > HEADER + 4 and not (len(data) - HEADER - 4) % ROW.itemsize:
+        count = (len(data) - HEADER - 4) // ROW.itemsize
+        finding = Finding.warning(
+            "field-ignored",
+            f"it states 0 triangles, and has bytes for {count}, which were read",
+            why="the program that wrote it did not finish its header, or was stopped",
+            fix="look at the surface; if a part is missing, export it again",
+        )
+        whole = data[:HEADER] + count.to_bytes(4, "little") + data[HEADER + 4 :]
+        return _read_binary(whole), (finding,)
     if 0 < (left := len(data) - _length(data)) < ROW.itemsize:
         finding = Finding.warning(
             "field-ignored",

@@ -217,6 +217,21 @@ def test_slices_without_an_acquisition_number_belong_to_any(tmp_path):
     assert not found.findings
 
 
+@pytest.mark.parametrize("tag", ["0020,0052", "0028,0004", "0008,0060"])
+def test_slices_that_state_no_frame_pixels_or_modality_contradict_none(tmp_path, tag):
+    explicit_series(tmp_path / "ct")
+    group, number = (int(part, 16) for part in tag.split(","))
+    for k in (0, 3, 4):
+        path = tmp_path / "ct" / f"{k}.dcm"
+        head, found, rest = path.read_bytes().partition(struct.pack("<HH", group, number))
+        if found:
+            (length,) = struct.unpack("<H", rest[2:4])
+            path.write_bytes(head + rest[4 + length :])
+    found = read_image_file(tmp_path / "ct")
+    same(found, noisy())
+    assert found.modality == "CT"
+
+
 def test_acquisitions_that_alternate_on_one_even_row_are_one_scan_with_a_warning(tmp_path):
     slices = [s.with_tags(t0020_0012=str(1 + k % 2)) for k, s in enumerate(axial(noisy()))]
     write_series(tmp_path / "ct", slices)

@@ -51,6 +51,11 @@ OBJ = {
     "weights of 1": CORNERS.replace("\n", " 1.00000\n") + "f 1 3 2\nf 1 2 4\n",
     "weights of 1e0": CORNERS.replace("\n", " +1e+00\n") + "f 1 3 2\nf 1 2 4\n",
     "colours of four parts": CORNERS.replace("\n", " 0.5 0.5 0.5 1.0\n") + "f 1 3 2\nf 1 2 4",
+    "comments behind": CORNERS.replace("\n", " # a corner\n") + "f 1 3 2 # a\nf 1 2 4 #\n",
+    "returns alone": (CORNERS + "f 1 3 2\nf 1 2 4\n").replace("\n", "\r"),
+    "slashes alone": CORNERS + "f 1// 3// 2//\nf 1/ 2/ 4/\n",
+    "the end of DOS": CORNERS + "f 1 3 2\nf 1 2 4\n\x1a",
+    "zeros at the end": CORNERS + "f 1 3 2\nf 1 2 4\n\0\0",
     "a mark of UTF-8": "\ufeff# by hand\n" + CORNERS + "f 1 3 2\nf 1 2 4\n",
 }
 
@@ -83,7 +88,7 @@ BAD_OBJ = {
     "fo 1 2 3": "line 5: 'fo' is not known in OBJ",
     "f 1 2 3\n# 5 vertices": "a comment states 5 vertices, the file holds 4",
     "f 1 2 3\n# Faces: 2": "a comment states 2 faces, the file holds 1",
-    "f 1 2 3\n\0": "zero bytes",
+    "f 1 2 3\0\n": "zero bytes",
     "": "found nothing",
 }
 
@@ -221,6 +226,29 @@ def test_what_was_ignored_in_a_surface_is_logged_where_nobody_asks(tmp_path, cap
     assert "it.ply: 3 bytes after the last row were ignored" in caplog.text
 
 
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_strips_of_a_ply_become_triangles_that_face_one_way(order, tmp_path):
+    """One list in which -1 ends a strip, as scans of Stanford have it."""
+    strips = [0, 1, 2, 3, -1, 4, 6, 5, 7, -1]
+    head = (
+        f"ply\nformat {order} 1.0\nelement vertex {len(CUBE)}\nproperty double x\n"
+        "property double y\nproperty double z\nelement tristrips 1\n"
+        "property list int int vertex_indices\nend_header\n"
+    )
+    if order == "ascii":
+        rows = [" ".join(map(str, row)) for row in CUBE.tolist()]
+        body = "\n".join([*rows, f"{len(strips)} {' '.join(map(str, strips))}\n"]).encode()
+    else:
+        e = ">" if "big" in order else "<"
+        body = CUBE.astype(f"{e}f8").tobytes()
+        body += struct.pack(f"{e}{1 + len(strips)}i", len(strips), *strips)
+    surface = cmfsim.read_surface(saved(tmp_path, "it.ply", head.encode() + body))
+    assert surface.triangles.tolist() == [[0, 1, 2], [2, 1, 3], [4, 6, 5], [5, 6, 7]]
+    bad = head.encode() + body.replace(b" 3 -1", b" 9 -1")
+    if order == "ascii":
+        refused(saved(tmp_path, "bad.ply", bad), "names vertex 9")
+
+
 # STL.
 
 
@@ -251,6 +279,8 @@ def test_stl_is_told_apart_by_its_content(ball, tmp_path):
         stl_text(corners),
         stl_text(corners).upper(),
         stl_text(corners[:half], "one facet") + stl_text(corners[half:], "two"),
+        b"\xef\xbb\xbf" + stl_text(corners) + b"\x1a",
+        stl_text(corners).replace(b"normal 0 0 0", b"normal -1.#IND nan nan") + b"\0\0",
     ):
         surface = cmfsim.read_surface(saved(tmp_path, "it.stl", content))
         assert np.array_equal(surface.vertices[surface.triangles], corners)
@@ -285,6 +315,16 @@ def test_stl_with_a_few_bytes_left_is_read_with_a_warning(ball, tmp_path):
         read = cmfsim.io.read_surface_file(path)
         assert np.array_equal(read.surface.vertices[read.surface.triangles], corners)
         assert [f.code for f in read.findings] == ["field-ignored"]
+
+
+def test_stl_whose_count_was_never_written_is_read_with_a_warning(ball, tmp_path):
+    """Programs that write as they go leave 0 there."""
+    binary, corners = ball
+    path = saved(tmp_path, "it.stl", binary[:80] + bytes(4) + binary[84:])
+    read = cmfsim.io.read_surface_file(path)
+    assert np.array_equal(read.surface.vertices[read.surface.triangles], corners)
+    (finding,) = read.findings
+    assert f"has bytes for {len(corners)}" in finding.what
 
 
 # VTK's XML files.
