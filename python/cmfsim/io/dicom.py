@@ -215,7 +215,7 @@ def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[
     headers += below
     if not headers:
         raise ImageInputError(
-            f"{folder.name}: neither the folder nor those below it hold a DICOM image "
+            f"{folder.name}: there is no DICOM image in the folder or below it "
             f"({len(paths)} files in it)"
         )
     if damaged:

@@ -106,12 +106,21 @@ class DicomHeader:
     has_pixels : bool
     frames : tuple of Frame
         Of an enhanced multi-frame image, in the order of its pixels.
+    odd : tuple of (int, int)
+        The first byte of each private element of no known kind, and that after its last.
     """
 
     path: Path
     tags: Tags
     has_pixels: bool = False
     frames: tuple[Frame, ...] = ()
+    odd: tuple[tuple[int, int], ...] = ()
+
+    def without_odd(self) -> bytes:
+        """The file without its private elements of no known kind, which not all readers pass."""
+        data, ends = self.path.read_bytes(), [0, *(end for _, end in self.odd)]
+        starts = [*(start for start, _ in self.odd), len(data)]
+        return b"".join(data[a:b] for a, b in zip(ends, starts, strict=True))
 
     @property
     def count(self) -> int:
@@ -192,6 +201,8 @@ class _Reader:
         self.explicit = True
         self.elements = 0
         self.pixels: int | None = None
+        self.depth = 0
+        self.odd: list[tuple[int, int]] = []
 
     def header(self) -> DicomHeader:
         found = _Found()
@@ -212,7 +223,9 @@ class _Reader:
             self.explicit = first[4:6].isalpha()
         self._data_set(found, self.size, 0)
         self._check_pixels(found)
-        return DicomHeader(self.path, found.tags, self.pixels is not None, tuple(_frames(found)))
+        frames = tuple(_frames(found))
+        has_pixels = self.pixels is not None
+        return DicomHeader(self.path, found.tags, has_pixels, frames, tuple(self.odd))
 
     def _data_set(
         self, found: _Found, end: int, depth: int, *, stop_after_meta: bool = False
@@ -224,6 +237,7 @@ class _Reader:
         while self.stream.tell() < end:
             if stop_after_meta and self._next_group() != META_GROUP:
                 return
+            self.depth = depth
             tag, kind, length = self._element()
             if tag in {ITEM_END, SEQUENCE_END}:
                 return
@@ -286,6 +300,8 @@ class _Reader:
             ):
                 if self._is_followed(tag, start + length):
                     self.stream.seek(start)
+                    if self.depth == 0:
+                        self.odd.append((begin - 8, start + length))
                     return length
         raise ImageInputError(
             f"{self.path.name}: its element {tag >> 16:04x},{tag & 0xFFFF:04x} has no known value "

@@ -6,6 +6,7 @@ slice, never from file names, instance numbers or a reader's sorting.
 
 import itertools
 import math
+import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -237,7 +238,13 @@ def _pixels(name: str, stack: Stack) -> NDArray[Any]:
 
 def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
     paths = [str(s.header.path.absolute()) for s in stack.slices]
-    answer = read_in_child("cmfsim.io.image_reading:read_slices", limits, paths=paths)
+    with tempfile.TemporaryDirectory(prefix="cmfsim-dicom-") as folder:
+        for k, one in enumerate(stack.slices):
+            if one.header.odd:
+                copy = Path(folder, f"{k}-{one.header.path.name}")
+                copy.write_bytes(one.header.without_odd())
+                paths[k] = str(copy)
+        answer = read_in_child("cmfsim.io.image_reading:read_slices", limits, paths=paths)
     places = np.array(answer.values["places"])
     expected = np.column_stack([stack.positions, np.tile(stack.spacing, (len(paths), 1))])
     off = np.abs(places - expected).max(axis=1)

@@ -77,9 +77,8 @@ def _read(path: str, kind: str) -> Any:
         image = reader.Execute()
     except RuntimeError as error:
         raise ImageInputError(
-            f"{name}: cannot be read, because it is cut short, damaged or unusual "
-            f"({_last_line(error)[:100]}): copy it again; if other programs show it, save it anew "
-            "(DICOM: with gdcmconv or dcmconv)"
+            f"{name}: cannot be decoded ({_last_line(error)[:100]}): copy it again; if other "
+            "programs show it, save it anew with one of them (DICOM: with gdcmconv or dcmconv)"
         ) from error
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise ImageInputError(

@@ -10,7 +10,6 @@ import cmfsim
 import ct_variants as variants
 from cmfsim import ImageData, ImageError
 from cmfsim.io.dicom import dicom_files, dicom_places
-from cmfsim.io.dicom_headers import dicom_header
 from cmfsim.io.image_grids import of_slices
 from cmfsim.io.images import read_image_file
 from dicom_series import axial, tilted, write_classic_frames, write_enhanced, write_series
@@ -264,6 +263,8 @@ def private(kind, length, value=b"abcd"):
     "odd",
     [
         private(b"\0\0", struct.pack("<H", 4)),
+        private(b"??", struct.pack("<H", 4)),
+        private(b"", struct.pack("<I", 4)),
         private(b"--", b"\0\0" + struct.pack("<I", 4)),
     ],
 )
@@ -274,20 +275,10 @@ def test_private_elements_of_no_known_kind_are_passed_over(tmp_path, odd):
     same(read_image_file(tmp_path / "ct"), noisy())
 
 
-def test_a_private_element_without_any_kind_is_passed_over(tmp_path):
-    explicit_series(tmp_path / "ct")
-    with_elements(tmp_path / "ct" / "3.dcm", private(b"", struct.pack("<I", 4)))
-    assert dicom_header(tmp_path / "ct" / "3.dcm").text("series_uid") == "1.2.3"
-
-
 def test_an_element_whose_end_is_not_found_is_named_with_a_remedy(tmp_path):
     explicit_series(tmp_path / "ct")
     with_elements(tmp_path / "ct" / "3.dcm", private(b"\0\0", struct.pack("<H", 9999)))
     refused(tmp_path / "ct", "3.dcm", "0009,1001", "gdcmconv")
-    # This one the reader of pixels does not pass over.
-    explicit_series(tmp_path / "odd")
-    with_elements(tmp_path / "odd" / "3.dcm", private(b"??", struct.pack("<H", 4)))
-    refused(tmp_path / "odd", "3.dcm", "gdcmconv")
     # One that is not private may be needed.
     public = struct.pack("<HH", 0x0008, 0x0070) + b"\0\0" + struct.pack("<H", 4) + b"abcd"
     explicit_series(tmp_path / "other")
