@@ -4,6 +4,7 @@ The order of slices, their distances and their shifts come from the position and
 slice, never from file names, instance numbers or a reader's sorting.
 """
 
+import contextlib
 import itertools
 import math
 import tempfile
@@ -20,6 +21,7 @@ from cmfsim.errors import ImageInputError
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom_headers import numbers_of
 from cmfsim.io.dicom_slices import Slice, Stack, counted, is_localizer, listed
+from cmfsim.io.files import utf8_path
 from cmfsim.io.image_grids import aligned, of_slices, turn_of, upright
 from cmfsim.io.image_headers import check_shape
 from cmfsim.values.finding import Finding
@@ -237,13 +239,15 @@ def _pixels(name: str, stack: Stack) -> NDArray[Any]:
 
 
 def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
-    paths = [str(s.header.path.absolute()) for s in stack.slices]
-    with tempfile.TemporaryDirectory(prefix="cmfsim-dicom-") as folder:
+    paths = []
+    with contextlib.ExitStack() as kept:
+        folder = kept.enter_context(tempfile.TemporaryDirectory(prefix="cmfsim-dicom-"))
         for k, one in enumerate(stack.slices):
+            path = one.header.path
             if one.header.odd:
-                copy = Path(folder, f"{k}-{one.header.path.name}")
-                copy.write_bytes(one.header.without_odd())
-                paths[k] = str(copy)
+                path = Path(folder, f"{k}.dcm")
+                path.write_bytes(one.header.without_odd())
+            paths.append(kept.enter_context(utf8_path(path)))
         answer = read_in_child("cmfsim.io.image_reading:read_slices", limits, paths=paths)
     places = np.array(answer.values["places"])
     expected = np.column_stack([stack.positions, np.tile(stack.spacing, (len(paths), 1))])
@@ -259,7 +263,8 @@ def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
 
 
 def _of_frames(path: Path, limits: ReadLimits) -> NDArray[Any]:
-    answer = read_in_child("cmfsim.io.image_reading:read_frames", limits, path=str(path.absolute()))
+    with utf8_path(path) as plain:
+        answer = read_in_child("cmfsim.io.image_reading:read_frames", limits, path=plain)
     values = answer.arrays["values"]
     return values if values.ndim == 3 else values[None]
 

@@ -12,6 +12,7 @@ import math
 import os
 import re
 import stat
+import tempfile
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path, PurePosixPath
@@ -42,6 +43,7 @@ __all__ = [
     "table_of",
     "toml_hint",
     "toml_module",
+    "utf8_path",
     "utf8_text",
 ]
 
@@ -178,6 +180,23 @@ def named(path: Path) -> Iterator[None]:
         text = str(error)
         own = text.startswith(f"{path.name}: ")
         raise CaseInputError(text if own else f"{path.name}: {text}") from error
+
+
+@contextlib.contextmanager
+def utf8_path(path: Path) -> Iterator[str]:
+    """An absolute path as C++ libraries take it: a link in UTF-8 where a name on it is not."""
+    text = os.path.abspath(path)  # noqa: PTH100 (links stay as they are named)
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory(prefix="cmfsim-link-") as folder:
+            # Some libraries go by the ending.
+            ending = "".join(path.suffixes[-2:]).encode("ascii", "ignore").decode()
+            link = Path(folder, f"file{ending}")
+            link.symlink_to(text)
+            yield str(link)
+    else:
+        yield text
 
 
 def beside(folder: Path, where: str, name: object) -> Path:

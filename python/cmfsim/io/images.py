@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cmfsim.errors import ImageError, ImageInputError, third_party
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.io.dicom import read_dicom_file, read_dicom_folder
-from cmfsim.io.files import is_there
+from cmfsim.io.files import is_there, utf8_path
 from cmfsim.io.image_grids import aligned, shear_of, turn_of, upright
 from cmfsim.io.image_headers import KNOWN, ImageHeader, apart
 from cmfsim.io.leftovers import abandoned, temporary_folder
@@ -158,9 +158,9 @@ def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
         shutil.rmtree(left, ignore_errors=True)
     with temporary_folder(path.parent, prefix) as fresh:
         try:
-            temporary = fresh / f"image{suffix}"
-            itk.WriteImage(written, str(temporary), useCompression=True)
-            temporary.replace(path)
+            with utf8_path(fresh) as plain:
+                itk.WriteImage(written, f"{plain}/image{suffix}", useCompression=True)
+            (fresh / f"image{suffix}").replace(path)
         except RuntimeError as error:
             raise ImageError(f"{path.name}: cannot be written ({_last_line(error)})") from error
         finally:
@@ -182,12 +182,9 @@ def _read_file(path: Path, header: ImageHeader) -> ImageFile:
     size = max(path.stat().st_size, header.bytes)
     limits = ReadLimits(20.0 + size / 5e6, 4 * 2**30 + COPIES * size)
     try:
-        answer = read_in_child(
-            "cmfsim.io.image_reading:read_volume",
-            limits,
-            path=str(path.absolute()),
-            reader=header.reader,
-        )
+        with utf8_path(path) as plain:
+            task = "cmfsim.io.image_reading:read_volume"
+            answer = read_in_child(task, limits, path=plain, reader=header.reader)
     except ReaderError as error:
         raise ImageInputError(f"{path.name}: {error}") from error
     values = answer.arrays["values"].T

@@ -12,6 +12,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.child import Answer, ReaderError, ReadLimits, read_in_child
+from cmfsim.io.files import utf8_path
 from cmfsim.values.checks import Floats
 
 __all__ = ["parse_itk_hdf5", "read_itk_hdf5"]
@@ -50,11 +51,9 @@ def read_itk_hdf5(path: Path) -> list[tuple[str, Floats, Floats]]:
         if file.read(len(SIGNATURE)) != SIGNATURE:
             raise CaseInputError("is not an HDF5 file: save the transform as .h5 or .tfm again")
     try:
-        answer = read_in_child(
-            "cmfsim.io.itk_hdf5:parse_itk_hdf5",
-            ReadLimits(seconds=SECONDS),
-            path=str(path.resolve()),
-        )
+        with utf8_path(path) as plain:
+            task = "cmfsim.io.itk_hdf5:parse_itk_hdf5"
+            answer = read_in_child(task, ReadLimits(seconds=SECONDS), path=plain)
     except ReaderError as error:
         raise CaseInputError(f"{error}; save the transform as .tfm (ITK text)") from error
     return [

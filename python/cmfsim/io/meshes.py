@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.child import Answer, ReaderError, ReadLimits, read_in_child
-from cmfsim.io.files import check_readable, named
+from cmfsim.io.files import check_readable, named, utf8_path
 from cmfsim.io.msh import read_msh
 from cmfsim.io.obj import read_obj
 from cmfsim.io.plain_mesh import Cells, PlainMesh
@@ -120,7 +120,8 @@ def _by_meshio(path: Path) -> PlainMesh:
     # meshio's slowest readers take a MB a second, and less than 200 bytes for each.
     limits = ReadLimits(SECONDS + size / 1e6, MEMORY + 200 * size)
     try:
-        answer = read_in_child("cmfsim.io.meshes:meshio_answer", limits, path=os.path.abspath(path))  # noqa: PTH100
+        with utf8_path(path) as plain:
+            answer = read_in_child("cmfsim.io.meshes:meshio_answer", limits, path=plain)
     except ReaderError as error:
         raise CaseInputError(f"cannot be read as a mesh: {error}") from error
     arrays, values = answer.arrays, answer.values

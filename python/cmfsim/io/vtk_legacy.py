@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io.child import Answer, ReaderError, ReadLimits, read_in_child
+from cmfsim.io.files import utf8_path
 from cmfsim.io.plain_mesh import Cells, PlainMesh
 from cmfsim.io.polygons import triangles_of, triangles_of_strips
 from cmfsim.io.stated_frames import stated_frame
@@ -77,12 +78,9 @@ def read_vtk_legacy(path: Path) -> PlainMesh:
         )
     limits = ReadLimits(SECONDS + len(data) / 2e6, MEMORY + 64 * len(data))
     try:
-        answer = read_in_child(
-            "cmfsim.io.vtk_legacy:legacy_answer",
-            limits,
-            path=str(path.absolute()),
-            reader=READERS[kind],
-        )
+        with utf8_path(path) as plain:
+            task = "cmfsim.io.vtk_legacy:legacy_answer"
+            answer = read_in_child(task, limits, path=plain, reader=READERS[kind])
     except ReaderError as error:
         raise CaseInputError(
             f"is cut short or damaged ({error}): export it again, as STL or PLY if you can"

@@ -1,6 +1,8 @@
 """DICOM series as scanners and archives give them: placed rightly, or refused by name."""
 
+import os
 import struct
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -514,6 +516,22 @@ def test_slices_that_are_links_are_read_and_broken_links_reported(tmp_path):
     assert (finding.severity, finding.code) == ("warning", "dicom-other-files")
     assert "1.2.3_0007.dcm" in finding.what
     assert "datalad get" in finding.fix
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes are those of Linux")
+def test_names_that_are_not_utf_8_keep_no_library_from_a_file(tmp_path):
+    """SimpleITK ended the process, and readers failed, in a folder with an umlaut in Latin-1."""
+    folder = tmp_path / os.fsdecode(b"Pati\xe9nt")
+    folder.mkdir()
+    for ending in (".nrrd", ".nii.gz", ".mha"):
+        path = folder / (os.fsdecode(b"gr\xfcn") + ending)
+        cmfsim.write_image(noisy(), path)
+        same(read_image_file(path), noisy())
+    write_series(tmp_path / "ct", axial(noisy()))
+    (tmp_path / "ct").rename(folder / "ct")
+    same(read_image_file(folder / "ct"), noisy())
+    write_classic_frames(folder / "ct.dcm", axial(noisy()), {0x00180088: "2"})
+    same(read_image_file(folder / "ct.dcm"), noisy())
 
 
 # Real data -------------------------------------------------------------------------------------

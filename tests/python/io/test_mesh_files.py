@@ -3,6 +3,7 @@
 import base64
 import os
 import struct
+import sys
 import zlib
 
 import numpy as np
@@ -592,6 +593,19 @@ def test_vtk_models_of_slicer_are_read(version, binary, tmp_path):
         assert mesh.frame == "RAS"
         assert np.allclose(mesh.points, ball.points, atol=1e-4)
         assert np.array_equal(mesh.cells[0].data, ball.faces.reshape(-1, 4)[:, 1:])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes are those of Linux")
+def test_names_that_are_not_utf_8_keep_no_library_from_a_surface(tmp_path):
+    ball = vtk_ball()
+    cells = [("triangle", ball.faces.reshape(-1, 4)[:, 1:])]
+    meshio.Mesh(np.asarray(ball.points, dtype=float), cells).write(tmp_path / "it.off")
+    vtk_saved(tmp_path / "it.vtk", ball)
+    folder = tmp_path / os.fsdecode(b"Pati\xe9nt")
+    folder.mkdir()
+    for name in ("it.off", "it.vtk"):
+        (tmp_path / name).rename(folder / name)
+        assert len(cmfsim.read_surface(folder / name).triangles) == len(cells[0][1])
 
 
 def test_vtk_cells_whose_first_bytes_look_like_a_line_are_read(tmp_path):
