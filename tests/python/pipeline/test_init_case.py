@@ -396,6 +396,25 @@ def test_links_into_a_store_are_read_and_broken_ones_reported(head):
     assert "datalad get" in why
 
 
+def test_links_to_folders_are_followed_once_and_never_upwards(head):
+    """To the folder of surfaces, to itself, and to the folder of all patients."""
+    folder = head / "patient"
+    (head / "store").mkdir()
+    folder.mkdir()
+    for name in ("skin.ply", "cranium.ply", "mandible.ply"):
+        (head / name).rename(head / "store" / name)
+    (folder / "a").symlink_to("../store")
+    (folder / "b").symlink_to("../store")
+    (folder / "up").symlink_to("..")
+    (folder / "round").symlink_to("round")
+    draft = init_case(folder)
+    assert cmfsim.Case.load(folder).surfaces.skin == folder / "a" / "skin.ply"
+    whys = {entry.label: entry.why for entry in draft.taken}
+    assert "that holds this one" in whys["up"]
+    assert "was read already" in whys["b"]
+    assert "datalad" in whys["round"]
+
+
 def series_of_a_head(folder, uid="1.2.3", study="1.2", places=(".",)):
     """A small CT of which each part of the slices lies in a folder of its own."""
     values = np.full((24, 24, 12), -1000, dtype=np.int16)

@@ -47,6 +47,7 @@ OURS = ("prediction.json", "build.json", "metrics.json", "cmfsim-scene.mrml")
 # Why files are not read.
 NOT_UTF8 = "its name is not UTF-8, so a case file cannot name it: rename it"
 NOT_HERE = "is a link to a file that is not here: fetch it (with DataLad: datalad get)"
+SEEN = "is a link to a folder that holds this one, or that was read already"
 # What a DICOM file holds after its preamble.
 PREAMBLE = 128
 
@@ -237,10 +238,18 @@ def listing(folder: Path) -> Listing:
 def _files(folder: Path, found: Listing) -> Iterator[Path]:
     """The plain files of a folder in a fixed order; hidden ones and cmfsim's results left out.
 
-    Links are followed: the folder is the user's own. Files that no case can name are noted.
+    Links are followed: the folder is the user's own. Files that no case can name are noted, and
+    links to folders that were seen already, or that this one lies in.
     """
-    for place, folders, names in os.walk(folder):
+    top, seen = folder.resolve(), set[Path]()
+    for place, folders, names in os.walk(folder, followlinks=True):
         here = Path(place)
+        real = here.resolve()
+        if real in seen or (real != top and top.is_relative_to(real)):
+            found.skip(here, SEEN)
+            folders.clear()
+            continue
+        seen.add(real)
         if here != folder and any(name in names for name in OURS):
             folders.clear()
             continue
