@@ -356,7 +356,8 @@ def _muscle_moduli(table: Table) -> TissueModuli:
 
 def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
     """The face and bones after the operation, from [postoperative]."""
-    table.only("skin", "image", "landmarks", "bones", "aligned", "units", "frame", "series")
+    flags = ("aligned", "verified")
+    table.only("skin", "image", "landmarks", "bones", "units", "frame", "series", *flags)
     bones = table.table("bones")
     if "skin" in table and "image" in table:
         table.fail("image", "is given together with skin: give one of them")
@@ -378,6 +379,7 @@ def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
         table.text("units", "mm", tuple(UNITS)),
         stated_frame(table),
         _dicom_series(table),
+        table.flag("verified", default=False),
     )
 
 
