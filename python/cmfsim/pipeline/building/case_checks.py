@@ -7,6 +7,7 @@ import numpy as np
 
 from cmfsim._core import TetMesh
 from cmfsim.doctor import SizedMotion, check_motion_size
+from cmfsim.doctor.bone_overlap import BonePart, check_jaws, jaw_of
 from cmfsim.doctor.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
@@ -17,7 +18,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["cut_segments", "misplaced", "plan_sizes", "untouched"]
+__all__ = ["cut_segments", "jaws", "misplaced", "plan_sizes", "untouched"]
 
 
 def misplaced(
@@ -80,6 +81,28 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
     if case.surfaces is None and (errors := [f for f in found if f.severity == "error"]):
         raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].fix}")
     return found
+
+
+def jaws(
+    bones: PlannedBones, landmarks: Mapping[str, Floats], case: Case, known: Iterable[Finding]
+) -> list[Finding]:
+    """What the plan does to the jaws, now that every segment has its surface and its motion.
+
+    The doctor has reported it before where the case gives surfaces and landmarks.
+    """
+    seen = {finding.code for finding in known}
+    made = {name: cut for cut in case.osteotomies for name in cut.segments}
+    parts = []
+    for segment in bones.segments:
+        cut = made.get(segment.name)
+        # A piece that a plane of the user cuts has the jaw of its bone.
+        names = (segment.name, cut.bone if cut is not None else None)
+        jaw = next((jaw for name in names if name and (jaw := jaw_of(name))), None)
+        if jaw is not None:
+            where = case.where("plan" if case.achieved else f"plan.{segment.name}")
+            motion = bones.motions.get(segment.name, np.eye(4))
+            parts.append(BonePart(segment.name, jaw, where, segment.surface, motion))
+    return [found for found in check_jaws(parts, landmarks) if found.code not in seen]
 
 
 def untouched(
