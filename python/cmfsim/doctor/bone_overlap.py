@@ -29,8 +29,8 @@ REVERSED, FAR_BEHIND, GOOD_BITE, DECIDES = 2.0, 9.4, (0.4, 6.4), 3.0
 # The bones that bear the teeth: the first that there is.
 UPPER_BEARERS = ("maxilla", "midface", "cranium", "skull")
 LOWER_BEARERS = ("mandible_body", "mandible")
-# Share of a bone's points from which on it lies within the other.
-WITHIN = 0.5
+# Share of a bone's points, deeper than this in mm, from which on it lies within the other.
+WITHIN, TOUCHES = 0.05, 0.5
 # Matrices whose entries differ by less, mm, are one motion.
 SAME_MOTION = 1e-9
 # Points of a bone that are looked up.
@@ -153,7 +153,7 @@ def _check_overlap(parts: Sequence[BonePart], joints: Sequence[Floats]) -> Itera
     gain, place, lower, upper = worst
     moving = upper if lower.is_still else lower
     yield Finding.warning(
-        "bones-overlap",
+        "plan-through-bone",
         f"{lower.name} lies {gain:.1f} mm deeper within {upper.name} than before, at "
         f"{place_text(place)}",
         where=moving.where,
@@ -178,14 +178,12 @@ def _deeper(lower: BonePart, upper: BonePart, joints: Sequence[Floats]) -> tuple
     for joint in joints:
         away = np.linalg.norm(before - joint, axis=1) > AROUND_JOINT
         before, after = before[away], after[away]
-    depth = upper.depth(after, upper.motion)
-    within = np.flatnonzero(depth)
+    was, depth = upper.depth(before), upper.depth(after, upper.motion)
     # A bone that lies within another is given twice, which is reported where surfaces are checked.
-    if not 0 < len(within) < WITHIN * len(after):
+    if not depth.any() or float((was > TOUCHES).mean()) > WITHIN:
         return 0.0, np.zeros(3)
-    gain = depth[within] - upper.depth(before[within])
-    worst = int(np.argmax(gain))
-    return float(gain[worst]), after[within[worst]]
+    worst = int(np.argmax(depth - was))
+    return float(depth[worst] - was[worst]), after[worst]
 
 
 def _remedy(lower: BonePart, upper: BonePart, gain: float, joints: Sequence[Floats]) -> str:

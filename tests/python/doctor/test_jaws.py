@@ -55,9 +55,9 @@ def test_a_jaw_that_is_not_moved_is_no_finding():
 
 def test_teeth_nine_millimetres_up_through_the_others_are_found():
     up = found(shifted(z=9.0), segments=("mandible_body", "ramus"))
-    assert set(up) == {"bones-overlap"}
-    assert "mandible_body lies" in up["bones-overlap"].what
-    assert "cranium is not moved" in up["bones-overlap"].fix
+    assert set(up) == {"plan-through-bone"}
+    assert "mandible_body lies" in up["plan-through-bone"].what
+    assert "cranium is not moved" in up["plan-through-bone"].fix
     # Both jaws together pass through nothing.
     assert found(shifted(z=9.0), upper=shifted(z=9.0), segments=("mandible_body",)) == {}
 
@@ -65,7 +65,7 @@ def test_teeth_nine_millimetres_up_through_the_others_are_found():
 def test_bones_that_overlapped_before_are_found_only_if_they_do_more():
     skull = ball((0.0, -50.0, 15.0), (60.0, 60.0, 50.0), 3)
     deep = cmfsim.SurfaceData(skull.vertices + [0.0, 0.0, -5.0], skull.triangles)
-    for shift, expected in ((0.5, []), (4.0, ["bones-overlap"])):
+    for shift, expected in ((0.5, []), (4.0, ["plan-through-bone"])):
         parts = [
             BonePart("maxilla", "upper", "", deep, np.eye(4)),
             BonePart("mandible_body", "lower", "", lower_jaw(), shifted(z=shift)),
@@ -76,7 +76,7 @@ def test_bones_that_overlapped_before_are_found_only_if_they_do_more():
 def test_a_bone_that_is_followed_by_its_vertices_is_looked_up_too():
     jaw = lower_jaw()
     up = cmfsim.MovedSurface(jaw, jaw.vertices + [0.0, 0.0, 9.0])
-    assert set(found(up)) == {"bones-overlap", "joint-left"}
+    assert set(found(up)) == {"plan-through-bone", "joint-left"}
 
 
 def test_a_whole_jaw_that_leaves_its_joint_lacks_a_split():
@@ -116,7 +116,7 @@ def test_the_doctor_finds_it_before_any_work(tmp_path):
     head = HeadCase()
     head.replace("translation = [0, -4, 1]", "translation = [0, -4, 16]")
     codes = [f.code for f in cmfsim.diagnose(cmfsim.Case.load(head.write(tmp_path)))]
-    assert "bones-overlap" in codes
+    assert "plan-through-bone" in codes
 
 
 def test_jaws_are_known_by_the_names_of_their_bones():
