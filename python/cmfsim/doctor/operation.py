@@ -12,7 +12,7 @@ from cmfsim.bones.planes import Cut
 from cmfsim.doctor.bone_overlap import BonePart, check_jaws, jaw_of
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.places import place_text
-from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
+from cmfsim.doctor.plan_size import SizedMotion, check_motion_size, nothing_moves
 from cmfsim.errors import CaseError, CmfsimError, LandmarkError
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.io.transforms import motion_in_lps
@@ -48,6 +48,15 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
             )
         available |= set(cut.segments)
         yield from _check_procedure(evidence, cut, where)
+    if {"le_fort_1", "le_fort_3"} <= {cut.procedure for cut in case.osteotomies}:
+        yield Finding.warning(
+            "cuts-both-le-fort",
+            "Le Fort I and Le Fort III are cut together",
+            where=case.where("osteotomies"),
+            why="a plan needs a motion for both pieces: the maxilla does not follow the midface, "
+            "nor the midface the maxilla",
+            fix="remove the cut that is not meant; if both are, give both segments a motion",
+        )
     for name in case.plan:
         if name not in available:
             yield Finding.error(
@@ -179,6 +188,10 @@ def check_plan(
         As `pieces_of` gives it.
     """
     case = evidence.case
+    # A motion that cannot be read is reported where files are.
+    known = not case.achieved and set(case.plan) == set(evidence.motions)
+    if known and all(np.array_equal(motion, np.eye(4)) for motion in evidence.motions.values()):
+        yield nothing_moves(case.where("plan"))
     apart = False
     for name, matrix in evidence.motions.items():
         piece, given = pieces[name], case.plan[name]

@@ -10,7 +10,15 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import decompose_motion
 
-__all__ = ["FAR", "TOO_FAR", "SizedMotion", "check_motion_size", "check_tiny", "check_turn"]
+__all__ = [
+    "FAR",
+    "TOO_FAR",
+    "SizedMotion",
+    "check_motion_size",
+    "check_tiny",
+    "check_turn",
+    "nothing_moves",
+]
 
 # Motions of bone above which a plan is unusual, and above which it is implausible; mm and degrees.
 # The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
@@ -74,6 +82,17 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
         elif not motion.typed:
             remedy = "check the unit (mm), frame (LPS or RAS) and direction of the transform"
         yield _too_far(motion, far, remedy)
+    elif angle > TINY_TURN[0] and motion.typed and not motion.has_centre:
+        yield Finding.warning(
+            "plan-no-centre",
+            f"{motion.name} turns by {angle:.1f}° about the origin of the coordinates, for no "
+            f"centre is given: the turn moves it by up to {far:.1f} mm",
+            where=motion.where,
+            why="a segment is turned about one of its own landmarks; about another point, the same "
+            "angle moves it elsewhere",
+            fix="give centre, such as the place of the upper incisors; centre = [0, 0, 0] if the "
+            "origin is meant",
+        )
     yield from check_turn(motion.name, motion.where, angle)
     reach = 0.0 if motion.points is not None else REACH * math.radians(angle)
     yield from check_tiny(motion.name, motion.where, far + reach, angle)
@@ -87,6 +106,17 @@ def _too_far(motion: SizedMotion, far: float, remedy: str) -> Finding:
         where=motion.where,
         why=f"ordinary surgery moves bone by at most {FAR:g} mm; tissue would tear",
         fix=remedy,
+    )
+
+
+def nothing_moves(where: str) -> Finding:
+    """The warning about a plan that moves no segment."""
+    return Finding.warning(
+        "plan-still",
+        "no segment moves",
+        where=where,
+        why="the predicted face is the face before the operation",
+        fix="give a motion in [plan.SEGMENT], or a file of the planning page by --plan",
     )
 
 

@@ -299,7 +299,7 @@ def _plain(table: Table) -> dict[str, Any]:
 def tissue_of(table: Table) -> TissueData | None:
     """The fat that the table states; None if it states none."""
     table.only("preset", "young", "poisson")
-    young = table.number("young", "MPa", above=0.0, high=1e5)
+    young = table.number("young", "MPa", low=YOUNG_RANGE[0], high=YOUNG_RANGE[1])
     poisson = table.number("poisson", above=-1.0, high=0.4999)
     if "preset" in table:
         if young is not None or poisson is not None:

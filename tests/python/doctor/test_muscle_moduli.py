@@ -9,7 +9,7 @@ from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.muscles import check_muscles
 from head_case import HeadCase
 
-CODES = ("muscle-moduli", "muscle-moduli-unusual", "muscle-moduli-unknown", "fat-moduli")
+CODES = ("muscle-moduli", "moduli-unusual", "muscle-moduli-unknown", "fat-moduli")
 OWN = """
 [muscles]
 preset = "kim2010"
@@ -112,5 +112,5 @@ def test_an_unknown_muscle_is_an_error_with_the_nearest_names(tmp_path):
 
 def test_kilopascals_are_a_warning(tmp_path):
     found = findings(tmp_path, OWN.replace("0.2", "200.0"))
-    assert [(f.severity, f.code) for f in found][1] == ("warning", "muscle-moduli-unusual")
+    assert [(f.severity, f.code) for f in found][1] == ("warning", "moduli-unusual")
     assert "10 kPa is 0.01" in found[1].fix

@@ -9,6 +9,7 @@ from cmfsim._core import TetMesh
 from cmfsim.doctor import SizedMotion, check_motion_size
 from cmfsim.doctor.bone_overlap import BonePart, check_jaws, jaw_of
 from cmfsim.doctor.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
+from cmfsim.doctor.plan_size import nothing_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.motions import PlannedBones
@@ -56,8 +57,10 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
     raised: a bone that is torn away.
     """
     seen = {(finding.code, finding.where) for finding in known}
-    surfaces = {segment.name: segment.surface for segment in bones.segments}
     found: list[Finding] = []
+    if case.achieved and all(_is_still(motion) for motion in bones.motions.values()):
+        found.append(nothing_moves(case.where("plan")))
+    surfaces = {segment.name: segment.surface for segment in bones.segments}
     for name, motion in bones.motions.items():
         if isinstance(motion, MovedSurface):
             continue
@@ -81,6 +84,12 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
     if case.surfaces is None and (errors := [f for f in found if f.severity == "error"]):
         raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].fix}")
     return found
+
+
+def _is_still(motion: Floats | MovedSurface) -> bool:
+    if isinstance(motion, MovedSurface):
+        return np.array_equal(motion.surface.vertices, motion.moved_vertices)
+    return np.array_equal(motion, np.eye(4))
 
 
 def jaws(
