@@ -8,14 +8,16 @@ from cmfsim.values.finding_table import FINDING_KINDS
 PAGE = Path(__file__).parents[1] / "docs/checks.md"
 HEAD = """# What is checked
 
-cmfsim reports what it notices as *findings*: `cmfsim doctor` before any work, every other command while it works. An
-error ends the work, a warning means that the result may be wrong, a note is for information. Findings are printed on
-the terminal, listed at the top of the report, and stored in the results as JSON. `--no-doctor` skips the checks made
-before the work. Errors about the face after an operation become warnings by `verified = true` in `[postoperative]`
+cmfsim reports what it notices as *findings*: `cmfsim doctor` before any work, every other command
+while it works. An error ends the work, a warning means that the result may be wrong, a note is for
+information. Findings are printed on the terminal, listed at the top of the report, and stored in
+the results as JSON. `--no-doctor` skips the checks made before the work. Errors about the face
+after an operation become warnings by `verified = true` in `[postoperative]`
 ([Evaluation](evaluation.md#where-nothing-was-operated-on)).
 
-This page lists every code; `…` stands for names and figures of your case. `scripts/make_checks_page.py` writes it from
-the table in the package (`cmfsim.values.finding_table`).
+This page lists every code; `…` stands for names and figures of your case.
+`scripts/make_checks_page.py` writes it from the table in the package
+(`cmfsim.values.finding_table`).
 
 | code | severity | meaning | why it matters | remedy |
 |---|---|---|---|---|

@@ -3,8 +3,9 @@
 import importlib.util
 from pathlib import Path
 
-from cmfsim.values.finding_table import FINDING_KINDS
 from finding_codes import package_findings
+
+from cmfsim.values.finding_table import FINDING_KINDS
 
 ROOT = Path(__file__).parents[3]
 MADE = package_findings()
