@@ -12,7 +12,12 @@ from cmfsim.bones.planes import Cut
 from cmfsim.doctor.bone_overlap import BonePart, check_jaws, jaw_of
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.places import place_text
-from cmfsim.doctor.plan_size import SizedMotion, check_motion_size, nothing_moves
+from cmfsim.doctor.plan_size import (
+    SizedMotion,
+    check_motion_size,
+    check_typed,
+    nothing_moves,
+)
 from cmfsim.errors import CaseError, CmfsimError, LandmarkError
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.io.transforms import motion_in_lps
@@ -210,6 +215,8 @@ def check_plan(
             )
         )
         yield from wrong
+        if given.typed:
+            yield from check_typed(plan[name], case.where(f"plan.{name}"))
         # A bone that flies off passes the skin as well: one reason is enough.
         flies = any(f.severity == "error" for f in wrong)
         apart = apart or flies
