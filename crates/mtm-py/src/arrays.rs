@@ -26,6 +26,20 @@ impl Named<'_> {
     }
 }
 
+/// `value` as a numpy array; rejects masked entries, whose values are unknown.
+fn unmasked<'py>(value: &Bound<'py, PyAny>, name: Named<'_>) -> PyResult<Bound<'py, PyAny>> {
+    let numpy = value.py().import("numpy")?;
+    if value.hasattr("mask")?
+        && numpy.getattr("ma")?.call_method1("is_masked", (value,))?.extract()?
+    {
+        let problem = "has masked entries, whose values are unknown: fill or remove them";
+        return Err(name.fail(problem.into()));
+    }
+    numpy
+        .call_method1("asarray", (value,))
+        .map_err(|e| name.fail(format!("cannot be read as an array: {e}")))
+}
+
 /// `value` as a numpy array in C order with the given dtype; rejects values of another kind.
 fn converted<'py>(
     value: &Bound<'py, PyAny>,
@@ -35,9 +49,7 @@ fn converted<'py>(
     wanted: &str,
 ) -> PyResult<Bound<'py, PyAny>> {
     let numpy = value.py().import("numpy")?;
-    let array = numpy
-        .call_method1("asarray", (value,))
-        .map_err(|e| name.fail(format!("cannot be read as an array: {e}")))?;
+    let array = unmasked(value, name)?;
     let kind: String = array.getattr("dtype")?.getattr("kind")?.extract()?;
     let empty = array.getattr("size")?.extract::<usize>()? == 0;
     if !(kinds.contains(&kind) || empty && kind == "f") {
@@ -164,11 +176,7 @@ fn three_axes<'py>(
     value: &Bound<'py, PyAny>,
     name: Named<'_>,
 ) -> PyResult<(Bound<'py, PyAny>, [usize; 3], String)> {
-    let array = value
-        .py()
-        .import("numpy")?
-        .call_method1("asarray", (value,))
-        .map_err(|e| name.fail(format!("cannot be read as an array: {e}")))?;
+    let array = unmasked(value, name)?;
     let shape: Vec<usize> = array.getattr("shape")?.extract()?;
     let shape = shape.try_into().map_err(|found: Vec<usize>| {
         name.fail(format!("has shape {} where (nx, ny, nz) is needed", shape_text(&found)))

@@ -12,7 +12,7 @@ from cmfsim.values.finding_groups import FindingGroup, counted, grouped
 __all__ = ["FindingsError", "Notices"]
 
 # ANSI colours of what is printed.
-COLOURS = {"error": "31;1", "warning": "33;1"}
+COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}
 
 
 class FindingsError(Exception):
@@ -50,18 +50,21 @@ class Notices:
             if group.severity != "note":
                 _print(f"cmfsim: {_head(group)}: {escaped(group.line)}")
 
-    def summarise(self, where: str) -> None:
+    def summarise(self, where: str | None) -> None:
         """Prints the list at the end: nothing if there are no findings.
 
         Parameters
         ----------
-        where : str
-            The file that lists all findings in full, for the last line.
+        where : str or None
+            The file that lists all findings in full, for the first line; None lists notes as well.
         """
-        groups = [group for group in grouped(self._found) if group.severity != "note"]
+        groups = grouped(self._found)
+        if where is not None or self._quiet:
+            groups = [group for group in groups if group.severity != "note"]
         if not groups and (self._quiet or not self._found):
             return
-        _print(f"cmfsim: {counted(self._found)}; in full: {escaped(where)}")
+        full = "" if where is None else f"; in full: {escaped(where)}"
+        _print(f"cmfsim: {counted(self._found)}{full}")
         for group in groups:
             _print(f"  {_head(group)}: {escaped(group.line)}")
             if group.worst.fix:

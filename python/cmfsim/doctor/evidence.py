@@ -20,6 +20,7 @@ from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.moduli import FatModuli, moduli_unusual
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = ["Body", "Evidence", "gather"]
@@ -247,7 +248,10 @@ def _check_region(case: Case, skull: Mapping[str, Floats], findings: list[Findin
 
 
 def _check_preset(case: Case, findings: list[Finding]) -> None:
-    """Whether the constants of the tissue are known."""
+    """Whether the constants of the tissue are known, and are those of a soft tissue."""
+    if case.muscles is None and case.fat.kind == "isotropic":
+        # With muscles, those of all tissues are checked together.
+        findings += moduli_unusual({"fat": FatModuli.of(case.fat)}, case.where("tissue"))
     if case.fat.kind == "preset" and case.fat.preset not in PRESETS:
         findings.append(
             Finding.error(

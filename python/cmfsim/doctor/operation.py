@@ -1,14 +1,23 @@
 """Whether cuts and plan can be meant: names, landmarks, sizes of motions, bone through skin."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cmfsim.bones import Procedure, place_procedure
-from cmfsim.doctor.evidence import Body, Evidence
+from cmfsim.bones import CuttingPlane, free_cut, place_procedure
+from cmfsim.bones.planes import Cut
+from cmfsim.doctor.bone_overlap import BonePart, check_jaws, jaw_of
+from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.places import place_text
-from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
+from cmfsim.doctor.plan_size import (
+    SizedMotion,
+    check_motion_size,
+    check_typed,
+    nothing_moves,
+)
 from cmfsim.errors import CaseError, CmfsimError, LandmarkError
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.io.transforms import motion_in_lps
@@ -16,6 +25,7 @@ from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import Finding
+from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
 
@@ -44,6 +54,15 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
         available |= set(cut.segments)
         yield from _check_procedure(evidence, cut, where)
     cut_up = {CUT_UP[p]: cut for cut in case.osteotomies if (p := cut.procedure or "") in CUT_UP}
+    if {"le_fort_1", "le_fort_3"} <= {cut.procedure for cut in case.osteotomies}:
+        yield Finding.warning(
+            "cuts-both-le-fort",
+            "Le Fort I and Le Fort III are cut together",
+            where=case.where("osteotomies"),
+            why="a plan needs a motion for both pieces: the maxilla does not follow the midface, "
+            "nor the midface the maxilla",
+            fix="remove the cut that is not meant; if both are, give both segments a motion",
+        )
     for name in case.plan:
         if name in cut_up:
             cut = cut_up[name]
@@ -93,46 +112,77 @@ def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iter
         )
 
 
-def _placed(evidence: Evidence, cut: CaseOsteotomy) -> Procedure | None:
-    if cut.procedure is None:
-        return None
-    try:
-        return place_procedure(cut.procedure, evidence.skull_landmarks, cut.options)
-    except (CaseError, LandmarkError):
-        return None
+def _cuts(evidence: Evidence) -> Iterator[Cut]:
+    """The cuts of the case that can be placed, in their order."""
+    for cut in evidence.case.osteotomies:
+        if cut.procedure is not None:
+            # Landmarks or options that do not place it are reported by `check_cuts`.
+            with suppress(CaseError, LandmarkError):
+                placed = place_procedure(cut.procedure, evidence.skull_landmarks, cut.options)
+                yield from placed.cuts
+        elif cut.plane is not None and cut.bone is not None and cut.name is not None:
+            plane = CuttingPlane(cut.plane.point, cut.plane.normal)
+            yield from free_cut(cut.bone, cut.name, (plane,)).cuts
+
+
+def _owners(evidence: Evidence, bone: str, points: Floats) -> NDArray[np.object_]:
+    """The name of the segment that each of (k, 3) points in or on a bone belongs to."""
+    names = np.full(len(points), bone, dtype=object)
+    there = set(evidence.bones)
+    for cut in _cuts(evidence):
+        source = next((name for name in cut.sources if name in there), None)
+        if source is None:
+            continue
+        there |= {cut.segment} if cut.rest is None else {cut.segment, cut.rest}
+        own = np.flatnonzero(names == source)
+        inside = np.maximum.reduce(
+            [np.minimum.reduce([p.distance(points[own]) for p in group]) for group in cut.groups]
+        )
+        names[own[inside > 0.0]] = cut.segment
+        if cut.rest is not None:
+            names[own[inside <= 0.0]] = cut.rest
+            there.discard(source)
+    return names
+
+
+def _segments_of(evidence: Evidence, bone: str) -> list[str]:
+    """The names of the segments that a bone is cut into, itself among them if it is left."""
+    return list(dict.fromkeys(_owners(evidence, bone, evidence.bones[bone].samples)))
 
 
 def _piece(evidence: Evidence, name: str) -> Floats | None:
     """Points on the surface of a bone or segment, (k, 3) mm, with the unit normals, (k, 6) in all.
 
-    Of a segment those of its bone that lie in the cut's region; None if nothing is known of it.
+    None if nothing is known of it.
     """
-    found: list[Floats] = []
-    if name in evidence.bones:
-        found.append(_with_normals(evidence.bones[name]))
-    for cut in evidence.case.osteotomies:
-        procedure = _placed(evidence, cut)
-        if procedure is not None:
-            for piece in procedure.cuts:
-                bodies = [evidence.bones[s] for s in piece.sources if s in evidence.bones]
-                if name not in {piece.segment, piece.rest} or not bodies:
-                    continue
-                rows = np.concatenate([_with_normals(body) for body in bodies])
-                inside = np.maximum.reduce(
-                    [np.minimum.reduce([p.distance(rows[:, :3]) for p in g]) for g in piece.groups]
-                )
-                found.append(rows[inside > 0.0] if name == piece.segment else rows[inside <= 0.0])
-        elif cut.plane is not None and name == cut.name and cut.bone is not None:
-            if cut.bone not in evidence.bones:
+    found = []
+    for bone, body in evidence.bones.items():
+        own = body.samples[_owners(evidence, bone, body.samples) == name]
+        if len(own):
+            found.append(np.concatenate([own, body.index.closest(own)[1]], axis=1))
+    return np.concatenate(found) if found else None
+
+
+def _parts(evidence: Evidence) -> list[BonePart]:
+    """The bones of both jaws, cut as the case cuts them, with the motions that are known."""
+    parts = []
+    for bone, body in evidence.bones.items():
+        jaw = jaw_of(bone)
+        if jaw is None:
+            continue
+        for name in _segments_of(evidence, bone):
+            moved = evidence.moved.get(name)
+            motion = evidence.motions.get(name, np.eye(4))
+            where = evidence.case.where(f"plan.{name}")
+            if isinstance(moved, MovedSurface):
+                parts.append(BonePart(name, jaw, where, body.repaired, moved))
                 continue
-            rows = _with_normals(evidence.bones[cut.bone])
-            found.append(rows[cut.plane.distance(rows[:, :3]) > 0.0])
-    rows = np.concatenate(found) if found else np.zeros((0, 6))
-    return rows if len(rows) else None
 
+            def owns(points: Floats, bone: str = bone, name: str = name) -> NDArray[np.bool_]:
+                return np.asarray(_owners(evidence, bone, points) == name, dtype=np.bool_)
 
-def _with_normals(body: Body) -> Floats:
-    return np.concatenate([body.samples, body.index.closest(body.samples)[1]], axis=1)
+            parts.append(BonePart(name, jaw, where, body.repaired, motion, owns))
+    return parts
 
 
 def pieces_of(evidence: Evidence) -> dict[str, Floats | None]:
@@ -154,6 +204,11 @@ def check_plan(
         As `pieces_of` gives it.
     """
     case = evidence.case
+    # A motion that cannot be read is reported where files are.
+    known = not case.achieved and set(case.plan) == set(evidence.motions)
+    if known and all(np.array_equal(motion, np.eye(4)) for motion in evidence.motions.values()):
+        yield nothing_moves(case.where("plan"))
+    apart = False
     for name, matrix in evidence.motions.items():
         piece, given = pieces[name], case.plan[name]
         yield from _check_frame(evidence, name, matrix)
@@ -171,11 +226,17 @@ def check_plan(
             )
         )
         yield from wrong
+        if given.typed:
+            yield from check_typed(plan[name], case.where(f"plan.{name}"))
         # A bone that flies off passes the skin as well: one reason is enough.
-        if piece is not None and not any(f.severity == "error" for f in wrong):
+        flies = any(f.severity == "error" for f in wrong)
+        apart = apart or flies
+        if piece is not None and not flies:
             yield from check_against_skin(
                 evidence, name, piece[:, :3], _moved(matrix, piece[:, :3])
             )
+    if not apart:
+        yield from check_jaws(_parts(evidence), evidence.skull_landmarks)
 
 
 def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Finding]:

@@ -7,10 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.values.checks import Floats
+from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import decompose_motion
 
-__all__ = ["FAR", "TOO_FAR", "SizedMotion", "check_motion_size", "check_tiny", "check_turn"]
+__all__ = [
+    "FAR",
+    "TOO_FAR",
+    "SizedMotion",
+    "check_motion_size",
+    "check_tiny",
+    "check_turn",
+    "check_typed",
+    "nothing_moves",
+]
 
 # Motions of bone above which a plan is unusual, and above which it is implausible; mm and degrees.
 # The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
@@ -18,6 +28,9 @@ FAR, TOO_FAR = 20.0, 60.0
 TURNED, TOO_TURNED = 20.0, 60.0
 # A motion that no face shows, mm: a tenth of a voxel of a CT. 20 mm written in metres is 0.02.
 TINY = 0.05
+# Motions of less than this, mm and degrees, are more likely in centimetres, and those further to a
+# side than this, mm, if that is most of the motion, in another order.
+SMALL, SIDEWAYS = 1.0, 5.0
 # Turns that nobody plans, degrees: 0.2 rad are 11°. Below the first, rounding of a typed matrix.
 TINY_TURN = (1e-3, 0.2)
 # Less than this is rounding of no motion, mm and degrees.
@@ -74,6 +87,17 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
         elif not motion.typed:
             remedy = "check the unit (mm), frame (LPS or RAS) and direction of the transform"
         yield _too_far(motion, far, remedy)
+    elif angle > TINY_TURN[0] and motion.typed and not motion.has_centre:
+        yield Finding.warning(
+            "plan-no-centre",
+            f"{motion.name} turns by {angle:.1f}° about the origin of the coordinates, for no "
+            f"centre is given: the turn moves it by up to {far:.1f} mm",
+            where=motion.where,
+            why="a segment is turned about one of its own landmarks; about another point, the same "
+            "angle moves it elsewhere",
+            fix="give centre, such as the place of the upper incisors; centre = [0, 0, 0] if the "
+            "origin is meant",
+        )
     yield from check_turn(motion.name, motion.where, angle)
     reach = 0.0 if motion.points is not None else REACH * math.radians(angle)
     yield from check_tiny(motion.name, motion.where, far + reach, angle)
@@ -87,6 +111,43 @@ def _too_far(motion: SizedMotion, far: float, remedy: str) -> Finding:
         where=motion.where,
         why=f"ordinary surgery moves bone by at most {FAR:g} mm; tissue would tear",
         fix=remedy,
+    )
+
+
+def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
+    """Findings about the numbers of a typed motion: in centimetres, or in another order."""
+    size = math.hypot(motion.forwards, motion.up, motion.left)
+    turn = math.hypot(motion.pitch, motion.yaw, motion.roll)
+    if TINY <= size < SMALL and turn < SMALL:
+        yield Finding.warning(
+            "plan-small",
+            f"{motion.segment} moves by {size:.2g} mm",
+            where=where,
+            why="bones are moved by millimetres, and an operation is not more exact than 1 mm",
+            fix=f"check the unit: translations are in mm ({size:.2g} cm would be "
+            f"{10.0 * size:.2g} mm); nothing to do if it is meant",
+        )
+    if abs(motion.left) > SIDEWAYS and size < math.sqrt(2.0) * abs(motion.left):
+        side = "left" if motion.left > 0.0 else "right"
+        yield Finding.warning(
+            "plan-sideways",
+            f"{motion.segment} moves {abs(motion.left):.1f} mm to the {side}, which is most of its "
+            "motion",
+            where=where,
+            why="jaws are moved forwards, back, up or down, and to a side by a few millimetres",
+            fix="check the order of the numbers: to the left, backwards, up (LPS), so 5 mm "
+            "forwards is [0, -5, 0]; nothing to do if it is meant",
+        )
+
+
+def nothing_moves(where: str) -> Finding:
+    """The warning about a plan that moves no segment."""
+    return Finding.warning(
+        "plan-still",
+        "no segment moves",
+        where=where,
+        why="the predicted face is the face before the operation",
+        fix="give a motion in [plan.SEGMENT], or a file of the planning page by --plan",
     )
 
 

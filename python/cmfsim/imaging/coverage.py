@@ -45,15 +45,15 @@ def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
     away = (np.argwhere(beyond).mean(axis=0) - np.argwhere(cavity).mean(axis=0)) * spacing
     findings = []
     if away[2] > LEAST_OFFSET:
-        findings.append(_turned("upside-down", "the head is upside down"))
+        findings.append(_turned("ct-upside-down", "the head is upside down"))
     if away[1] > LEAST_OFFSET:
-        findings.append(_turned("facing-back", "the face points backwards (+y, posterior)"))
+        findings.append(_turned("ct-facing-back", "the face points backwards (+y, posterior)"))
     return tuple(findings)
 
 
 def _turned(code: str, what: str) -> Finding:
     return Finding.error(
-        f"ct-{code}",
+        code,
         f"{what}: the image is flipped, or its header is wrong",
         where="image",
         why="front and back, or up and down, would be swapped; left and right may be swapped as "
@@ -69,13 +69,19 @@ def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     front = float(np.count_nonzero(skin.mask[:, 0]) * x * z)
     if work.border[0, 1] and front > CUT_SKIN:
         findings.append(
-            _missing("front", "nose or face", f"skin meets the front border over {front:.0f} mm²")
+            _missing(
+                "ct-cut-front", "nose or face", f"skin meets the front border over {front:.0f} mm²"
+            )
         )
     for side, layer, begin in (("right", 0, 0), ("left", -1, 1)):
         area = float(np.count_nonzero(skin.mask[layer]) * y * z)
         if work.border[begin, 0] and area > CUT_SKIN:
             findings.append(
-                _missing(side, f"{side} side", f"skin meets the border over {area:.0f} mm²")
+                _missing(
+                    "ct-cut-right" if begin == 0 else "ct-cut-left",
+                    f"{side} side",
+                    f"skin meets the border over {area:.0f} mm²",
+                )
             )
     top = float(np.count_nonzero(bone.solid[:, :, -1]) * x * y)
     if work.border[1, 2] and top > CUT_BONE:
@@ -83,7 +89,9 @@ def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     chin = _chin_area(work, bone, skin)
     if work.border[0, 2] and chin > CUT_BONE:
         findings.append(
-            _missing("bottom", "chin", f"bone of the jaw meets the border over {chin:.0f} mm²")
+            _missing(
+                "ct-cut-bottom", "chin", f"bone of the jaw meets the border over {chin:.0f} mm²"
+            )
         )
     return findings
 
@@ -124,7 +132,7 @@ def _top(bone: Bone, area: float) -> Finding:
     per_layer = bone.mask.sum(axis=(0, 1))
     what = f"bone of the skull meets the border over {area:.0f} mm²"
     if bone.cavity is None or per_layer[-1] > 0.75 * per_layer.max():
-        return _missing("top", "forehead", what)
+        return _missing("ct-cut-top", "forehead", what)
     return Finding.note(
         "ct-cut-vertex",
         f"the vertex is cut off: {what}",
@@ -140,11 +148,11 @@ def _chin_area(work: Working, bone: Bone, skin: Skin) -> float:
     return float(np.count_nonzero(layer) * work.spacing[0] * work.spacing[1])
 
 
-def _missing(side: str, part: str, what: str) -> Finding:
+def _missing(code: str, part: str, what: str) -> Finding:
     return Finding.warning(
-        f"ct-cut-{side}",
+        code,
         f"{part} cut off: {what}",
-        where=f"{side} border of the image",
+        where=f"{code.removeprefix('ct-cut-')} border of the image",
         why="the surface is closed by a plane there, and the prediction near it is meaningless",
         fix="use an image that shows the whole face, or exclude that region from the evaluation",
     )

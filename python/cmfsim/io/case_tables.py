@@ -299,7 +299,7 @@ def _plain(table: Table) -> dict[str, Any]:
 def tissue_of(table: Table) -> TissueData | None:
     """The fat that the table states; None if it states none."""
     table.only("preset", "young", "poisson")
-    young = table.number("young", "MPa", above=0.0, high=1e5)
+    young = table.number("young", "MPa", low=YOUNG_RANGE[0], high=YOUNG_RANGE[1])
     poisson = table.number("poisson", above=-1.0, high=0.4999)
     if "preset" in table:
         if young is not None or poisson is not None:
@@ -356,7 +356,8 @@ def _muscle_moduli(table: Table) -> TissueModuli:
 
 def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
     """The face and bones after the operation, from [postoperative]."""
-    table.only("skin", "image", "landmarks", "bones", "aligned", "units", "frame", "series")
+    flags = ("aligned", "verified")
+    table.only("skin", "image", "landmarks", "bones", "units", "frame", "series", *flags)
     bones = table.table("bones")
     if "skin" in table and "image" in table:
         table.fail("image", "is given together with skin: give one of them")
@@ -378,6 +379,7 @@ def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
         table.text("units", "mm", tuple(UNITS)),
         stated_frame(table),
         _dicom_series(table),
+        table.flag("verified", default=False),
     )
 
 

@@ -173,11 +173,16 @@ class _Attempt:
             return False
         found = PLACE.fullmatch(str(error))
         where, what = (found[1], found[2]) if found else (self._gathered.where, str(error))
-        code, fix = self._code, self._fix
-        if isinstance(error, FileNotFoundError):
-            code, fix = MISSING, "put the file there, or correct its name"
-        why = "the template cannot be used"
-        self._gathered.findings.append(Finding.error(code, what, where=where, why=why, fix=fix))
+        is_missing = isinstance(error, FileNotFoundError)
+        self._gathered.findings.append(
+            Finding.error(
+                MISSING if is_missing else self._code,
+                what,
+                where=where,
+                why="the template cannot be used",
+                fix="put the file there, or correct its name" if is_missing else self._fix,
+            )
+        )
         return True
 
 

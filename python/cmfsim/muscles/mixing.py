@@ -8,15 +8,12 @@ from cmfsim._core import MuscleShares, Tissue
 from cmfsim.errors import MaterialInputError
 from cmfsim.values.checks import Floats, nearest
 from cmfsim.values.finding import Finding
-from cmfsim.values.moduli import MuscleModuli, TissueModuli
+from cmfsim.values.moduli import MuscleModuli, TissueModuli, moduli_unusual
 from cmfsim.values.tissue_data import TissueData
 
 __all__ = ["MODULI_CODES", "check_muscle_names", "mixed_tissue", "moduli_findings"]
 
-# Young's moduli of muscle beyond these, MPa, are more likely a unit typed wrongly than a muscle:
-# published ones of whole passive muscle lie well within (docs/moduli.md).
-USUAL_YOUNG = (1e-4, 10.0)
-MODULI_CODES = frozenset({"muscle-moduli", "muscle-moduli-unusual"})
+MODULI_CODES = frozenset({"muscle-moduli", "moduli-unusual"})
 
 
 def mixed_tissue(
@@ -129,18 +126,4 @@ def moduli_findings(moduli: TissueModuli, preset: str, where: str = "") -> Itera
         why="Displacements depend on the ratios of moduli; the accuracy was measured with those "
         "of the preset.",
     )
-    low, high = USUAL_YOUNG
-    unusual = [
-        f"{name} {value:g}"
-        for name, m in named.items()
-        for value in m.constants()[:2]
-        if not low <= value <= high
-    ]
-    if unusual:
-        yield Finding.warning(
-            "muscle-moduli-unusual",
-            f"Young's moduli of muscle beyond {low:g} to {high:g} MPa: {', '.join(unusual)}",
-            where=where,
-            why="No published value for muscle is that low or that high.",
-            fix="Moduli are in MPa: 10 kPa is 0.01.",
-        )
+    yield from moduli_unusual({"fat": own.fat, **named}, where)

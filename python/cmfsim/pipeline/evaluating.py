@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from cmfsim.io.metrics import EVALUATION_FILE
 from cmfsim.pipeline.building.inputs import case_key
 from cmfsim.pipeline.building.postoperative import Postoperative, read_postoperative
 from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.face_after import check_face_after, refuse_other_face
 from cmfsim.pipeline.face_regions import face_landmarks
 from cmfsim.pipeline.predicting import named_models, predictions_of
 from cmfsim.surfaces.depth import tissue_depth
@@ -190,7 +192,8 @@ def evaluate(
     ------
     CmfsimError
         (also `ValueError` where the input is at fault) What a stage cannot work with; a model that
-        does not solve, where none of the others does.
+        does not solve, where none of the others does; a face after that is another patient's or the
+        one before, unless the case states that it is verified.
 
     Examples
     --------
@@ -228,7 +231,8 @@ def evaluate(
     compared = _Compared(predictions, postoperative.skin, postoperative.landmarks, landmarks.points)
     comparison = compared.models()
     unmoved, why = compared.unmoved()
-    notes = (*landmarks.findings, *why)
+    doubts = check_face_after(case, comparison, unmoved, compared.moved)
+    notes = (*landmarks.findings, *why, *refuse_other_face(doubts))
     if predictions[0].patient.landmarks_are_found and postoperative.landmarks:
         notes = (*notes, _landmarks_unused())
     thickness = fitted = None
@@ -259,6 +263,11 @@ class _Compared:
     after_landmarks: Mapping[str, Floats]
     landmarks: Mapping[str, Floats]
 
+    @cached_property
+    def moved(self) -> dict[str, Floats]:
+        """How far each model moves each vertex of the skin, mm."""
+        return {p.model: np.linalg.norm(p.skin_displacements, axis=1) for p in self.predictions}
+
     def models(self, thickening: Floats | None = None) -> ModelComparison:
         """Every model against the face after, by regions; distances by landmarks of both."""
         before = self.predictions[0].skin_before
@@ -284,10 +293,10 @@ class _Compared:
         if not self.landmarks:
             return None, ()
         before = self.predictions[0].skin_before
-        sizes = [np.linalg.norm(p.skin_displacements, axis=1) for p in self.predictions]
+        most = np.max([*self.moved.values()], axis=0)
         regions = unmoved_regions(before.vertices, self.landmarks)
         try:
-            found = compare_unmoved(before, self.after, regions, np.max(sizes, axis=0))
+            found = compare_unmoved(before, self.after, regions, most)
         except RegistrationError as error:
             return None, (_not_shown(str(error)),)
         if found is None:

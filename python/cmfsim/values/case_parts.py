@@ -386,6 +386,9 @@ class CasePostoperative:
         Of the surface files, as in `CaseSurfaces`.
     series : str or None
         UID or number of the DICOM series of the image, where its folder holds several.
+    verified : bool
+        Whether the user states that this is the patient after this operation: findings that it is
+        another face, or the face before, are then warnings, not errors.
     """
 
     skin: Path | None = None
@@ -396,6 +399,7 @@ class CasePostoperative:
     units: str = "mm"
     frame: str | None = None
     series: str | None = None
+    verified: bool = False
 
     def __post_init__(self) -> None:
         if self.image is not None and (self.skin is not None or self.bones):

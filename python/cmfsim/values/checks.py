@@ -21,6 +21,7 @@ __all__ = [
     "as_positive",
     "as_rows",
     "as_text",
+    "as_unmasked",
     "check_instance",
     "check_one_of",
     "frozen",
@@ -38,10 +39,19 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
     return copy
 
 
+def as_unmasked(name: str, value: ArrayLike) -> NDArray[Any]:
+    """The value as an array; masked entries, whose values are unknown, are refused."""
+    if hasattr(value, "mask") and np.ma.is_masked(value):
+        raise CaseInputError(
+            f"{name} has masked entries, whose values are unknown: fill or remove them"
+        )
+    return np.asarray(value)
+
+
 def as_floats(name: str, value: ArrayLike) -> Floats:
     """The value as finite float64, or an error with the index at fault."""
     try:
-        array = np.asarray(value)
+        array = as_unmasked(name, value)
         if array.dtype.kind not in "fiu":
             raise CaseInputError(f"{name} has dtype {array.dtype}: real numbers are needed")
         array = array.astype(np.float64)
@@ -68,7 +78,7 @@ def as_rows(name: str, value: ArrayLike, width: int) -> Floats:
 
 def as_point(name: str, value: ArrayLike) -> Floats:
     """A read-only (3,) float64 copy of a place or a direction."""
-    return cast("Floats", as_rows(name, np.reshape(np.asarray(value), (1, -1)), 3)[0])
+    return cast("Floats", as_rows(name, np.reshape(as_unmasked(name, value), (1, -1)), 3)[0])
 
 
 def as_direction(name: str, value: ArrayLike) -> Floats:
@@ -84,8 +94,10 @@ def as_direction(name: str, value: ArrayLike) -> Floats:
 
 def _whole_numbers(name: str, value: ArrayLike, count: int | None, of: str) -> Indices:
     try:
-        array = np.asarray(value)
+        array = as_unmasked(name, value)
     except (TypeError, ValueError) as error:
+        if isinstance(error, CaseInputError):
+            raise
         raise CaseInputError(f"{name} is not an array of indices: {error}") from error
     if array.size == 0:
         return np.zeros(array.shape, dtype=np.uint32)

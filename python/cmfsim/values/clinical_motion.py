@@ -352,13 +352,18 @@ def _reference(
     if points is None or not len(points):
         return None, ""
     if sites:
-        return _on_surface(base, points)
+        return _guessed(*_on_surface(base, points))
     for name, words in dict.fromkeys(site for known in SITES.values() for site in known):
         if name in landmarks:
             place = np.asarray(landmarks[name], dtype=np.float64)
             if np.linalg.norm(points - place, axis=1).min() <= ON_SEGMENT:
                 return place, f"{words} ({name})"
-    return points.mean(axis=0), "middle of its surface"
+    return _guessed(points.mean(axis=0), "middle of its surface")
+
+
+def _guessed(point: Floats, place: str) -> tuple[Floats, str]:
+    """A point that no landmark names: surfaces of other fineness give another, so it is stated."""
+    return point, f"{place}, a guess at ({', '.join(f'{x:.1f}' for x in point)})"
 
 
 def _on_surface(base: str, points: Floats) -> tuple[Floats, str]:

@@ -12,6 +12,7 @@ from cmfsim.values.checks import (
     Floats,
     as_point,
     as_rows,
+    as_unmasked,
 )
 from cmfsim.values.frozen import Frozen
 
@@ -54,7 +55,7 @@ class ImageData(Frozen):
     def __init__(
         self, values: NDArray[Any], spacing: ArrayLike, origin: ArrayLike = (0.0, 0.0, 0.0)
     ) -> None:
-        values = np.asarray(values)
+        values = as_unmasked("image", values)
         if values.ndim != 3 or 0 in values.shape:
             raise CaseInputError(f"image has shape {values.shape}: three axes, none empty, needed")
         if values.dtype.kind not in "fiub":

@@ -7,6 +7,7 @@ from types import MappingProxyType
 from cmfsim._core import Tissue
 from cmfsim.errors import MaterialError, MaterialInputError
 from cmfsim.values.checks import as_number, as_text, check_instance
+from cmfsim.values.finding import Finding
 from cmfsim.values.tissue_data import TissueData
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "FatModuli",
     "MuscleModuli",
     "TissueModuli",
+    "moduli_unusual",
 ]
 
 # Young's moduli that a muscle or fat may have, MPa: from a thousandth of the softest fat that was
@@ -24,6 +26,44 @@ __all__ = [
 YOUNG_RANGE = (1e-6, 1e3)
 # Above, the tets lock and the system is nearly singular; -1 itself is excluded.
 MOST_POISSON = 0.4999
+
+
+# Beyond these, moduli of soft tissue are a unit or a digit typed wrongly rather than a tissue, MPa:
+# published values of fat and of whole passive muscle lie well within (docs/moduli.md). Poisson's
+# ratio of tissue that is mostly water is 0.4 to 0.5, and 0.3 in the softest models of fat.
+USUAL_YOUNG = (1e-4, 2.0)
+USUAL_POISSON = 0.2
+
+
+def unusual_moduli(named: Mapping[str, "FatModuli | MuscleModuli"]) -> list[str]:
+    """The moduli that no soft tissue has, in words, of tissues by name without gaps."""
+    low, high = USUAL_YOUNG
+    found = []
+    for name, moduli in named.items():
+        *young, poisson = moduli.constants()
+        found += [f"{name} {value:g} MPa" for value in young if not low <= value <= high]
+        if poisson < USUAL_POISSON:
+            found.append(f"{name} with a Poisson's ratio of {poisson:g}")
+    return found
+
+
+def moduli_unusual(named: Mapping[str, "FatModuli | MuscleModuli"], where: str) -> list[Finding]:
+    """The warning about them; none where there are none."""
+    found = unusual_moduli(named)
+    if not found:
+        return []
+    low, high = USUAL_YOUNG
+    return [
+        Finding.warning(
+            "moduli-unusual",
+            f"no soft tissue has these moduli: {', '.join(found)}",
+            where=where,
+            why=f"published Young's moduli lie within {low:g} to {high:g} MPa, Poisson's ratios "
+            f"within {USUAL_POISSON:g} to 0.5",
+            fix="check digits and unit: moduli are in MPa, so 10 kPa is 0.01; Poisson's ratio of "
+            "fat is about 0.46, not 0.046",
+        )
+    ]
 
 
 def _check_young(name: str, value: float | None) -> None:

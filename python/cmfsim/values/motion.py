@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import rigid_matrix
-from cmfsim.errors import BoundaryInputError
+from cmfsim.errors import BoundaryInputError, CaseInputError
+from cmfsim.values.checks import as_unmasked
 
 __all__ = ["RigidMotion", "decompose_motion", "rigid_matrix", "rigid_motion"]
 
@@ -167,7 +168,9 @@ def decompose_motion(matrix: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> 
 
 def _three(name: str, value: ArrayLike) -> NDArray[np.float64]:
     try:
-        vector = np.asarray(value, dtype=np.float64)
+        vector = as_unmasked(name, value).astype(np.float64)
+    except CaseInputError as error:
+        raise BoundaryInputError(str(error)) from error
     except (TypeError, ValueError) as error:
         raise BoundaryInputError(f"{name} is not three numbers: {value!r}") from error
     except OverflowError as error:

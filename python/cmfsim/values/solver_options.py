@@ -26,7 +26,10 @@ class SolverOptions:
     contact : str
         "bilateral" or "unilateral".
     tolerance : float
-        Estimated error of the iterative methods, over the length of the motion.
+        Estimated error of the iterative methods, over the largest displacement that bones
+        prescribe or, if it is larger, about that which loads cause. It says nothing of nodes that
+        move far less. A solution
+        whose estimated error exceeds a thousandth of its largest displacement is refused.
     max_iterations : int or None
     contact_tolerance : float, mm
         Largest distance of a node in contact from its contact surface; the force along the surface

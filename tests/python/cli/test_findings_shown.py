@@ -176,7 +176,7 @@ def test_a_study_states_what_is_doubtful_of_each_case_at_the_top():
 
 def test_the_warnings_of_an_evaluation_are_those_of_all_that_led_to_it(noticed):
     text = noticed.read_text("utf-8")
-    noticed.write_text(f'{text}\n[postoperative]\nskin = "skin.ply"\n', "utf-8")
+    noticed.write_text(f'{text}\n[postoperative]\nskin = "skin.ply"\nverified = true\n', "utf-8")
     found = cmfsim.evaluate(noticed, "H", check=False).as_dict()["warnings"]
     assert "warning: solving is doubtful" in found
     assert "warning: 4 muscles partly outside the tissue (largest: muscle_1 12.0 %)" in found

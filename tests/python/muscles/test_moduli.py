@@ -170,7 +170,7 @@ def test_moduli_that_no_tissue_has_are_refused(make, words):
 
 def test_a_modulus_in_kilopascals_is_a_warning():
     found = mixed(cmfsim.TissueModuli(muscle=cmfsim.MuscleModuli(young_along=30.0))).findings
-    (warning,) = (f for f in found if f.code == "muscle-moduli-unusual")
+    (warning,) = (f for f in found if f.code == "moduli-unusual")
     assert warning.severity == "warning"
     assert "muscle 30" in warning.what
 

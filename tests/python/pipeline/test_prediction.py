@@ -14,6 +14,7 @@ import phantom_case
 from cmfsim.cli import main
 from cmfsim.pipeline.evaluating import evaluation_key
 from cmfsim.report import case_document, render_page
+from cmfsim.study.worker import _evaluated
 from shared_values import drawn_levels, without_pictures
 
 pytest.importorskip("scipy")
@@ -168,6 +169,62 @@ def test_evaluation_finds_the_model_that_made_the_truth(with_truth, predictions)
     assert values["key"] == evaluation_key(with_truth, ["M", "H"])
     assert values["key"] != evaluation_key(with_truth, ["H"])
     del predictions
+
+
+def with_face(with_truth, name, skin, more=""):
+    """The case with another face after the operation, and no landmarks on it."""
+    folder = with_truth.file.parent
+    cmfsim.write_surface(folder / f"{name}.ply", skin)
+    text = with_truth.file.read_text(encoding="utf-8")
+    text = text.replace('skin = "after.ply"\nlandmarks = "after.mrk.json"', f'skin = "{name}.ply"')
+    path = folder / f"{name}.toml"
+    path.write_text(text + more, encoding="utf-8")
+    return cmfsim.Case.load(path)
+
+
+def codes(evaluation):
+    return {f.code: f.severity for f in evaluation.findings if f.severity != "note"}
+
+
+@pytest.mark.parametrize(("far", "severity"), [(0.5, None), (1.8, "warning"), (5.0, "error")])
+def test_a_face_that_differs_where_nothing_was_operated_on_is_no_comparison(
+    with_truth, far, severity
+):
+    """Another patient's forehead lies elsewhere in the same frame."""
+    skin = cmfsim.read_surface(with_truth.postoperative.skin)
+    other = cmfsim.SurfaceData(skin.vertices + [0.0, -far, 0.0], skin.triangles)
+    made = with_face(with_truth, f"other{far:g}", other)
+    if severity == "error":
+        with pytest.raises(cmfsim.CaseError, match="where nothing was operated on"):
+            cmfsim.evaluate(made, ["H"], check=False)
+        made, severity = with_face(with_truth, "sure", other, "verified = true\n"), "warning"
+    found = codes(cmfsim.evaluate(made, ["H"], check=False))
+    assert found.get("postoperative-other-face") == severity
+
+
+def test_a_face_beyond_every_forehead_is_no_comparison(with_truth):
+    """A scan that ends below the eyes, of a patient with another face."""
+    brow = with_truth.file.parent / "skin.mrk.json"
+    eyes = cmfsim.read_landmarks(brow)["exocanthion_L"][2]
+    skin = cmfsim.read_surface(with_truth.postoperative.skin)
+    low = (skin.vertices[skin.triangles][:, :, 2] < eyes).all(axis=1)
+    far = cmfsim.SurfaceData(skin.vertices + [0.0, -12.0, 0.0], skin.triangles[low])
+    made = with_face(with_truth, "low", far)
+    # As the process does that works on a case of a cohort.
+    with pytest.raises(cmfsim.CaseError, match="more than any model moves the skin"):
+        _evaluated(made, ["H"])
+
+
+def test_a_face_after_that_is_the_face_before_is_no_comparison(with_truth):
+    before = cmfsim.read_surface(with_truth.surfaces.skin)
+    made = with_face(with_truth, "before", before)
+    assert "postoperative-unchanged" in {f.code for f in cmfsim.diagnose(made)}
+    # Scanned or meshed again, only the comparison shows it.
+    noise = 0.05 * np.random.default_rng(0).normal(size=before.vertices.shape)
+    after = cmfsim.SurfaceData(before.vertices + noise, before.triangles)
+    again = with_face(with_truth, "again", after)
+    with pytest.raises(cmfsim.CaseError, match="is the face before"):
+        cmfsim.evaluate(again, ["H"], check=False)
 
 
 def test_evaluation_without_a_face_to_compare_with_says_so(case):

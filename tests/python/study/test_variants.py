@@ -52,7 +52,8 @@ def folder(tmp_path_factory):
         (folder / name).mkdir()
         path = phantom_case.surface_case(folder / name, head, anatomy)
         text = path.read_text(encoding="utf-8").replace("edge_length = 7.0", "edge_length = 10.0")
-        path.write_text(f'{text}\n[postoperative]\nskin = "after.ply"\n', encoding="utf-8")
+        after = '[postoperative]\nskin = "after.ply"\nverified = true'
+        path.write_text(f"{text}\n{after}\n", encoding="utf-8")
         skin = cmfsim.read_surface(folder / name / "skin.ply")
         after = np.array(skin.vertices)
         after[:, 1] += share * np.exp(-(((after[:, 2] + 45.0) / 20.0) ** 2))

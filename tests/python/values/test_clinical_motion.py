@@ -135,9 +135,7 @@ def test_a_motion_of_vertices_is_its_nearest_rigid_one_with_what_that_leaves():
     matrix = cmfsim.rigid_motion((0, -5, 0), 3, (0, 0, 1), here.mean(axis=0))
     there = here @ matrix[:3, :3].T + matrix[:3, 3]
     rigid = cmfsim.clinical_motion("piece", cmfsim.MovedSurface(shape, there))
-    assert (
-        rigid.text == "5.0 mm forwards at the middle of its surface; yaw +3.0° (front to the left)"
-    )
+    assert "5.0 mm forwards at the middle of its surface, a guess at (" in rigid.text
     noisy = there + rng.normal(0, 0.5, there.shape)
     found = cmfsim.clinical_motion("piece", cmfsim.MovedSurface(shape, noisy))
     assert found.residual == pytest.approx(0.5 * 3**0.5, rel=0.1)
@@ -284,7 +282,7 @@ def test_no_motion_and_ordinary_motions_are_no_tiny_ones(tmp_path):
         head = HeadCase()
         head.replace(TYPED, entry)
         found, examined = codes(tmp_path, head)
-        assert found == []
+        assert found == (["plan-still"] if "[0, 0, 0]" in entry else [])
         assert (examined.plan["mandible"].text == "stays") == (entry == "translation = [0, 0, 0]")
 
 

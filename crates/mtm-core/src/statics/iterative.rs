@@ -27,6 +27,8 @@ use crate::vector::{add, dot, norm, scaled, sub};
 const RELAXATION_FACTOR: f64 = 1.6;
 /// Sweeps after which the node-wise iteration stops with an error.
 const MAX_SWEEPS: usize = 200_000;
+/// Estimated error of a solution that is worth nothing, over the largest displacement.
+const WORTH: f64 = 1e-3;
 /// Accuracy, as a share of the tolerance, to which the error left by the sweeps is measured.
 const MEASURED_SHARE: f64 = 0.1;
 /// λ/μ above which a stronger smoother pays: at ν = 0.499 it takes 113 iterations instead of 186. ν = 0.48.
@@ -158,13 +160,40 @@ impl Iterative {
         let begun = Begun::new(&self.multigrid, b);
         let tolerance = self.tolerance * begun.reach(solve.scale);
         if self.sweeps {
-            return self.relax_to_bound(&self.matrix, b, tolerance, solve);
+            let found = self.relax_to_bound(&self.matrix, b, tolerance, solve)?;
+            self.check_worth(&found, solve)?;
+            return Ok(found);
         }
         let confirmed = self.confirmed((&self.matrix, &begun), &self.trial, solve.interrupted);
         let found = self.solution(&confirmed, b, tolerance)?;
         solve.effort.error_estimate = found.error_estimate_mm;
         solve.effort.add(found.iterations, found.residual_history);
+        self.check_worth(&found.solution, solve)?;
         Ok(found.solution)
+    }
+
+    /// Refuses a solution whose estimated error is not small beside the motion itself.
+    ///
+    /// The length of the tolerance is known before the solution: one cycle guesses it, and at contrasts near the
+    /// limit of f64 it may guess far more than anything moves.
+    fn check_worth(&self, solution: &[[f64; 3]], solve: &Solve<'_>) -> Result<()> {
+        let length = solution.iter().fold(solve.scale, |m, v| m.max(norm(*v)));
+        let (value, limit) = (solve.effort.error_estimate, WORTH.max(self.tolerance) * length);
+        if value <= limit {
+            return Ok(());
+        }
+        Err(MtmError::NotConverged {
+            method: if self.sweeps { "relaxation" } else { "pcg" },
+            iterations: solve.effort.iterations,
+            shortfall: Shortfall {
+                quantity: "the estimated error of a node",
+                value,
+                limit,
+                unit: " mm",
+            },
+            advice: "the material contrast is too large for f64: check the moduli, or use \
+                     method=\"cholesky\"",
+        })
     }
 
     /// A⁻¹ b with an error of `allowed`, mm, or of the tolerance times the distance that one cycle moves the

@@ -39,7 +39,9 @@ static METHODS: LazyLock<String> = LazyLock::new(|| Method::ALL.map(Method::name
 pub struct StaticOptions {
     /// How the linear system is solved.
     pub method: Method,
-    /// Estimated error of the iterative methods over the largest prescribed displacement.
+    /// Estimated error of the iterative methods over the largest prescribed displacement, or over the motion that
+    /// loads cause if that is larger, as one cycle of the preconditioner gives it. A solution whose estimated error
+    /// exceeds both this and a thousandth of its own largest displacement is refused.
     pub tolerance: f64,
     /// Maximum number of iterations of the iterative methods; their own default if `None`.
     pub max_iterations: Option<usize>,

@@ -104,18 +104,22 @@ def _listed(names: list[str]) -> str:
 
 
 def _check_terms(template: TemplateData) -> Iterator[Finding]:
-    for key, why in (
-        ("attribution", "most licences require attribution"),
-        ("source", "its origin is unknown"),
-    ):
-        if not getattr(template, key):
-            yield Finding.warning(
-                f"template-{key}",
-                f"{key} is not stated",
-                where=template.name,
-                why=why,
-                fix=f'write {key} = "…" in template.toml',
-            )
+    if not template.attribution:
+        yield Finding.warning(
+            "template-attribution",
+            "attribution is not stated",
+            where=template.name,
+            why="most licences require attribution",
+            fix='write attribution = "…" in template.toml',
+        )
+    if not template.source:
+        yield Finding.warning(
+            "template-source",
+            "source is not stated",
+            where=template.name,
+            why="its origin is unknown",
+            fix='write source = "…" in template.toml',
+        )
 
 
 def _check_sites(template: TemplateData) -> Iterator[Finding]:

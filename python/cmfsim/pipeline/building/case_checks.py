@@ -7,7 +7,9 @@ import numpy as np
 
 from cmfsim._core import TetMesh
 from cmfsim.doctor import SizedMotion, check_motion_size
+from cmfsim.doctor.bone_overlap import BonePart, check_jaws, jaw_of
 from cmfsim.doctor.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
+from cmfsim.doctor.plan_size import nothing_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.motions import PlannedBones
@@ -17,7 +19,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["cut_segments", "misplaced", "plan_sizes", "untouched"]
+__all__ = ["cut_segments", "jaws", "misplaced", "plan_sizes", "untouched"]
 
 
 def misplaced(
@@ -55,8 +57,10 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
     raised: a bone that is torn away.
     """
     seen = {(finding.code, finding.where) for finding in known}
-    surfaces = {segment.name: segment.surface for segment in bones.segments}
     found: list[Finding] = []
+    if case.achieved and all(_is_still(motion) for motion in bones.motions.values()):
+        found.append(nothing_moves(case.where("plan")))
+    surfaces = {segment.name: segment.surface for segment in bones.segments}
     for name, motion in bones.motions.items():
         if isinstance(motion, MovedSurface):
             continue
@@ -80,6 +84,34 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
     if case.surfaces is None and (errors := [f for f in found if f.severity == "error"]):
         raise CaseInputError(f"{errors[0].where}: {errors[0].what}; {errors[0].fix}")
     return found
+
+
+def _is_still(motion: Floats | MovedSurface) -> bool:
+    if isinstance(motion, MovedSurface):
+        return np.array_equal(motion.surface.vertices, motion.moved_vertices)
+    return np.array_equal(motion, np.eye(4))
+
+
+def jaws(
+    bones: PlannedBones, landmarks: Mapping[str, Floats], case: Case, known: Iterable[Finding]
+) -> list[Finding]:
+    """What the plan does to the jaws, now that every segment has its surface and its motion.
+
+    The doctor has reported it before where the case gives surfaces and landmarks.
+    """
+    seen = {finding.code for finding in known}
+    made = {name: cut for cut in case.osteotomies for name in cut.segments}
+    parts = []
+    for segment in bones.segments:
+        cut = made.get(segment.name)
+        # A piece that a plane of the user cuts has the jaw of its bone.
+        names = (segment.name, cut.bone if cut is not None else None)
+        jaw = next((jaw for name in names if name and (jaw := jaw_of(name))), None)
+        if jaw is not None:
+            where = case.where("plan" if case.achieved else f"plan.{segment.name}")
+            motion = bones.motions.get(segment.name, np.eye(4))
+            parts.append(BonePart(segment.name, jaw, where, segment.surface, motion))
+    return [found for found in check_jaws(parts, landmarks) if found.code not in seen]
 
 
 def untouched(

@@ -25,7 +25,7 @@ from cmfsim.meshing import tissue_level
 from cmfsim.meshing.node_kinds import KindOptions, dental_arches, kind_options
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
 from cmfsim.pipeline.building.assembly import assembled
-from cmfsim.pipeline.building.case_checks import misplaced, plan_sizes
+from cmfsim.pipeline.building.case_checks import jaws, misplaced, plan_sizes
 from cmfsim.pipeline.building.contacts import mean_edge
 from cmfsim.pipeline.building.inputs import check_output, read_anatomy, read_case_landmarks
 from cmfsim.pipeline.building.landmarks import found_landmarks
@@ -223,6 +223,7 @@ def _bones(
             stages.drop({"moved-scaled"}, case.where(f"plan.{name}"))
     stages.add(bones.findings)
     stages.add(plan_sizes(case, bones, stages.findings))
+    stages.add(jaws(bones, head.skull, case, stages.findings))
     if case.image is not None:
         # What was compared with the voxels of the CT is compared with the bones made of them.
         stages.drop(LANDMARK_CODES)

@@ -265,7 +265,7 @@ class App {
       const count = trials.filter((t) => !t.failed).length;
       const failed = trials.length - count;
       const corrected = leftOut.length ? ` and ${leftOut.length} left out of the correction one by one` : "";
-      box.textContent = `Expected error of the face: ${found.mean.toFixed(2)} mm on average; at most ${found.usual.toFixed(2)} mm in nine of ten plans as far away, ${found.largest.toFixed(2)} mm in the worst (an estimate from exact solutions of ${count} other plans${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
+      box.textContent = `The face differs from this model's exact solution by ${found.mean.toFixed(2)} mm on average, at most ${found.usual.toFixed(2)} mm in nine of ten plans as far away, ${found.largest.toFixed(2)} mm in the worst; errors against real faces are millimetres (an estimate from exact solutions of ${count} other plans${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
       if (failed) box.textContent += ` ${failed} more could not be solved.`;
       warned = found.usual > WARNED_ERROR;
     }
