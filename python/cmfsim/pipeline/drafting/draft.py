@@ -1,6 +1,6 @@
 """A case file drafted from what lies in a folder: what each thing was taken for, and why."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,12 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.landmarks import write_landmarks
 from cmfsim.io.surfaces import write_surface
 from cmfsim.pipeline.drafting.case_lines import Taken, Text, quoted
+from cmfsim.pipeline.drafting.checking import Shown, unaccounted
 from cmfsim.pipeline.drafting.choices import Images, Marks, choose_images, choose_landmarks
-from cmfsim.pipeline.drafting.finds import EXTRACTED, LandmarkFind, SurfaceFind
+from cmfsim.pipeline.drafting.finds import EXTRACTED, ImageFind, LandmarkFind, SurfaceFind
 from cmfsim.pipeline.drafting.gathering import Gathered
 from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
-from cmfsim.pipeline.drafting.roles import MOVING, safe_key
+from cmfsim.pipeline.drafting.roles import safe_key
 from cmfsim.pipeline.drafting.surfaces import Anatomy, Question, choose_surfaces
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats
@@ -26,6 +27,8 @@ __all__ = ["CaseDraft", "draft_case"]
 SAME = 1e-9
 # Middles of the skins before and after that are farther apart are those of two scans, mm.
 APART = 20.0
+# Questions about what there is after the operation.
+AFTER = "postoperative."
 EXAMPLE = """# No plan was found. To move a segment, state how it moves, such as:
 # [plan.maxilla]
 # translation = [0, -5, 0]          # mm, LPS: -y is forwards
@@ -46,12 +49,15 @@ class CaseDraft:
         What a person has to decide before the case can be used.
     files : dict of str to callable
         Functions that write further files, by path; each is called with the path.
+    shown : Shown
+        Where everything lies, and how it moves, as it was reported.
     """
 
     text: str = ""
     taken: list[Taken] = field(default_factory=list)
     questions: list[str] = field(default_factory=list)
     files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
+    shown: Shown = field(default_factory=Shown)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -60,6 +66,25 @@ class CaseDraft:
             "questions": self.questions,
             "written": sorted(self.files),
         }
+
+
+@dataclass(frozen=True)
+class _Place:
+    """How the surfaces of a table of the case are placed.
+
+    Attributes
+    ----------
+    frame : str or None
+        What the table states.
+    shown : str or None
+        The frame of the files that state none.
+    matrix : callable
+        What carries a surface from its own coordinates to those of the case, LPS mm.
+    """
+
+    frame: str | None
+    shown: str | None
+    matrix: Callable[[SurfaceFind], Floats]
 
 
 @dataclass
@@ -76,6 +101,7 @@ class _Draft:
     by_image: bool
     text: Text = field(default_factory=Text)
     files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
+    shown: Shown = field(default_factory=Shown)
 
 
 def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
@@ -120,11 +146,28 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
     _write_after(draft)
     text.table("output")
     text.value("folder", '"out"')
-    return CaseDraft(str(text), taken, text.questions, draft.files)
+    for segment, motion in draft.plan.motions.items():
+        if motion.shown is not None and not motion.question:
+            draft.shown.motions[segment] = motion.shown
+    return CaseDraft(str(text), taken, text.questions, draft.files, draft.shown)
 
 
 def _has_after(draft: _Draft) -> bool:
-    return bool(draft.anatomy.after_bones) or draft.images.after is not None
+    """Whether there are bones after the operation, on which the plan can be measured."""
+    return bool(draft.anatomy.after_bones) or _uses_image_after(draft)
+
+
+def _uses_image_after(draft: _Draft) -> bool:
+    """Whether the face after the operation is that of a CT: there is no surface of it."""
+    anatomy = draft.anatomy
+    surfaces = anatomy.after or any(q.key.startswith(AFTER) for q in anatomy.questions)
+    return draft.images.after is not None and not surfaces
+
+
+def _has_any_after(draft: _Draft) -> bool:
+    """Whether there is anything after the operation."""
+    asked = any(question.key.startswith(AFTER) for question in draft.anatomy.questions)
+    return bool(draft.anatomy.after) or asked or draft.images.after is not None
 
 
 def _decide(found: Gathered, unpacked: Path) -> _Draft:
@@ -180,8 +223,25 @@ def _taken(draft: _Draft) -> list[Taken]:
             else t
             for t in draft.images.taken
         ]
-    others = [Taken(o.label, "not used", o.why) for o in (*draft.found.others, *draft.plan.others)]
-    return [*draft.images.taken, *surfaces, *draft.marks.taken, *draft.plan.taken, *others]
+    images, marks = draft.images.taken, draft.marks.taken
+    if draft.images.after is not None and not _uses_image_after(draft):
+        images = _without(images, draft.images.after, "surfaces after the operation are there")
+    if draft.marks.after is not None and not _has_any_after(draft):
+        marks = _without(marks, draft.marks.after, "there is no face after the operation")
+    others = [
+        Taken(o.label, "not used", o.why, paths=o.paths)
+        for o in (*draft.found.others, *draft.plan.others)
+    ]
+    taken = [*images, *surfaces, *marks, *draft.plan.taken, *others]
+    return [*taken, *unaccounted(draft.found, draft.plan, taken)]
+
+
+def _without(taken: list[Taken], find: ImageFind | LandmarkFind, why: str) -> list[Taken]:
+    """The entries with that of a file as not used."""
+    return [
+        replace(t, taken_for="not used", why=f"{why}; {t.why}") if t.label == find.label else t
+        for t in taken
+    ]
 
 
 def _beside_image(draft: _Draft, taken: Taken) -> Taken:
@@ -212,7 +272,7 @@ def _write_image(draft: _Draft) -> None:
     elif images.ct is not None:
         low, high = images.ct.values
         why = f"{images.ct.words}, {low:g} to {high:g}"
-        text.value("file", quoted(_image_path(draft)), why)
+        text.value("file", quoted(_image_path(draft, images.ct)), why)
         if not np.allclose(images.ct.to_world, np.eye(4), rtol=0.0, atol=SAME):
             text.comment(
                 "The scene turns this volume; the case is in the volume's own coordinates."
@@ -221,11 +281,8 @@ def _write_image(draft: _Draft) -> None:
         text.ask("rescale", *images.rescale)
 
 
-def _image_path(draft: _Draft) -> str:
-    """The path of the CT; that of a bundle is copied next to the case."""
-    image = draft.images.ct
-    if image is None:  # asked before
-        raise AssertionError
+def _image_path(draft: _Draft, image: ImageFind) -> str:
+    """The path of a CT; that of a bundle is copied next to the case."""
     if not image.path.is_relative_to(draft.unpacked):
         return "." if image.path == draft.found.folder else draft.found.shown(image.path)
     name = f"{EXTRACTED}/{safe_key(image.path.name.partition('.')[0])}"
@@ -241,70 +298,100 @@ def _keep(path: Path, data: bytes) -> None:
 
 def _write_surfaces(draft: _Draft, lead: str = "") -> None:
     text, anatomy = Text(), draft.anatomy
+    place = _before(draft)
     text.table("surfaces")
     if (asked := anatomy.asks("skin")) is not None:
-        text.ask("skin", asked.text, _choices(draft, asked))
+        text.ask("skin", asked.text, _choices(draft, asked, place))
     elif anatomy.skin is not None:
-        text.value("skin", quoted(_surface_path(draft, anatomy.skin, "skin")))
+        text.value("skin", quoted(_surface_path(draft, anatomy.skin, "skin", place)))
     else:
         text.ask("skin", "no surface that was found is a skin: which file is it?", ())
     if (asked := anatomy.asks("units")) is not None:
-        text.ask("units", asked.text, _choices(draft, asked))
+        text.ask("units", asked.text, _choices(draft, asked, place))
     else:
         text.value("units", '"mm"', anatomy.units_why)
     if (asked := anatomy.asks("frame")) is not None:
-        text.ask("frame", asked.text, _choices(draft, asked))
-    elif anatomy.frame is not None:
-        text.value("frame", quoted(anatomy.frame), anatomy.frame_why)
+        text.ask("frame", asked.text, _choices(draft, asked, place))
+    elif place.frame is not None:
+        text.value("frame", quoted(place.frame), anatomy.frame_why)
     elif anatomy.frame_why:
         text.comment(f"frame: {anatomy.frame_why}")
     text.table("surfaces.bones")
     for name, find in anatomy.bones.items():
-        text.value(name, quoted(_surface_path(draft, find, name)))
+        text.value(name, quoted(_surface_path(draft, find, name, place)))
     for question in anatomy.questions:
         part, _, name = question.key.partition(".")
         if part == "bones":
-            text.ask(name, question.text, _choices(draft, question))
+            text.ask(name, question.text, _choices(draft, question, place))
     draft.text.lines += [f"{lead}{line}".rstrip() for line in text.lines]
     if not lead:
         draft.text.questions += text.questions
 
 
-def _choices(draft: _Draft, question: Question) -> list[str]:
+def _choices(draft: _Draft, question: Question, place: _Place) -> list[str]:
     """What may be written for a question; a surface of a scene gets a file, so that it can be."""
     return [
-        words if find is None else f"{quoted(_candidate_path(draft, find))}: {words}"
+        words if find is None else f"{quoted(_candidate_path(draft, find, place))}: {words}"
         for find, words in question.choices
     ]
 
 
-def _candidate_path(draft: _Draft, find: SurfaceFind) -> str:
-    name = safe_key(find.label.rpartition(": ")[2].rpartition(" / ")[2])
+def _candidate_path(draft: _Draft, find: SurfaceFind, place: _Place) -> str:
+    tail = find.label.rpartition(": ")[2].rpartition(" / ")[2].rpartition("/")[2]
+    name = safe_key(tail.partition(".")[0] if find.is_made else tail)
     taken = {path for path in draft.files if path.startswith(f"{EXTRACTED}/{name}")}
-    return _surface_path(draft, find, f"{name}_{len(taken) + 1}" if taken else name)
+    return _surface_path(draft, find, f"{name}_{len(taken) + 1}" if taken else name, place)
 
 
-def _has_copy(draft: _Draft, find: SurfaceFind) -> bool:
-    """Whether a surface needs a copy: its file is packed, holds voxels, or is elsewhere."""
-    moved = not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
-    return (find.in_scene and (moved or find.path.is_relative_to(draft.unpacked))) or find.is_made
+def _before(draft: _Draft) -> _Place:
+    """Where surfaces lie before the operation, and what the case states of their frame."""
+    reference = np.eye(4) if draft.by_image else draft.reference
+    return _place(draft, draft.anatomy.chosen, draft.anatomy.frame, lambda _: reference)
 
 
-def _surface_path(draft: _Draft, find: SurfaceFind, name: str) -> str:
-    """The path of a surface in the case; where it lies before the operation, in LPS mm."""
-    if not _has_copy(draft, find):
-        return draft.found.shown(find.path)
-    reference = draft.reference if find.in_scene and not draft.by_image else np.eye(4)
-    if draft.anatomy.asks("units") is not None:
+def _place(
+    draft: _Draft,
+    finds: Sequence[SurfaceFind],
+    frame: str | None,
+    matrix: Callable[[SurfaceFind], Floats],
+) -> _Place:
+    """What a table of surfaces states of their frame: files that are written state LPS in vain."""
+    place = _Place(None, frame, lambda find: matrix(find) if find.in_scene else np.eye(4))
+    as_they_are = not any(_is_packed(draft, find, place) for find in finds)
+    frames = {find.stated or frame for find in finds if find.is_silent}
+    one_frame = len(frames) == 1 and all(find.is_silent for find in finds)
+    if as_they_are and one_frame and frames == {"RAS"}:
+        return replace(place, frame="RAS")
+    return replace(place, frame="LPS" if frame == "LPS" else None)
+
+
+def _is_packed(draft: _Draft, find: SurfaceFind, place: _Place) -> bool:
+    """Whether a surface has no file of its own where the case lies: packed, voxels, or moved."""
+    moved = not np.allclose(place.matrix(find), np.eye(4), rtol=0.0, atol=SAME)
+    return moved or find.path.is_relative_to(draft.unpacked) or find.is_made
+
+
+def _surface_path(draft: _Draft, find: SurfaceFind, name: str, place: _Place) -> str:
+    """The path of a surface in the case; a copy in LPS mm where its file alone would not do."""
+    true = find.stated or place.shown or "LPS"
+    matrix, flip = place.matrix(find), [-1.0, -1.0, 1.0] if true == "RAS" else [1.0, 1.0, 1.0]
+    known = draft.anatomy.asks("units") is None
+    vertices = find.surface.vertices * flip @ matrix[:3, :3].T + matrix[:3, 3]
+    reads_as = place.frame or ("LPS" if find.is_silent else find.stated)
+    if not _is_packed(draft, find, place) and (true == reads_as or not known):
+        path = draft.found.shown(find.path)
+    elif not known:
         raise CaseInputError(
             f"{find.label} is {find.extent.max():.4g} long: a scene of 3D Slicer is in mm, so its "
             "transforms do not fit this surface: scale it to mm, and save the scene again"
         )
-    vertices = draft.anatomy.placed(find) @ reference[:3, :3].T + reference[:3, 3]
-    surface = SurfaceData(vertices, find.surface.triangles)
-    path = f"{EXTRACTED}/{name}.ply"
-    if not draft.by_image:
-        draft.files[path] = lambda target: write_surface(target, surface)
+    else:
+        path = f"{EXTRACTED}/{name}.ply"
+        surface = SurfaceData(vertices, find.surface.triangles)
+        if not draft.by_image or find.role.is_after:
+            draft.files[path] = lambda target: write_surface(target, surface)
+    if known and (draft.anatomy.asks("frame") is None or not find.is_silent):
+        draft.shown.surfaces[path] = vertices
     return path
 
 
@@ -346,18 +433,32 @@ def _shows_skull(draft: _Draft) -> bool:
 
 def _landmark_path(draft: _Draft, find: LandmarkFind, key: str) -> str:
     """The path of landmarks in the case; where they lie before the operation."""
-    # A list under a segment's transform went with the segment; before, it lay with the head.
-    apart = find.in_scene and not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
+    matrix = _marks_matrix(draft, find)
+    points = {
+        label: matrix[:3, :3] @ point + matrix[:3, 3]
+        for label, point in draft.marks.placed(find).items()
+    }
+    if "frame" not in draft.marks.questions or find.read.stated:
+        draft.shown.landmarks[key] = points
+    apart = not np.allclose(matrix, np.eye(4), rtol=0.0, atol=SAME)
     if not apart and not find.path.is_relative_to(draft.unpacked):
         return draft.found.shown(find.path)
-    reference = draft.reference if find.in_scene and not draft.by_image else np.eye(4)
-    points = {
-        label: reference[:3, :3] @ point + reference[:3, 3]
-        for label, point in find.read.points.items()
-    }
     name = f"{EXTRACTED}/{key}.mrk.json"
     draft.files[name] = lambda path: write_landmarks(path, points)
     return name
+
+
+def _marks_matrix(draft: _Draft, find: LandmarkFind) -> Floats:
+    """What carries landmarks of a scene to where they lie before the operation in the case."""
+    if not find.in_scene:
+        return np.eye(4)
+    # A list under a segment's transform goes with the segment; before, it lies with the head.
+    moved = [bone for bone in draft.anatomy.bones.values() if bone.chain and bone.is_moved]
+    with_bone = any(bone.chain == find.chain for bone in moved) or bool(
+        set(find.chain) & draft.plan.links
+    )
+    matrix = draft.reference if with_bone else find.to_world
+    return np.linalg.inv(draft.reference) @ matrix if draft.by_image else matrix
 
 
 def _write_plan(draft: _Draft) -> None:
@@ -409,26 +510,37 @@ def _write_muscles(draft: _Draft) -> None:
     text.table("muscles", "the built-in template, placed by the skull landmarks")
 
 
-def _write_place_after(draft: _Draft) -> None:
-    """Unit and frame of surfaces after the operation, and whether they lie where the head was."""
+def _write_place_after(draft: _Draft) -> str | None:
+    """Unit and frame of surfaces after the operation, and whether they lie where the head was.
+
+    Returns the frame of the files that state none, as far as it is known.
+    """
     text, anatomy = draft.text, draft.anatomy
     silent = [find for find in anatomy.after if find.stated is None]
     if (asked := anatomy.asks("units")) is not None and anatomy.after:
-        text.ask("units", asked.text, _choices(draft, asked))
+        text.ask("units", asked.text, [words for _, words in asked.choices])
     frame = anatomy.frame
     if silent and (asked := anatomy.asks("frame")) is not None:
-        text.ask("frame", asked.text, _choices(draft, asked))
+        text.ask("frame", asked.text, [words for _, words in asked.choices])
     elif silent and _distance_after(draft, frame or "LPS") >= APART:
         other = "LPS" if frame == "RAS" else "RAS"
         frame = other if _distance_after(draft, other) < APART else frame
-    if silent and anatomy.asks("frame") is None and frame is not None:
-        text.value("frame", quoted(frame), "so that they are where the skin was before")
+    stated = _after(draft, frame).frame
+    if anatomy.after and anatomy.asks("frame") is None and stated is not None:
+        text.value("frame", quoted(stated), "so that they are where the skin was before")
     away = _distance_after(draft, frame or "LPS")
     if not np.isfinite(away):
         text.value("aligned", "true", "it is where the head was before; if not, write false")
-        return
+        return frame
     why = f"the middles of the skins before and after are {away:.0f} mm apart"
     text.value("aligned", "true" if away < APART else "false", why)
+    return frame
+
+
+def _after(draft: _Draft, frame: str | None) -> _Place:
+    """Where surfaces lie after the operation: a scene shows them there."""
+    back = np.linalg.inv(draft.reference) if draft.by_image else np.eye(4)
+    return _place(draft, draft.anatomy.after, frame, lambda find: back @ find.to_world)
 
 
 def _distance_after(draft: _Draft, frame: str) -> float:
@@ -436,26 +548,37 @@ def _distance_after(draft: _Draft, frame: str) -> float:
     anatomy = draft.anatomy
     if anatomy.skin is None or anatomy.after_skin is None or anatomy.asks("units") is not None:
         return float("inf")
-    before = anatomy.placed(anatomy.skin)
-    after = replace(anatomy, frame=frame).placed(anatomy.after_skin)
+    here, there = _before(draft).matrix(anatomy.skin), _after(draft, frame).matrix
+    before = anatomy.placed(anatomy.skin) @ here[:3, :3].T + here[:3, 3]
+    matrix = there(anatomy.after_skin)
+    placed = replace(anatomy, frame=frame).placed(anatomy.after_skin)
+    after = placed @ matrix[:3, :3].T + matrix[:3, 3]
     middles = [0.5 * (points.min(axis=0) + points.max(axis=0)) for points in (before, after)]
     return float(np.linalg.norm(middles[1] - middles[0]))
 
 
 def _write_after(draft: _Draft) -> None:
     text, anatomy, images = draft.text, draft.anatomy, draft.images
-    if anatomy.after_skin is None and not anatomy.after_bones and images.after is None:
+    if not _has_any_after(draft):
         return
     text.table("postoperative", "after the operation, by the names of the files")
-    if images.after is not None and anatomy.after_skin is None:
-        text.value("image", quoted(draft.found.shown(images.after.path)))
-    elif anatomy.after_skin is not None:
-        text.value("skin", quoted(draft.found.shown(anatomy.after_skin.path)))
     if draft.marks.after is not None:
-        text.value("landmarks", quoted(draft.found.shown(draft.marks.after.path)))
-    _write_place_after(draft)
-    if anatomy.after_bones and (images.after is None or anatomy.after_skin is not None):
+        marks = draft.marks.after
+        text.value("landmarks", quoted(_landmark_path(draft, marks, "landmarks_after")))
+    if images.after is not None and _uses_image_after(draft):
+        text.value("image", quoted(_image_path(draft, images.after)))
+        _write_place_after(draft)
+        return
+    place = _after(draft, _write_place_after(draft))
+    skin, asked = anatomy.after_skin, anatomy.asks(f"{AFTER}skin")
+    if asked is not None:
+        text.ask("skin", asked.text, _choices(draft, asked, place))
+    elif skin is not None:
+        text.value("skin", quoted(_surface_path(draft, skin, "skin_after", place)))
+    questions = [q for q in anatomy.questions if q.key.startswith(f"{AFTER}bones.")]
+    if anatomy.after_bones or questions:
         text.table("postoperative.bones")
-        for name, find in anatomy.after_bones.items():
-            if name in ("cranium", *MOVING):
-                text.value(name, quoted(draft.found.shown(find.path)))
+    for name, find in anatomy.after_bones.items():
+        text.value(name, quoted(_surface_path(draft, find, f"{name}_after", place)))
+    for question in questions:
+        text.ask(question.key.rpartition(".")[2], question.text, _choices(draft, question, place))

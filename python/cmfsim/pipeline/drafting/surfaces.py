@@ -1,15 +1,19 @@
 """The surfaces of a case, their unit and their frame, with the reasons."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from cmfsim._core import Surface
+from cmfsim.meshing.levels import signed_level
 from cmfsim.pipeline.drafting.case_lines import Taken
 from cmfsim.pipeline.drafting.finds import SurfaceFind
-from cmfsim.pipeline.drafting.roles import MOVING, safe_key
+from cmfsim.pipeline.drafting.roles import JAWS_OF_TEETH, MOVING, safe_key
+from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.values.checks import Floats
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["Anatomy", "Question", "choose_surfaces"]
 
@@ -23,6 +27,14 @@ SAMPLES = 300
 PART_SHARE, NEAR = 0.8, 0.6
 # The jaw's middle lies so far in front of the cranium's, mm, for this to tell the frame.
 IN_FRONT = 5.0
+# Rows of teeth, by what names say.
+ROWS = ("teeth", *JAWS_OF_TEETH)
+# Teeth are those of the nearer jaw where its distance is below this part of the other's.
+NEARER = 0.5
+# Voxels along the longest side of a jaw that its teeth are added to, and the least of them, mm.
+VOXELS_OF_JAW, LEAST_VOXEL = 250.0, 0.5
+# A ramus that lies so far beyond the middle, mm, is on the other side.
+OFF_MIDDLE = 5.0
 FLIP = np.array([-1.0, -1.0, 1.0])
 PIECES_OF = {
     "mandible": ("mandible_body", "ramus_left", "ramus_right", "chin"),
@@ -121,13 +133,18 @@ def choose_surfaces(
     anatomy = Anatomy()
     before = [find for find in found if not find.role.is_after]
     parts = _by_part(anatomy, before)
+    teeth = [find for row in ROWS for find in parts.pop(row, [])]
     _choose_skin(anatomy, parts)
     _choose_bones(anatomy, parts)
     _check_pieces(anatomy)
     _choose_units(anatomy)
     _choose_frame(anatomy, boxes)
+    _check_sides(anatomy)
+    for row in teeth:
+        _add_teeth(anatomy, row)
     _choose_after(anatomy, [find for find in found if find.role.is_after])
     _report(anatomy)
+    _report_joined(anatomy, found)
     return anatomy
 
 
@@ -261,10 +278,7 @@ def _share(piece: SurfaceFind, whole: SurfaceFind) -> float:
         return 0.0
     points = piece.surface.vertices
     points = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLES)], dtype=np.float64)
-    index = Surface(
-        np.ascontiguousarray(whole.surface.vertices, dtype=np.float64),
-        np.ascontiguousarray(whole.surface.triangles, dtype=np.uint32),
-    )
+    index = _index(whole.surface.vertices, whole)
     closest, _, _ = index.closest(points)
     near = np.linalg.norm(closest - points, axis=1) < NEAR * whole.extent.max() / 150.0
     inside = index.winding_number(points) > 0.5
@@ -365,22 +379,139 @@ def _middle(find: SurfaceFind) -> Floats:
     return centre
 
 
+def _check_sides(anatomy: Anatomy) -> None:
+    """Asks about a left ramus that lies on the right, or the other way round."""
+    if anatomy.asks("frame") is not None or anatomy.asks("units") is not None:
+        return
+    rami = {n: anatomy.bones[n] for n in ("ramus_left", "ramus_right") if n in anatomy.bones}
+    middles = {name: float(anatomy.placed(find)[:, 0].mean()) for name, find in rami.items()}
+    if len(rami) == 2:
+        middle = 0.5 * sum(middles.values())
+    else:
+        rest = [find for name, find in anatomy.bones.items() if name not in rami]
+        whole = anatomy.skin or next(iter(rest), None)
+        if whole is None or not rami:
+            return
+        middle = float(np.ptp(anatomy.placed(whole)[:, 0])) / 2.0
+        middle += float(anatomy.placed(whole)[:, 0].min())
+    for name, x in middles.items():
+        side, other = ("left", "right") if name == "ramus_left" else ("right", "left")
+        away = (x - middle) * (1.0 if side == "left" else -1.0)
+        if away > -OFF_MIDDLE:
+            continue
+        find = anatomy.bones.pop(name)
+        text = (
+            f"{find.label}: by its name it is the {side} ramus, but it lies {-away:.0f} mm to the "
+            f"patient's {other}: are the names exchanged, or is the frame wrong?"
+        )
+        choices = [
+            (other_find, "if the names are exchanged")
+            for other_find in rami.values()
+            if other_find is not find
+        ]
+        choices.append((find, "if its name is right: the head is a mirror image, then"))
+        anatomy.questions.append(Question(f"bones.{name}", text, tuple(choices)))
+        anatomy.taken.append(Taken(find.label, "", text, question=True))
+
+
+def _add_teeth(anatomy: Anatomy, teeth: SurfaceFind) -> None:
+    """Adds a surface of teeth to that of its jaw; asks where it is not clear which one that is."""
+    jaw = _jaw_of(anatomy, teeth)
+    if jaw is not None:
+        find = anatomy.bones[jaw]
+        joined = replace(
+            find,
+            surface=_union(anatomy.placed(find), find, anatomy.placed(teeth), teeth),
+            stated="LPS",
+            is_made=True,
+            joined=(*find.joined, teeth.label),
+        )
+        anatomy.bones[jaw] = joined
+        return
+    text = (
+        f"{teeth.label}: which bone do these teeth belong to? They move with their jaw, and lips "
+        "and cheeks lie on them"
+    )
+    choices = (
+        (None, "join them with their jaw in the program that made them, and run init again; or"),
+        (None, "remove this line: the jaw is used without them"),
+    )
+    key = safe_key(teeth.label.rpartition("/")[2].rpartition(": ")[2].partition(".")[0])
+    anatomy.questions.append(Question(f"bones.{key}", text, choices))
+    anatomy.taken.append(Taken(teeth.label, "", text, question=True))
+
+
+def _jaw_of(anatomy: Anatomy, teeth: SurfaceFind) -> str | None:
+    """The bone of the case that a row of teeth belongs to; None where that is not clear."""
+    if anatomy.asks("units") is not None or anatomy.asks("frame") is not None:
+        return None
+    found: dict[str, str] = {}
+    for row, parts in JAWS_OF_TEETH.items():
+        # A jaw of which it is asked which surface it is may be the one.
+        open_parts = [part for part in parts if anatomy.asks(f"bones.{part}") is not None]
+        names = {find.role.part: name for name, find in anatomy.bones.items()}
+        first = next((part for part in parts if part in names or part in open_parts), "")
+        if first in names and np.array_equal(anatomy.bones[names[first]].to_world, teeth.to_world):
+            found[row] = names[first]
+    if teeth.role.part in JAWS_OF_TEETH:
+        return found.get(teeth.role.part)
+    if len(found) < len(JAWS_OF_TEETH):
+        return None
+    points = anatomy.placed(teeth)
+    points = points[:: max(1, len(points) // SAMPLES)]
+    away = {}
+    for name in found.values():
+        bone = anatomy.bones[name]
+        closest, _, _ = _index(anatomy.placed(bone), bone).closest(points)
+        away[name] = float(np.quantile(np.linalg.norm(closest - points, axis=1), 0.9))
+    near, far = sorted(away, key=away.__getitem__) if len(away) == 2 else ("", "")
+    return near if near and away[near] < NEARER * away[far] else None
+
+
+def _index(vertices: Floats, find: SurfaceFind) -> Surface:
+    return Surface(
+        np.ascontiguousarray(vertices, dtype=np.float64),
+        np.ascontiguousarray(find.surface.triangles, dtype=np.uint32),
+    )
+
+
+def _union(jaw: Floats, its: SurfaceFind, teeth: Floats, their: SurfaceFind) -> SurfaceData:
+    """The surface of a jaw and its teeth, LPS mm: repairs would drop single teeth as debris."""
+    points = np.concatenate([jaw, teeth])
+    step = max(LEAST_VOXEL, float(np.ptp(jaw, axis=0).max()) / VOXELS_OF_JAW)
+    lowest = points.min(axis=0) - 3.0 * step
+    shape = np.ceil((points.max(axis=0) + 3.0 * step - lowest) / step).astype(int)
+    grid = ImageData(np.broadcast_to(np.float32(0.0), tuple(shape)), (step, step, step), lowest)
+    levels = [
+        signed_level(SurfaceData(vertices, find.surface.triangles), grid).values
+        for vertices, find in ((jaw, its), (teeth, their))
+    ]
+    return surface_of_level(its.label, grid.with_values(np.maximum(*levels)))
+
+
 def _choose_after(anatomy: Anatomy, found: Sequence[SurfaceFind]) -> None:
+    parts: dict[str, list[SurfaceFind]] = {}
     for find in found:
         part = find.role.part
-        if part == "skin" and anatomy.after_skin is None:
-            anatomy.after_skin = find
-        elif part in ("cranium", *MOVING) and part not in anatomy.after_bones:
-            anatomy.after_bones[part] = find
-        elif part == "" and anatomy.after_skin is None and anatomy.skin is not None:
+        if part in ("skin", "cranium", *MOVING):
+            parts.setdefault(part, []).append(find)
+        elif part == "" and anatomy.skin is not None:
             ratio = float(find.extent.max() / anatomy.skin.extent.max())
             if 0.5 < ratio < 2.0:
-                anatomy.after_skin = find
+                parts.setdefault("skin", []).append(find)
                 continue
             anatomy.taken.append(Taken(find.label, "not used", "after the operation; which part?"))
         else:
-            why = "after the operation, and it is not clear which part it is"
-            anatomy.taken.append(Taken(find.label, "not used", why))
+            why = f"{find.role.part or 'a part that its name does not say'} after the operation"
+            anatomy.taken.append(Taken(find.label, "not used", f"{why}, which no case uses"))
+    for part, finds in parts.items():
+        if len(finds) > 1:
+            key = "skin" if part == "skin" else f"bones.{part}"
+            _ask_which(anatomy, f"postoperative.{key}", finds)
+        elif part == "skin":
+            anatomy.after_skin = finds[0]
+        else:
+            anatomy.after_bones[part] = finds[0]
 
 
 def _report(anatomy: Anatomy) -> None:
@@ -404,6 +535,24 @@ def _report(anatomy: Anatomy) -> None:
             anatomy.taken.append(
                 Taken(find.label, f"{part} after the operation", why, "mm", find.stated or "LPS")
             )
+
+
+def _report_joined(anatomy: Anatomy, found: Iterable[SurfaceFind]) -> None:
+    """Teeth that went with their jaw: they are used where that is."""
+    finds = {id(find): find for find in (*found, *anatomy.bones.values())}
+    status = {taken.label: taken for taken in anatomy.taken}
+    done = set(status)
+    for find in finds.values():
+        jaw = status.get(find.label)
+        for label in find.joined:
+            if jaw is None or label in done:
+                continue
+            done.add(label)
+            if jaw.question or jaw.taken_for in {"", "not used"}:
+                anatomy.taken.append(replace(jaw, label=label, why=f"as {jaw.label}: {jaw.why}"))
+                continue
+            why = f"teeth belong to their jaw: they are in the surface of {find.label}"
+            anatomy.taken.append(Taken(label, f"part of {jaw.taken_for}", why, "mm", "LPS"))
 
 
 def _shape(find: SurfaceFind, unit: str = "") -> str:
