@@ -8,10 +8,10 @@ import pytest
 import cmfsim
 import head_case
 import label_images
-from cmfsim.pipeline.drafting import draft as drafting
 from cmfsim.pipeline.drafting import init_case
-from cmfsim.pipeline.drafting.checking import UNDECIDED
+from cmfsim.pipeline.drafting.case_lines import Text
 from cmfsim.pipeline.drafting.roles import name_role
+from cmfsim.pipeline.drafting.written import UNDECIDED, placing
 from scene_text import model, pack, shift, transform, write_scene
 
 pytest.importorskip("SimpleITK")
@@ -310,12 +310,12 @@ def test_landmarks_of_a_scene_lie_where_slicer_shows_them(tmp_path):
 def test_a_case_that_reads_as_something_else_than_was_shown_is_an_error(tmp_path, monkeypatch):
     """The writer of surfaces is made to turn them: no case is left."""
     label_images.write_seg(tmp_path / "s.seg.nrrd", label_images.masks())
-    write = drafting.write_surface
+    write = placing.write_surface
 
     def turned(path, surface):
         write(path, cmfsim.SurfaceData(np.asarray(surface.vertices) * FLIP, surface.triangles))
 
-    monkeypatch.setattr(drafting, "write_surface", turned)
+    monkeypatch.setattr(placing, "write_surface", turned)
     with pytest.raises(cmfsim.CaseError, match=r"skin \(from_scene/skin.ply\) lies up to"):
         init_case(tmp_path)
     assert not (tmp_path / "case.toml").exists()
@@ -329,9 +329,9 @@ def test_a_motion_that_reads_as_another_is_an_error(tmp_path, monkeypatch):
         move,
         model("Mandible", "mandible.ply", "Move"),
     )
-    matrix = drafting.Text.matrix
+    matrix = Text.matrix
     stays = np.eye(4).tolist()
-    monkeypatch.setattr(drafting.Text, "matrix", lambda self, *_: matrix(self, stays))
+    monkeypatch.setattr(Text, "matrix", lambda self, *_: matrix(self, stays))
     with pytest.raises(cmfsim.CaseError, match="the motion of mandible is another"):
         init_case(tmp_path)
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing
 from cmfsim.pipeline.drafting.case_lines import Taken
-from cmfsim.pipeline.drafting.checking import check_written
 from cmfsim.pipeline.drafting.draft import CaseDraft, draft_case
 from cmfsim.pipeline.drafting.finds import CASE_FILE, EXTRACTED
 from cmfsim.pipeline.drafting.gathering import gather
+from cmfsim.pipeline.drafting.written import check_written
 
 __all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case"]
 

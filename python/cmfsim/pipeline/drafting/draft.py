@@ -1,30 +1,35 @@
 """A case file drafted from what lies in a folder: what each thing was taken for, and why."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cmfsim.errors import CaseInputError
-from cmfsim.io.landmarks import write_landmarks
-from cmfsim.io.surfaces import write_surface
 from cmfsim.pipeline.drafting.case_lines import Taken, Text, quoted
-from cmfsim.pipeline.drafting.checking import Shown, unaccounted
-from cmfsim.pipeline.drafting.choices import Images, Marks, choose_images, choose_landmarks
-from cmfsim.pipeline.drafting.finds import EXTRACTED, ImageFind, LandmarkFind, SurfaceFind
+from cmfsim.pipeline.drafting.choices import choose_images, choose_landmarks
+from cmfsim.pipeline.drafting.finds import ImageFind, LandmarkFind
 from cmfsim.pipeline.drafting.gathering import Gathered
 from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
-from cmfsim.pipeline.drafting.roles import safe_key
-from cmfsim.pipeline.drafting.surfaces import Anatomy, Question, choose_surfaces
+from cmfsim.pipeline.drafting.surfaces import Anatomy, choose_surfaces
+from cmfsim.pipeline.drafting.written import (
+    SAME,
+    Draft,
+    Shown,
+    choices_of,
+    image_path,
+    landmark_path,
+    place_after,
+    place_before,
+    surface_path,
+    unaccounted,
+)
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats
-from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["CaseDraft", "draft_case"]
 
-SAME = 1e-9
 # Middles of the skins before and after that are farther apart are those of two scans, mm.
 APART = 20.0
 # Questions about what there is after the operation.
@@ -66,42 +71,6 @@ class CaseDraft:
             "questions": self.questions,
             "written": sorted(self.files),
         }
-
-
-@dataclass(frozen=True)
-class _Place:
-    """How the surfaces of a table of the case are placed.
-
-    Attributes
-    ----------
-    frame : str or None
-        What the table states.
-    shown : str or None
-        The frame of the files that state none.
-    matrix : callable
-        What carries a surface from its own coordinates to those of the case, LPS mm.
-    """
-
-    frame: str | None
-    shown: str | None
-    matrix: Callable[[SurfaceFind], Floats]
-
-
-@dataclass
-class _Draft:
-    """What a case is made of, and the text that is made of it."""
-
-    found: Gathered
-    unpacked: Path
-    images: Images
-    anatomy: Anatomy
-    marks: Marks
-    plan: Plan
-    reference: Floats
-    by_image: bool
-    text: Text = field(default_factory=Text)
-    files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
-    shown: Shown = field(default_factory=Shown)
 
 
 def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
@@ -152,25 +121,25 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
     return CaseDraft(str(text), taken, text.questions, draft.files, draft.shown)
 
 
-def _has_after(draft: _Draft) -> bool:
+def _has_after(draft: Draft) -> bool:
     """Whether there are bones after the operation, on which the plan can be measured."""
     return bool(draft.anatomy.after_bones) or _uses_image_after(draft)
 
 
-def _uses_image_after(draft: _Draft) -> bool:
+def _uses_image_after(draft: Draft) -> bool:
     """Whether the face after the operation is that of a CT: there is no surface of it."""
     anatomy = draft.anatomy
     surfaces = anatomy.after or any(q.key.startswith(AFTER) for q in anatomy.questions)
     return draft.images.after is not None and not surfaces
 
 
-def _has_any_after(draft: _Draft) -> bool:
+def _has_any_after(draft: Draft) -> bool:
     """Whether there is anything after the operation."""
     asked = any(question.key.startswith(AFTER) for question in draft.anatomy.questions)
     return bool(draft.anatomy.after) or asked or draft.images.after is not None
 
 
-def _decide(found: Gathered, unpacked: Path) -> _Draft:
+def _decide(found: Gathered, unpacked: Path) -> Draft:
     images = choose_images(found.images)
     boxes = [(i.label, i.box) for i in (images.ct,) if i is not None and i.box is not None]
     boxes += [
@@ -195,7 +164,7 @@ def _decide(found: Gathered, unpacked: Path) -> _Draft:
     if found.scene:
         scene_motions(plan, anatomy.bones, found.loose, reference, in_image=by_image)
     file_motions(plan, found.transforms, by_slicer=found.by_slicer)
-    return _Draft(found, unpacked, images, anatomy, marks, plan, reference, by_image)
+    return Draft(found, unpacked, images, anatomy, marks, plan, reference, by_image)
 
 
 def _is_cut(anatomy: Anatomy) -> bool:
@@ -211,7 +180,7 @@ def _box_of(anatomy: Anatomy) -> Floats | None:
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-def _taken(draft: _Draft) -> list[Taken]:
+def _taken(draft: Draft) -> list[Taken]:
     """What each file was taken for, those that the case does not use included."""
     surfaces = draft.anatomy.taken
     if draft.by_image:
@@ -244,7 +213,7 @@ def _without(taken: list[Taken], find: ImageFind | LandmarkFind, why: str) -> li
     ]
 
 
-def _beside_image(draft: _Draft, taken: Taken) -> Taken:
+def _beside_image(draft: Draft, taken: Taken) -> Taken:
     if "after the operation" in taken.taken_for or taken.taken_for == "not used":
         return taken
     kept = f"would be the {taken.taken_for}" if taken.taken_for else "not clear what it is"
@@ -253,7 +222,7 @@ def _beside_image(draft: _Draft, taken: Taken) -> Taken:
     return replace(taken, taken_for="not used", why=why, question=False)
 
 
-def _write_head(draft: _Draft) -> None:
+def _write_head(draft: Draft) -> None:
     if draft.by_image:
         _write_image(draft)
         if draft.anatomy.skin is not None and draft.anatomy.bones:
@@ -264,7 +233,7 @@ def _write_head(draft: _Draft) -> None:
     _write_surfaces(draft)
 
 
-def _write_image(draft: _Draft) -> None:
+def _write_image(draft: Draft) -> None:
     text, images = draft.text, draft.images
     text.table("image")
     if images.question is not None:
@@ -272,7 +241,7 @@ def _write_image(draft: _Draft) -> None:
     elif images.ct is not None:
         low, high = images.ct.values
         why = f"{images.ct.words}, {low:g} to {high:g}"
-        text.value("file", quoted(_image_path(draft, images.ct)), why)
+        text.value("file", quoted(image_path(draft, images.ct)), why)
         if not np.allclose(images.ct.to_world, np.eye(4), rtol=0.0, atol=SAME):
             text.comment(
                 "The scene turns this volume; the case is in the volume's own coordinates."
@@ -281,121 +250,39 @@ def _write_image(draft: _Draft) -> None:
         text.ask("rescale", *images.rescale)
 
 
-def _image_path(draft: _Draft, image: ImageFind) -> str:
-    """The path of a CT; that of a bundle is copied next to the case."""
-    if not image.path.is_relative_to(draft.unpacked):
-        return "." if image.path == draft.found.folder else draft.found.shown(image.path)
-    name = f"{EXTRACTED}/{safe_key(image.path.name.partition('.')[0])}"
-    name += "".join(image.path.suffixes[-2:]) if image.path.suffix == ".gz" else image.path.suffix
-    data = image.path.read_bytes()
-    draft.files[name] = lambda path: _keep(path, data)
-    return name
-
-
-def _keep(path: Path, data: bytes) -> None:
-    path.write_bytes(data)
-
-
-def _write_surfaces(draft: _Draft, lead: str = "") -> None:
+def _write_surfaces(draft: Draft, lead: str = "") -> None:
     text, anatomy = Text(), draft.anatomy
-    place = _before(draft)
+    place = place_before(draft)
     text.table("surfaces")
     if (asked := anatomy.asks("skin")) is not None:
-        text.ask("skin", asked.text, _choices(draft, asked, place))
+        text.ask("skin", asked.text, choices_of(draft, asked, place))
     elif anatomy.skin is not None:
-        text.value("skin", quoted(_surface_path(draft, anatomy.skin, "skin", place)))
+        text.value("skin", quoted(surface_path(draft, anatomy.skin, "skin", place)))
     else:
         text.ask("skin", "no surface that was found is a skin: which file is it?", ())
     if (asked := anatomy.asks("units")) is not None:
-        text.ask("units", asked.text, _choices(draft, asked, place))
+        text.ask("units", asked.text, choices_of(draft, asked, place))
     else:
         text.value("units", '"mm"', anatomy.units_why)
     if (asked := anatomy.asks("frame")) is not None:
-        text.ask("frame", asked.text, _choices(draft, asked, place))
+        text.ask("frame", asked.text, choices_of(draft, asked, place))
     elif place.frame is not None:
         text.value("frame", quoted(place.frame), anatomy.frame_why)
     elif anatomy.frame_why:
         text.comment(f"frame: {anatomy.frame_why}")
     text.table("surfaces.bones")
     for name, find in anatomy.bones.items():
-        text.value(name, quoted(_surface_path(draft, find, name, place)))
+        text.value(name, quoted(surface_path(draft, find, name, place)))
     for question in anatomy.questions:
         part, _, name = question.key.partition(".")
         if part == "bones":
-            text.ask(name, question.text, _choices(draft, question, place))
+            text.ask(name, question.text, choices_of(draft, question, place))
     draft.text.lines += [f"{lead}{line}".rstrip() for line in text.lines]
     if not lead:
         draft.text.questions += text.questions
 
 
-def _choices(draft: _Draft, question: Question, place: _Place) -> list[str]:
-    """What may be written for a question; a surface of a scene gets a file, so that it can be."""
-    return [
-        words if find is None else f"{quoted(_candidate_path(draft, find, place))}: {words}"
-        for find, words in question.choices
-    ]
-
-
-def _candidate_path(draft: _Draft, find: SurfaceFind, place: _Place) -> str:
-    tail = find.label.rpartition(": ")[2].rpartition(" / ")[2].rpartition("/")[2]
-    name = safe_key(tail.partition(".")[0] if find.is_made else tail)
-    taken = {path for path in draft.files if path.startswith(f"{EXTRACTED}/{name}")}
-    return _surface_path(draft, find, f"{name}_{len(taken) + 1}" if taken else name, place)
-
-
-def _before(draft: _Draft) -> _Place:
-    """Where surfaces lie before the operation, and what the case states of their frame."""
-    reference = np.eye(4) if draft.by_image else draft.reference
-    return _place(draft, draft.anatomy.chosen, draft.anatomy.frame, lambda _: reference)
-
-
-def _place(
-    draft: _Draft,
-    finds: Sequence[SurfaceFind],
-    frame: str | None,
-    matrix: Callable[[SurfaceFind], Floats],
-) -> _Place:
-    """What a table of surfaces states of their frame: files that are written state LPS in vain."""
-    place = _Place(None, frame, lambda find: matrix(find) if find.in_scene else np.eye(4))
-    as_they_are = not any(_is_packed(draft, find, place) for find in finds)
-    frames = {find.stated or frame for find in finds if find.is_silent}
-    one_frame = len(frames) == 1 and all(find.is_silent for find in finds)
-    if as_they_are and one_frame and frames == {"RAS"}:
-        return replace(place, frame="RAS")
-    return replace(place, frame="LPS" if frame == "LPS" else None)
-
-
-def _is_packed(draft: _Draft, find: SurfaceFind, place: _Place) -> bool:
-    """Whether a surface has no file of its own where the case lies: packed, voxels, or moved."""
-    moved = not np.allclose(place.matrix(find), np.eye(4), rtol=0.0, atol=SAME)
-    return moved or find.path.is_relative_to(draft.unpacked) or find.is_made
-
-
-def _surface_path(draft: _Draft, find: SurfaceFind, name: str, place: _Place) -> str:
-    """The path of a surface in the case; a copy in LPS mm where its file alone would not do."""
-    true = find.stated or place.shown or "LPS"
-    matrix, flip = place.matrix(find), [-1.0, -1.0, 1.0] if true == "RAS" else [1.0, 1.0, 1.0]
-    known = draft.anatomy.asks("units") is None
-    vertices = find.surface.vertices * flip @ matrix[:3, :3].T + matrix[:3, 3]
-    reads_as = place.frame or ("LPS" if find.is_silent else find.stated)
-    if not _is_packed(draft, find, place) and (true == reads_as or not known):
-        path = draft.found.shown(find.path)
-    elif not known:
-        raise CaseInputError(
-            f"{find.label} is {find.extent.max():.4g} long: a scene of 3D Slicer is in mm, so its "
-            "transforms do not fit this surface: scale it to mm, and save the scene again"
-        )
-    else:
-        path = f"{EXTRACTED}/{name}.ply"
-        surface = SurfaceData(vertices, find.surface.triangles)
-        if not draft.by_image or find.role.is_after:
-            draft.files[path] = lambda target: write_surface(target, surface)
-    if known and (draft.anatomy.asks("frame") is None or not find.is_silent):
-        draft.shown.surfaces[path] = vertices
-    return path
-
-
-def _write_landmarks(draft: _Draft) -> None:
+def _write_landmarks(draft: Draft) -> None:
     text, marks = draft.text, draft.marks
     if not marks.skull and not marks.skin and not marks.questions:
         text.table("landmarks", "there is no file of landmarks")
@@ -417,7 +304,7 @@ def _write_landmarks(draft: _Draft) -> None:
         elif find is not None:
             frame = f"{find.read.frame}, stated" if find.read.stated else "frame not stated"
             why = f"{len(find.read.points)} points, {frame}"
-            text.value(key, quoted(_landmark_path(draft, find, key)), why)
+            text.value(key, quoted(landmark_path(draft, find, key)), why)
     if "frame" in marks.questions:
         text.ask("frame", *marks.questions["frame"])
     elif marks.frame is not None:
@@ -426,42 +313,12 @@ def _write_landmarks(draft: _Draft) -> None:
         )
 
 
-def _shows_skull(draft: _Draft) -> bool:
+def _shows_skull(draft: Draft) -> bool:
     """Whether landmarks of the skull can be found: by a CT, or a cranium as a surface."""
     return draft.by_image or "cranium" in draft.anatomy.bones
 
 
-def _landmark_path(draft: _Draft, find: LandmarkFind, key: str) -> str:
-    """The path of landmarks in the case; where they lie before the operation."""
-    matrix = _marks_matrix(draft, find)
-    points = {
-        label: matrix[:3, :3] @ point + matrix[:3, 3]
-        for label, point in draft.marks.placed(find).items()
-    }
-    if "frame" not in draft.marks.questions or find.read.stated:
-        draft.shown.landmarks[key] = points
-    apart = not np.allclose(matrix, np.eye(4), rtol=0.0, atol=SAME)
-    if not apart and not find.path.is_relative_to(draft.unpacked):
-        return draft.found.shown(find.path)
-    name = f"{EXTRACTED}/{key}.mrk.json"
-    draft.files[name] = lambda path: write_landmarks(path, points)
-    return name
-
-
-def _marks_matrix(draft: _Draft, find: LandmarkFind) -> Floats:
-    """What carries landmarks of a scene to where they lie before the operation in the case."""
-    if not find.in_scene:
-        return np.eye(4)
-    # A list under a segment's transform goes with the segment; before, it lies with the head.
-    moved = [bone for bone in draft.anatomy.bones.values() if bone.chain and bone.is_moved]
-    with_bone = any(bone.chain == find.chain for bone in moved) or bool(
-        set(find.chain) & draft.plan.links
-    )
-    matrix = draft.reference if with_bone else find.to_world
-    return np.linalg.inv(draft.reference) @ matrix if draft.by_image else matrix
-
-
-def _write_plan(draft: _Draft) -> None:
+def _write_plan(draft: Draft) -> None:
     text, plan = draft.text, draft.plan
     bones = set(draft.anatomy.bones) if not draft.by_image else {"cranium", "mandible"}
     asked = {q.key.partition(".")[2] for q in draft.anatomy.questions if not draft.by_image}
@@ -499,7 +356,7 @@ def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
         text.value("transform", motion.transform)
 
 
-def _write_muscles(draft: _Draft) -> None:
+def _write_muscles(draft: Draft) -> None:
     text = draft.text
     given = draft.marks.skin is not None or draft.marks.questions
     if draft.marks.skull is None and (given or not _shows_skull(draft)):
@@ -510,7 +367,7 @@ def _write_muscles(draft: _Draft) -> None:
     text.table("muscles", "the built-in template, placed by the skull landmarks")
 
 
-def _write_place_after(draft: _Draft) -> str | None:
+def _write_place_after(draft: Draft) -> str | None:
     """Unit and frame of surfaces after the operation, and whether they lie where the head was.
 
     Returns the frame of the files that state none, as far as it is known.
@@ -525,7 +382,7 @@ def _write_place_after(draft: _Draft) -> str | None:
     elif silent and _distance_after(draft, frame or "LPS") >= APART:
         other = "LPS" if frame == "RAS" else "RAS"
         frame = other if _distance_after(draft, other) < APART else frame
-    stated = _after(draft, frame).frame
+    stated = place_after(draft, frame).frame
     if anatomy.after and anatomy.asks("frame") is None and stated is not None:
         text.value("frame", quoted(stated), "so that they are where the skin was before")
     away = _distance_after(draft, frame or "LPS")
@@ -537,18 +394,12 @@ def _write_place_after(draft: _Draft) -> str | None:
     return frame
 
 
-def _after(draft: _Draft, frame: str | None) -> _Place:
-    """Where surfaces lie after the operation: a scene shows them there."""
-    back = np.linalg.inv(draft.reference) if draft.by_image else np.eye(4)
-    return _place(draft, draft.anatomy.after, frame, lambda find: back @ find.to_world)
-
-
-def _distance_after(draft: _Draft, frame: str) -> float:
+def _distance_after(draft: Draft, frame: str) -> float:
     """How far the middles of the skins before and after are apart, mm; infinite if not known."""
     anatomy = draft.anatomy
     if anatomy.skin is None or anatomy.after_skin is None or anatomy.asks("units") is not None:
         return float("inf")
-    here, there = _before(draft).matrix(anatomy.skin), _after(draft, frame).matrix
+    here, there = place_before(draft).matrix(anatomy.skin), place_after(draft, frame).matrix
     before = anatomy.placed(anatomy.skin) @ here[:3, :3].T + here[:3, 3]
     matrix = there(anatomy.after_skin)
     placed = replace(anatomy, frame=frame).placed(anatomy.after_skin)
@@ -557,28 +408,28 @@ def _distance_after(draft: _Draft, frame: str) -> float:
     return float(np.linalg.norm(middles[1] - middles[0]))
 
 
-def _write_after(draft: _Draft) -> None:
+def _write_after(draft: Draft) -> None:
     text, anatomy, images = draft.text, draft.anatomy, draft.images
     if not _has_any_after(draft):
         return
     text.table("postoperative", "after the operation, by the names of the files")
     if draft.marks.after is not None:
         marks = draft.marks.after
-        text.value("landmarks", quoted(_landmark_path(draft, marks, "landmarks_after")))
+        text.value("landmarks", quoted(landmark_path(draft, marks, "landmarks_after")))
     if images.after is not None and _uses_image_after(draft):
-        text.value("image", quoted(_image_path(draft, images.after)))
+        text.value("image", quoted(image_path(draft, images.after)))
         _write_place_after(draft)
         return
-    place = _after(draft, _write_place_after(draft))
+    place = place_after(draft, _write_place_after(draft))
     skin, asked = anatomy.after_skin, anatomy.asks(f"{AFTER}skin")
     if asked is not None:
-        text.ask("skin", asked.text, _choices(draft, asked, place))
+        text.ask("skin", asked.text, choices_of(draft, asked, place))
     elif skin is not None:
-        text.value("skin", quoted(_surface_path(draft, skin, "skin_after", place)))
+        text.value("skin", quoted(surface_path(draft, skin, "skin_after", place)))
     questions = [q for q in anatomy.questions if q.key.startswith(f"{AFTER}bones.")]
     if anatomy.after_bones or questions:
         text.table("postoperative.bones")
     for name, find in anatomy.after_bones.items():
-        text.value(name, quoted(_surface_path(draft, find, f"{name}_after", place)))
+        text.value(name, quoted(surface_path(draft, find, f"{name}place_after", place)))
     for question in questions:
-        text.ask(question.key.rpartition(".")[2], question.text, _choices(draft, question, place))
+        text.ask(question.key.rpartition(".")[2], question.text, choices_of(draft, question, place))

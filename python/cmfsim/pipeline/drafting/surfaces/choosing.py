@@ -1,122 +1,37 @@
 """The surfaces of a case, their unit and their frame, with the reasons."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from cmfsim._core import Surface
-from cmfsim.meshing.levels import signed_level
 from cmfsim.pipeline.drafting.case_lines import Taken
 from cmfsim.pipeline.drafting.finds import SurfaceFind
-from cmfsim.pipeline.drafting.roles import JAWS_OF_TEETH, MOVING, safe_key
-from cmfsim.surfaces.levels import surface_of_level
+from cmfsim.pipeline.drafting.roles import MOVING, safe_key
+from cmfsim.pipeline.drafting.surfaces.anatomy import (
+    FLIP,
+    SAMPLES,
+    UNITS,
+    Anatomy,
+    Question,
+    index_of,
+)
+from cmfsim.pipeline.drafting.surfaces.teeth import ROWS, add_teeth, report_joined
 from cmfsim.values.checks import Floats
-from cmfsim.values.image_data import ImageData
-from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Anatomy", "Question", "choose_surfaces"]
+__all__ = ["choose_surfaces"]
 
 # Longest extent of a skin from a face mask to a head with neck, and of bones, mm.
 SKIN_EXTENT, BONE_EXTENT = (110.0, 420.0), (15.0, 320.0)
-# Lengths of other units that numbers may be in, mm.
-UNITS: Mapping[str, float] = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inch": 25.4, "um": 0.001}
-# Vertices at which it is asked whether one surface holds another.
-SAMPLES = 300
 # Share of a piece in a bone from which on it is part of it, and distance that counts as in it, mm.
 PART_SHARE, NEAR = 0.8, 0.6
 # The jaw's middle lies so far in front of the cranium's, mm, for this to tell the frame.
 IN_FRONT = 5.0
-# Rows of teeth, by what names say.
-ROWS = ("teeth", *JAWS_OF_TEETH)
-# Teeth are those of the nearer jaw where its distance is below this part of the other's.
-NEARER = 0.5
-# Voxels along the longest side of a jaw that its teeth are added to, and the least of them, mm.
-VOXELS_OF_JAW, LEAST_VOXEL = 250.0, 0.5
 # A ramus that lies so far beyond the middle, mm, is on the other side.
 OFF_MIDDLE = 5.0
-FLIP = np.array([-1.0, -1.0, 1.0])
 PIECES_OF = {
     "mandible": ("mandible_body", "ramus_left", "ramus_right", "chin"),
     "cranium": ("maxilla", "midface"),
 }
-
-
-@dataclass(frozen=True)
-class Question:
-    """A decision about a key that a person has to make.
-
-    Attributes
-    ----------
-    key : str
-        Below [surfaces].
-    text : str
-        The question.
-    choices : tuple of (SurfaceFind or None, str)
-        What may be written: the file of a surface, or none, and words about it.
-    """
-
-    key: str
-    text: str
-    choices: tuple[tuple[SurfaceFind | None, str], ...]
-
-
-@dataclass
-class Anatomy:
-    """The surfaces of a case.
-
-    Attributes
-    ----------
-    skin : SurfaceFind or None
-    bones : dict of str to SurfaceFind
-        By the name that the case gives them.
-    units : str
-    frame : str or None
-        What the case states; None where every file states its own, or nothing needs to be stated.
-    frame_why, units_why : str
-    questions : list of Question
-        Keys "skin", "units", "frame" of [surfaces], or "bones.NAME".
-    after_skin, after_bones
-        The same after the operation.
-    taken : list of Taken
-    """
-
-    skin: SurfaceFind | None = None
-    bones: dict[str, SurfaceFind] = field(default_factory=dict)
-    units: str = "mm"
-    units_why: str = ""
-    frame: str | None = None
-    frame_why: str = ""
-    questions: list[Question] = field(default_factory=list)
-    after_skin: SurfaceFind | None = None
-    after_bones: dict[str, SurfaceFind] = field(default_factory=dict)
-    taken: list[Taken] = field(default_factory=list)
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether there is a skin, or a question about it, and a bone."""
-        asked = {question.key.partition(".")[0] for question in self.questions}
-        return (self.skin is not None or "skin" in asked) and (bool(self.bones) or "bones" in asked)
-
-    @property
-    def chosen(self) -> list[SurfaceFind]:
-        """Skin and bones before the operation."""
-        return [*([self.skin] if self.skin else []), *self.bones.values()]
-
-    @property
-    def after(self) -> list[SurfaceFind]:
-        """Skin and bones after the operation."""
-        return [*([self.after_skin] if self.after_skin else []), *self.after_bones.values()]
-
-    def asks(self, key: str) -> Question | None:
-        """The question about a key, where there is one."""
-        return next((question for question in self.questions if question.key == key), None)
-
-    def placed(self, find: SurfaceFind) -> Floats:
-        """The vertices of a surface in LPS mm, as far as unit and frame are known, (v, 3)."""
-        frame = find.stated or self.frame or "LPS"
-        scale = UNITS.get(self.units, 1.0) * (FLIP if frame == "RAS" else np.ones(3))
-        return find.surface.vertices * scale
 
 
 def choose_surfaces(
@@ -141,10 +56,10 @@ def choose_surfaces(
     _choose_frame(anatomy, boxes)
     _check_sides(anatomy)
     for row in teeth:
-        _add_teeth(anatomy, row)
+        add_teeth(anatomy, row)
     _choose_after(anatomy, [find for find in found if find.role.is_after])
     _report(anatomy)
-    _report_joined(anatomy, found)
+    report_joined(anatomy, found)
     return anatomy
 
 
@@ -278,7 +193,7 @@ def _share(piece: SurfaceFind, whole: SurfaceFind) -> float:
         return 0.0
     points = piece.surface.vertices
     points = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLES)], dtype=np.float64)
-    index = _index(whole.surface.vertices, whole)
+    index = index_of(whole.surface.vertices, whole)
     closest, _, _ = index.closest(points)
     near = np.linalg.norm(closest - points, axis=1) < NEAR * whole.extent.max() / 150.0
     inside = index.winding_number(points) > 0.5
@@ -414,81 +329,6 @@ def _check_sides(anatomy: Anatomy) -> None:
         anatomy.taken.append(Taken(find.label, "", text, question=True))
 
 
-def _add_teeth(anatomy: Anatomy, teeth: SurfaceFind) -> None:
-    """Adds a surface of teeth to that of its jaw; asks where it is not clear which one that is."""
-    jaw = _jaw_of(anatomy, teeth)
-    if jaw is not None:
-        find = anatomy.bones[jaw]
-        joined = replace(
-            find,
-            surface=_union(anatomy.placed(find), find, anatomy.placed(teeth), teeth),
-            stated="LPS",
-            is_made=True,
-            joined=(*find.joined, teeth.label),
-        )
-        anatomy.bones[jaw] = joined
-        return
-    text = (
-        f"{teeth.label}: which bone do these teeth belong to? They move with their jaw, and lips "
-        "and cheeks lie on them"
-    )
-    choices = (
-        (None, "join them with their jaw in the program that made them, and run init again; or"),
-        (None, "remove this line: the jaw is used without them"),
-    )
-    key = safe_key(teeth.label.rpartition("/")[2].rpartition(": ")[2].partition(".")[0])
-    anatomy.questions.append(Question(f"bones.{key}", text, choices))
-    anatomy.taken.append(Taken(teeth.label, "", text, question=True))
-
-
-def _jaw_of(anatomy: Anatomy, teeth: SurfaceFind) -> str | None:
-    """The bone of the case that a row of teeth belongs to; None where that is not clear."""
-    if anatomy.asks("units") is not None or anatomy.asks("frame") is not None:
-        return None
-    found: dict[str, str] = {}
-    for row, parts in JAWS_OF_TEETH.items():
-        # A jaw of which it is asked which surface it is may be the one.
-        open_parts = [part for part in parts if anatomy.asks(f"bones.{part}") is not None]
-        names = {find.role.part: name for name, find in anatomy.bones.items()}
-        first = next((part for part in parts if part in names or part in open_parts), "")
-        if first in names and np.array_equal(anatomy.bones[names[first]].to_world, teeth.to_world):
-            found[row] = names[first]
-    if teeth.role.part in JAWS_OF_TEETH:
-        return found.get(teeth.role.part)
-    if len(found) < len(JAWS_OF_TEETH):
-        return None
-    points = anatomy.placed(teeth)
-    points = points[:: max(1, len(points) // SAMPLES)]
-    away = {}
-    for name in found.values():
-        bone = anatomy.bones[name]
-        closest, _, _ = _index(anatomy.placed(bone), bone).closest(points)
-        away[name] = float(np.quantile(np.linalg.norm(closest - points, axis=1), 0.9))
-    near, far = sorted(away, key=away.__getitem__) if len(away) == 2 else ("", "")
-    return near if near and away[near] < NEARER * away[far] else None
-
-
-def _index(vertices: Floats, find: SurfaceFind) -> Surface:
-    return Surface(
-        np.ascontiguousarray(vertices, dtype=np.float64),
-        np.ascontiguousarray(find.surface.triangles, dtype=np.uint32),
-    )
-
-
-def _union(jaw: Floats, its: SurfaceFind, teeth: Floats, their: SurfaceFind) -> SurfaceData:
-    """The surface of a jaw and its teeth, LPS mm: repairs would drop single teeth as debris."""
-    points = np.concatenate([jaw, teeth])
-    step = max(LEAST_VOXEL, float(np.ptp(jaw, axis=0).max()) / VOXELS_OF_JAW)
-    lowest = points.min(axis=0) - 3.0 * step
-    shape = np.ceil((points.max(axis=0) + 3.0 * step - lowest) / step).astype(int)
-    grid = ImageData(np.broadcast_to(np.float32(0.0), tuple(shape)), (step, step, step), lowest)
-    levels = [
-        signed_level(SurfaceData(vertices, find.surface.triangles), grid).values
-        for vertices, find in ((jaw, its), (teeth, their))
-    ]
-    return surface_of_level(its.label, grid.with_values(np.maximum(*levels)))
-
-
 def _choose_after(anatomy: Anatomy, found: Sequence[SurfaceFind]) -> None:
     parts: dict[str, list[SurfaceFind]] = {}
     for find in found:
@@ -535,24 +375,6 @@ def _report(anatomy: Anatomy) -> None:
             anatomy.taken.append(
                 Taken(find.label, f"{part} after the operation", why, "mm", find.stated or "LPS")
             )
-
-
-def _report_joined(anatomy: Anatomy, found: Iterable[SurfaceFind]) -> None:
-    """Teeth that went with their jaw: they are used where that is."""
-    finds = {id(find): find for find in (*found, *anatomy.bones.values())}
-    status = {taken.label: taken for taken in anatomy.taken}
-    done = set(status)
-    for find in finds.values():
-        jaw = status.get(find.label)
-        for label in find.joined:
-            if jaw is None or label in done:
-                continue
-            done.add(label)
-            if jaw.question or jaw.taken_for in {"", "not used"}:
-                anatomy.taken.append(replace(jaw, label=label, why=f"as {jaw.label}: {jaw.why}"))
-                continue
-            why = f"teeth belong to their jaw: they are in the surface of {find.label}"
-            anatomy.taken.append(Taken(label, f"part of {jaw.taken_for}", why, "mm", "LPS"))
 
 
 def _shape(find: SurfaceFind, unit: str = "") -> str:

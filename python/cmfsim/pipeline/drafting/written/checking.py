@@ -52,7 +52,12 @@ def unaccounted(found: Gathered, plan: Plan, taken: Sequence[Taken]) -> list[Tak
     for path in found.seen:
         label = found.shown(path)
         known = label in labels or any(name.startswith(f"{label} / ") for name in labels)
-        known = known or label == found.scene or path in paths or path.parent in folders
+        known = (
+            known
+            or label == found.scene
+            or path in paths
+            or any(folder in path.parents for folder in folders)
+        )
         if not known and path.resolve() not in found.scene_files:
             missing.append(Taken(label, "not used", UNDECIDED))
     for name, below in found.links.items():
