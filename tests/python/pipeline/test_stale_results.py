@@ -373,11 +373,12 @@ def test_files_of_two_runs_are_told_apart_by_their_content(tmp_path, prediction,
     """However they came together: each summary knows its files."""
     cmfsim.write_prediction(tmp_path / "a", prediction)
     cmfsim.write_prediction(tmp_path / "b", replanned)
-    (tmp_path / "a" / "face.vtp").replace(tmp_path / "b" / "face.vtp")
-    with pytest.raises(cmfsim.CaseError, match=r"face.vtp: is not the file"):
+    name = "face_before.vtp"
+    (tmp_path / "a" / name).replace(tmp_path / "b" / name)
+    with pytest.raises(cmfsim.CaseError, match=rf"{name}: is not the file"):
         read_parts(tmp_path / "b")
-    (tmp_path / "b" / "face.vtp").unlink()
-    with pytest.raises(FileNotFoundError, match=r"face.vtp"):
+    (tmp_path / "b" / name).unlink()
+    with pytest.raises(FileNotFoundError, match=name):
         read_parts(tmp_path / "b")
 
 

@@ -24,6 +24,7 @@ from cmfsim.planning.page.page import joined_scripts
 from cmfsim.planning.replanning import plan_distance
 from cmfsim.planning.replanning.expected_error import plan_near
 from cmfsim.planning.server import PlanningServer
+from cmfsim.values.motion import plan_digits
 
 pytest.importorskip("skimage")
 pytest.importorskip("meshio")
@@ -533,7 +534,9 @@ def test_a_saved_plan_is_what_predict_reads(opened, planning, folder, tmp_path):
     for name, motion in case.plan.items():
         np.testing.assert_allclose(motion.matrix, plan[name], atol=1e-12)
     command = opened.locator("#command").inner_text()
-    assert command == "cmfsim predict case.toml --plan demo-A.toml --model H+S"
+    digits = plan_digits(plan)
+    assert command == f"cmfsim predict case.toml --plan demo-A-{digits}.toml --model H+S"
+    assert f'"A" ({digits}) of the case' in file.read_text("utf-8")
     # Loaded again, it is a variant of its own with the same motions.
     opened.locator("#plan-file").set_input_files(file)
     until(opened, "cmfsimPage.plans.now.variants.length === 2")
@@ -583,7 +586,8 @@ def test_a_saved_transform_is_the_motion(opened, planning, tmp_path, direction):
     type_number(opened, "yaw", 4)
     opened.locator("#direction").select_option(direction)
     download = saved(opened, "#save-transform")
-    assert download.suggested_filename == f"demo-A-mandible_body.{direction}.tfm"
+    digits = plan_digits(motions_of(opened, planning))
+    assert download.suggested_filename == f"demo-A-{digits}-mandible_body.{direction}.tfm"
     file = tmp_path / download.suggested_filename
     download.save_as(file)
     motion = cmfsim.read_transform(file, direction=direction)
