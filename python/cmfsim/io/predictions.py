@@ -191,8 +191,8 @@ def write_prediction(
     """The names of the files of a prediction, written to a folder, which is created if necessary.
 
     `prediction.vtp` (the mesh's skin at rest with its `displacement`, and with its band where it
-    has one), `prediction.stl` (the same where it goes), `face.vtp` and `face.stl` (the whole skin in
-    full detail, after the operation), `face_before.vtp` (the same before it; both with the
+    has one), `prediction.stl` (the same where it goes), `face.vtp` and `face.stl` (the whole skin
+    in full detail, after the operation), `face_before.vtp` (the same before it; both with the
     `displacement` between them), `prediction.vtu` (tissue with `displacement`, `force`, muscle
     `fraction` and `fibre`), `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments
     before the operation, with their `displacement`) and `muscles.vtp`, each vertex with the number

@@ -462,7 +462,7 @@ def test_near_skin_is_a_shell():
 def test_tets_of_tetwild_fill_a_surface(tmp_path, monkeypatch):
     """The optional mesher: volume, orientation, edge."""
     if importlib.util.find_spec("pytetwild") is None:
-        pytest.skip("needs pytetwild: pip install 'cmfsim[tetwild]'")
+        pytest.skip("needs pytetwild: pip install '.[tetwild]'")
     vertices, triangles = head_case.icosphere(2)
     surface = cmfsim.SurfaceData(10.0 * vertices, triangles)
     monkeypatch.chdir(tmp_path)

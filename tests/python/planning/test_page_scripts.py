@@ -33,7 +33,7 @@ def test_a_decimal_comma_is_a_point_and_all_else_is_refused(tmp_path):
         'import { typedNumber } from "./elements.js";'
         f"console.log(JSON.stringify({json.dumps(texts)}.map(typedNumber)));",
     )
-    assert found == [2.5, 2.5, -3, -1.25, 0.5, 7, None, None, None, None, None, None]
+    assert found == [2.5, 2.5, -3, -1.25, 0.5, 7, None, None, None, None, 1000, None]
 
 
 def test_the_page_and_predict_give_plans_the_same_digits(tmp_path):

@@ -481,13 +481,30 @@ def test_undo_and_redo_give_the_very_plans_back(opened, planning):
 def test_what_is_no_number_or_beyond_the_limits_is_refused(opened, planning):
     before = motions_of(opened, planning)
     field = opened.locator("#number-forwards")
-    for typed, said in (("", "Type a number"), ("31", "at most 30 mm"), ("-1e9", "at most 30 mm")):
+    for typed, said in (
+        ("", "Type a number"),
+        ("2,5,", "Type a number"),
+        ("31", "at most 30 mm"),
+        ("-1e9", "at most 30 mm"),
+    ):
         field.fill(typed)
         field.press("Enter")
         assert said in opened.locator("#message").inner_text()
         until(opened, "document.getElementById('number-forwards').value === '-3.50'")
     after = motions_of(opened, planning)
     assert all(np.array_equal(before[n], m) for n, m in after.items())
+
+
+def test_a_decimal_comma_is_a_point(opened):
+    """A browser drops it from a field of numbers: 2,5 was 25."""
+    field = opened.locator("#number-forwards")
+    field.click()
+    field.fill("")
+    opened.keyboard.type("2,5")
+    opened.keyboard.press("Enter")
+    until(opened, "document.getElementById('number-forwards').value === '2.50'")
+    opened.keyboard.press("ArrowUp")
+    until(opened, "document.getElementById('number-forwards').value === '2.60'")
 
 
 def test_a_turn_leaves_the_chosen_centre_in_place(opened, planning):

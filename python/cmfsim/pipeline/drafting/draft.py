@@ -12,6 +12,7 @@ from cmfsim.pipeline.drafting.choices import choose_images, choose_landmarks
 from cmfsim.pipeline.drafting.finds import ImageFind, LandmarkFind
 from cmfsim.pipeline.drafting.gathering import Gathered
 from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
+from cmfsim.pipeline.drafting.roles import MOVING
 from cmfsim.pipeline.drafting.surfaces import Anatomy, choose_surfaces
 from cmfsim.pipeline.drafting.written import (
     SAME,
@@ -34,10 +35,10 @@ __all__ = ["CaseDraft", "draft_case"]
 APART = 20.0
 # Questions about what there is after the operation.
 AFTER = "postoperative."
-EXAMPLE = """# No plan was found. To move a segment, state how it moves, such as:
-# [plan.maxilla]
-# translation = [0, -5, 0]          # mm, LPS: -y is forwards
-# transform = {file = "maxilla.h5", direction = "from-parent"}   # saved by 3D Slicer"""
+CUT = ("[[osteotomies]]", 'procedure = "le_fort_1"', "")
+EXAMPLE = """[plan.{name}]
+translation = [0, -5, 0]  # mm, LPS: -y is forwards
+# or, as 3D Slicer saves it: transform = {{file = "{name}.h5", direction = "from-parent"}}"""
 
 
 @dataclass
@@ -335,9 +336,18 @@ def _write_plan(draft: Draft) -> None:
         if draft.found.scene:
             text.comment("It cuts by landmarks, not where the scene's pieces were cut.")
     if not plan.motions:
-        text.lines += ["", *EXAMPLE.splitlines()]
+        _propose_plan(text, bones)
     for name, motion in plan.motions.items():
         _write_motion(text, name, motion)
+
+
+def _propose_plan(text: Text, bones: set[str]) -> None:
+    """Adds a plan as a comment: of a piece that is there, or of one that a procedure cuts."""
+    # A whole mandible does not leave its joints: it is cut first.
+    pieces = [name for name in MOVING if name in bones - {"mandible"}]
+    lines = EXAMPLE.format(name=pieces[0] if pieces else "maxilla").splitlines()
+    text.lines += ["", "# No plan was found. To move a segment, state how it moves, such as:"]
+    text.lines += [f"# {line}".rstrip() for line in (*(() if pieces else CUT), *lines)]
 
 
 def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:

@@ -234,7 +234,7 @@ def _choose_frame(anatomy: Anatomy, boxes: Sequence[tuple[str, Floats]]) -> None
     silent = [find for find in chosen if find.stated is None]
     stated = sorted({find.stated for find in chosen if find.stated is not None})
     if not silent:
-        anatomy.frame_why = f"stated by the header of each file: {' and '.join(stated)}"
+        anatomy.frame_why = f"stated by each file, its scene or its labels: {' and '.join(stated)}"
         return
     names = ", ".join(find.label for find in silent[:4]) + (", …" if len(silent) > 4 else "")
     frame, why = _shown_frame(anatomy, silent, boxes)

@@ -32,7 +32,7 @@ export const numberField = (properties) =>
 /** The number that a person typed, a comma being its point; NaN for everything else. */
 export function typedNumber(text) {
   const plain = text.trim().replace(/^[−–]/, "-").replace(",", ".");
-  return /^[+-]?(\d+\.?\d*|\.\d+)$/.test(plain) ? Number(plain) : NaN;
+  return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) ? Number(plain) : NaN;
 }
 
 /** A number with its sign, such as "+1.2" or "−0.3"; "0.0" has none. */
