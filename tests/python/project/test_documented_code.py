@@ -46,7 +46,7 @@ def blocks(page):
 
 
 def commands(text):
-    """The lines of a block of commands as words; a line that ends in \\ goes on."""
+    """The lines of a block of commands as words; some go on in the next line."""
     joined = text.replace("\\\n", " ")
     lines = [line.partition(" #")[0].strip() for line in joined.splitlines()]
     return [shlex.split(line) for line in lines if line and not line.startswith("#")]
@@ -59,6 +59,7 @@ class Reader:
         self.also, self.names, self.done = list(also), {}, []
 
     def type(self, language, text):
+        """Executes a block; what is neither Python nor commands is only read."""
         if language == "python":
             exec(compile(text, "page", "exec"), self.names)  # noqa: S102
         elif language == "sh":
@@ -66,6 +67,7 @@ class Reader:
                 self.run(words)
 
     def run(self, words):
+        """Runs a command of cmfsim; others are only looked at."""
         if words[0] != "cmfsim" or any(words[1:][: len(w)] == w for w, _ in NOT_RUN):
             return
         # Coarse, quiet, and without a window.
