@@ -273,6 +273,18 @@ def test_the_frame_of_a_scene_reaches_the_case(tmp_path, states, moved):
     assert np.allclose(plan[:3, 3], [0.0, -4.0, 1.0], atol=1e-9)
 
 
+def test_a_file_in_another_frame_than_the_others_is_turned(head):
+    """The others state LPS; a case states one frame for all, so this one gets a copy in LPS."""
+    given = cmfsim.read_surface(head / "mandible.ply")
+    (head / "mandible.ply").unlink()
+    turned = cmfsim.SurfaceData(np.asarray(given.vertices) * FLIP, given.triangles)
+    cmfsim.write_surface(head / "mandible.vtp", turned)
+    taken = entries(head)
+    assert taken["mandible.vtp"].frame == "RAS"
+    here = np.asarray(bone_of(head, "mandible").vertices)
+    assert np.abs(here - np.asarray(given.vertices)).max() < 1e-9
+
+
 def test_a_face_after_the_operation_in_a_bundle_lies_where_slicer_shows_it(tmp_path):
     packed = tmp_path / "packed"
     packed.mkdir()

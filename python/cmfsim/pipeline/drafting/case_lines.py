@@ -48,6 +48,7 @@ class Taken:
             "frame": self.frame,
             "why": self.why,
             "question": self.question,
+            **({"files": [path.name for path in self.paths]} if self.paths else {}),
         }
 
 

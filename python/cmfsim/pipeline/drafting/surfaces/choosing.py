@@ -238,7 +238,7 @@ def _choose_frame(anatomy: Anatomy, boxes: Sequence[tuple[str, Floats]]) -> None
         return
     names = ", ".join(find.label for find in silent[:4]) + (", …" if len(silent) > 4 else "")
     frame, why = _shown_frame(anatomy, silent, boxes)
-    if frame is None or (frame == "RAS" and "LPS" in stated):
+    if frame is None:
         anatomy.questions.append(
             Question(
                 "frame",
