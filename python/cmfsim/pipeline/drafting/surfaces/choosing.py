@@ -381,7 +381,7 @@ def _shape(find: SurfaceFind, unit: str = "") -> str:
     size = " × ".join(f"{length:.3g}" for length in find.extent)
     closed = "closed" if find.is_closed else "open"
     count = len(find.surface.triangles)
-    return f"{size} {unit or 'in its own unit'}, {count} triangles, {closed}"
+    return f"{size} {unit or ('mm' if find.is_made else 'in its own unit')}, {count} triangles, {closed}"
 
 
 def _said(find: SurfaceFind) -> str:
