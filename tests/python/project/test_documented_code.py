@@ -74,6 +74,8 @@ class Reader:
             return
         # Coarse, quiet, and without a window.
         options = [word for word in self.also if accepts(words[1], word.partition("=")[0])]
+        if words[1] == "virtual-patients" and "--patients" not in words:
+            options.append("--count=3" if "--count" in words else "--patients=1")
         code = main([*words[1:], *options])
         assert code == 0, words
         self.done.append(words)
@@ -224,7 +226,7 @@ def test_python_about_a_case_runs(page, coarse_case, monkeypatch):
 # What a reader of the test adds to commands, which know some of it: coarser, fewer, no window.
 COARSE = (
     *("-q", "--no-open", "--screenshot=face.png", "--edge-length=14", "--trials=2"),
-    *("--corrections=4", "--count=3", "--spacing=4", "--workers=1", "--patients=1"),
+    *("--corrections=4", "--spacing=4", "--workers=1"),
 )
 # Commands that are not run: they never end, need data that is not ours, or take hours.
 NOT_RUN = (
@@ -269,6 +271,8 @@ def prepare(folder, coarse_case):
         model("Mandible", "mandible.ply", "Mandible move"),
     )
     pack(folder / "packed", folder / "planning.mrb")
+    plan = "[plan.maxilla]\ntranslation = [0, -3, 0]\n"
+    (folder / "demo-B-6d0f1c2a.toml").write_text(plan, encoding="utf-8")
     variants = (ROOT / "benches/variants.toml").read_text("utf-8")
     (folder / "benches" / "variants.toml").write_text(variants, encoding="utf-8")
     write_template(folder / "atlas", cmfsim.MuscleTemplate.load("default"))
