@@ -348,6 +348,14 @@ def test_a_motion_that_reads_as_another_is_an_error(tmp_path, monkeypatch):
         init_case(tmp_path)
 
 
+def test_a_skin_without_any_bone_is_a_question(head):
+    for name in ("cranium", "mandible"):
+        (head / f"{name}.ply").unlink()
+    assert init_case(head).questions
+    with pytest.raises(cmfsim.CaseError, match="no surface that was found is a bone"):
+        cmfsim.Case.load(head)
+
+
 # ------------------------------------------------------------------ label images without a CT
 
 

@@ -83,6 +83,9 @@ def init_case(
     progress("reading the case back")
     try:
         check_written(case_file, draft.shown, is_open=bool(draft.questions))
+    except CaseInputError:
+        # It is the case's owner who has to correct it.
+        raise
     except CmfsimError:
         if before is None:
             case_file.unlink()

@@ -278,6 +278,8 @@ def _write_surfaces(draft: Draft, lead: str = "") -> None:
         part, _, name = question.key.partition(".")
         if part == "bones":
             text.ask(name, question.text, choices_of(draft, question, place))
+    if not anatomy.bones and not any(q.key.startswith("bones.") for q in anatomy.questions):
+        text.ask("cranium", "no surface that was found is a bone: which file is it?", ())
     draft.text.lines += [f"{lead}{line}".rstrip() for line in text.lines]
     if not lead:
         draft.text.questions += text.questions

@@ -381,7 +381,8 @@ def _shape(find: SurfaceFind, unit: str = "") -> str:
     size = " × ".join(f"{length:.3g}" for length in find.extent)
     closed = "closed" if find.is_closed else "open"
     count = len(find.surface.triangles)
-    return f"{size} {unit or ('mm' if find.is_made else 'in its own unit')}, {count} triangles, {closed}"
+    unit = unit or ("mm" if find.is_made else "in its own unit")
+    return f"{size} {unit}, {count} triangles, {closed}"
 
 
 def _said(find: SurfaceFind) -> str:

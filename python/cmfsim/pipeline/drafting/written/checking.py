@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.errors import CaseError, CmfsimError
+from cmfsim.errors import CaseError, CaseInputError, CmfsimError
 from cmfsim.io import Case, read_surface
 from cmfsim.io.files import toml_module
 from cmfsim.io.landmarks import read_landmarks
@@ -83,9 +83,14 @@ def check_written(file: Path, shown: Shown, *, is_open: bool) -> None:
     ------
     CaseError
         Something is missing, or lies or moves otherwise.
+    CaseInputError
+        The case cannot be loaded, although no question is left.
     """
     if not is_open:
-        Case.load(file)
+        try:
+            Case.load(file)
+        except CaseInputError as error:
+            raise CaseInputError(f"{error}. Correct the case file that was written") from error
     tables = toml_module().loads(file.read_text(encoding="utf-8"))
     try:
         wrong = [*_surfaces(tables, file.parent, shown), *_landmarks(tables, file.parent, shown)]
