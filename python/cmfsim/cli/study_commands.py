@@ -324,7 +324,9 @@ def _figures(entry: WrittenPrediction, output: Path) -> dict[str, Any]:
 def _plan_text(summary: Mapping[str, Any]) -> str:
     """The plan as it was applied, a line for each segment; last what the planning page calls it."""
     plan = {name: entry["clinical"] for name, entry in summary["plan"].items()}
-    lines = [*plan_lines(plan), f"digits of its motions: {summary.get('plan_digits', '')}"]
+    lines = plan_lines(plan)
+    if "plan_digits" in summary:
+        lines.append(f"{summary['plan_digits']} (digits of its motions, as in a saved plan's name)")
     return "\n".join(f"plan: {escaped(line)}" for line in lines)
 
 
