@@ -233,6 +233,7 @@ NOT_RUN = (
     (["plan", "case.toml", "--serve"], "until Ctrl-C"),
     (["template", "import"], "BodyParts3D"),
     (["bench", "frontier"], "hours"),
+    (["study", "insilico/executed.toml"], "hours: thirty settings of every patient"),
 )
 WHOLE = (
     "README.md",
