@@ -21,7 +21,14 @@ from cmfsim.io.nifti import read_nifti
 from cmfsim.io.nrrd import BYTES, nrrd_affine, nrrd_fields
 from cmfsim.values.finding import Finding
 
-__all__ = ["Segment", "Segmentation", "are_labels", "read_labels", "read_segmentation"]
+__all__ = [
+    "NAMES_FILE",
+    "Segment",
+    "Segmentation",
+    "are_labels",
+    "read_labels",
+    "read_segmentation",
+]
 
 MAX_SEGMENTS = 200
 # Voxels of all layers, bytes in memory: those of a head CT in eight layers.

@@ -367,6 +367,7 @@ def test_a_label_image_with_names_becomes_skin_and_bones(tmp_path):
     (tmp_path / "dataset.json").write_text(json.dumps({"labels": names}), encoding="utf-8")
     taken = entries(tmp_path)
     assert taken["seg.nii.gz / Lower Teeth"].taken_for == "part of mandible"
+    assert taken["dataset.json"].taken_for == "names of labels"
     volume = label_images.volume(bone_of(tmp_path, "skin"))
     assert volume == pytest.approx(masks["Skin"].sum() * 64.0, rel=0.03)
     middle = np.asarray(bone_of(tmp_path, "mandible").vertices).mean(axis=0)

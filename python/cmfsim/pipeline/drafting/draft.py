@@ -201,6 +201,11 @@ def _taken(draft: Draft) -> list[Taken]:
     others = [
         Taken(o.label, "not used", o.why, paths=o.paths)
         for o in (*draft.found.others, *draft.plan.others)
+        if not o.paths or not set(o.paths) <= set(draft.found.names)
+    ]
+    others += [
+        Taken(draft.found.shown(path), "names of labels", "nnU-Net writes them next to its labels")
+        for path in draft.found.names
     ]
     taken = [*images, *surfaces, *marks, *draft.plan.taken, *others]
     return [*taken, *unaccounted(draft.found, draft.plan, taken)]

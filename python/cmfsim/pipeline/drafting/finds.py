@@ -11,7 +11,7 @@ from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files import is_below
 from cmfsim.io.images import read_image_file
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file
-from cmfsim.io.segmentations import are_labels, read_labels
+from cmfsim.io.segmentations import NAMES_FILE, are_labels, read_labels
 from cmfsim.io.stated_frames import is_own_file
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.pipeline.drafting.roles import NameRole, name_role
@@ -255,7 +255,8 @@ def listing(folder: Path) -> Listing:
         if kind is not None:
             kind.append(path)
         elif path.suffix.lower() in NO_SLICES or not (path.parent in dicom or _is_dicom(path)):
-            found.skip(path, "no case reads such files")
+            names = path.name == NAMES_FILE
+            found.skip(path, "it has names of labels" if names else "no case reads such files")
         else:
             dicom[path.parent] = None
     found.dicom = list(dicom)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io.segmentations import NAMES_FILE
 from cmfsim.io.slicer_bundles import unpack_bundle
 from cmfsim.io.slicer_scenes import read_slicer_scene
 from cmfsim.pipeline.drafting.finds import (
@@ -50,6 +51,8 @@ class Gathered:
         Whether 3D Slicer saved any of the files.
     seen : list of Path
         Every file of the folder.
+    names : list of Path
+        Those with the names of labels.
     scene_files : set of Path
         Those that the scene names.
     links : dict of str to tuple of str
@@ -66,6 +69,7 @@ class Gathered:
     loose: list[LooseMotion] = field(default_factory=list)
     others: list[OtherFind] = field(default_factory=list)
     seen: list[Path] = field(default_factory=list)
+    names: list[Path] = field(default_factory=list)
     scene_files: set[Path] = field(default_factory=set)
     links: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
@@ -167,6 +171,10 @@ def _gather_images(found: Gathered, paths: list[Path], progress: Callable[[str],
     segments = segment_finds(labels)
     found.surfaces += segments.surfaces
     found.others += segments.others
+    folders = {path.parent for path, _ in labels}
+    found.names = [
+        path for path in found.seen if path.name == NAMES_FILE and path.parent in folders
+    ]
 
 
 def _gather_scene(
