@@ -221,7 +221,12 @@ class Listing:
         found = []
         for (_, why), paths in self.unread.items():
             names = [path.relative_to(folder).as_posix() for path in paths]
-            more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+            if len(names) <= SHOWN:
+                found += [
+                    OtherFind(name, why, (path,)) for name, path in zip(names, paths, strict=True)
+                ]
+                continue
+            more = f" and {len(names) - SHOWN} more"
             found.append(OtherFind(", ".join(names[:SHOWN]) + more, why, tuple(paths)))
         return found
 
