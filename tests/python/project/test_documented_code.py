@@ -232,6 +232,7 @@ COARSE = (
 NOT_RUN = (
     (["plan", "case.toml", "--serve"], "until Ctrl-C"),
     (["template", "import"], "BodyParts3D"),
+    (["predict", "--band", "--calibration"], "a calibration of the 36 patients of the page"),
     (["bench", "frontier"], "hours"),
     (["study", "insilico/executed.toml"], "hours: thirty settings of every patient"),
 )
