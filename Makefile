@@ -26,7 +26,7 @@ PYTHON_DIRS := python tests/python scripts examples benches fuzz slicer
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python lint lint-rust lint-python format wheel notices bench peers stability elements frontier fuzz demo docs tutorials clean
+.PHONY: help build test test-rust test-python test-slow lint lint-rust lint-python format wheel notices bench peers stability elements frontier fuzz demo docs tutorials clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -59,6 +59,9 @@ test-rust: $(ENV_STAMP)
 
 test-python: $(DEVELOP_STAMP)
 	"$(PY)" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+
+test-slow: $(DEVELOP_STAMP) ## run the tests that take minutes: README and docs, typed from top to bottom
+	"$(PY)" -m pytest -m slow tests/python/project/test_documented_code.py
 
 lint: lint-rust lint-python ## rustfmt, clippy, ruff, mypy, stubtest, the import rules and the licences
 

@@ -326,6 +326,7 @@ def fcsv(data: bytes) -> dict[str, tuple[float, ...]]:
     """Points of a `.fcsv` by label, in LPS mm."""
     sign, found = -1, {}
     columns = ["id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label"]
+    columns += ["desc", "associatedNodeID"]
     rows = []
     for line in data.decode("utf-8-sig").splitlines():
         if line.startswith("#"):
@@ -337,7 +338,9 @@ def fcsv(data: bytes) -> dict[str, tuple[float, ...]]:
         elif line.strip():
             rows.append(next(csv.reader([line], strict=True)))
     for row in rows:
-        cells = dict(zip(columns, row, strict=False))
+        cells = dict(zip([*columns, "status"], row, strict=False))
+        if cells.get("status", "").strip() in {"0", "1"}:
+            continue
         x, y, z = (_real(cells[axis].strip()) for axis in "xyz")
         if cells["label"].strip() in found:
             raise ValueError(cells)

@@ -27,7 +27,7 @@ import cmfsim
 import oracles
 from cmfsim.io.curves import read_curves, write_curves
 from cmfsim.io.meshes import read_mesh
-from cmfsim.io.segmentations import read_segmentation
+from cmfsim.io.segmentations import read_labels, read_segmentation
 from cmfsim.io.slicer_bundles import unpack_bundle
 from cmfsim.io.slicer_scenes import read_slicer_scene
 from cmfsim.io.vtk import write_tets
@@ -467,6 +467,20 @@ def _segments() -> bytes:
 
 def _read_segments(path: Path) -> Any:
     found = read_segmentation(path)
+    return [(s.name, found.affine, found.mask(s)) for s in found.segments]
+
+
+def _label_image(folder: Path, number: int) -> bool:
+    if number:
+        return False
+    values = np.zeros((6, 5, 4), np.uint8)
+    values[1:3, 1:4, 1:3], values[3:5, 1:4, 1:3] = 1, 2
+    cmfsim.write_image(cmfsim.ImageData(values, (2.0, 1.0, 3.0), (-10, -20, 30)), folder / "it.nii")
+    return True
+
+
+def _read_labels(path: Path) -> Any:
+    found = read_labels(path)
     return [(s.name, found.affine, found.mask(s)) for s in found.segments]
 
 
@@ -1020,6 +1034,7 @@ READERS: tuple[Reader, ...] = (
     Reader(
         "segmentation .seg.nrrd", "it.seg.nrrd", _texts("it.seg.nrrd", _segments), _read_segments
     ),
+    Reader("label image .nii", "it.nii", _label_image, _read_labels),
     Reader("case.toml", "case.toml", _texts("case.toml", CASE.encode), cmfsim.Case.load),
     Reader("cohort.toml", "cohort.toml", _texts("cohort.toml", COHORT.encode), cmfsim.Cohort.load),
     Reader("scene .npz", "it.npz", _scene_npz, _read_scene, inside=True, sealed=True),

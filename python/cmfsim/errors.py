@@ -122,5 +122,5 @@ def third_party(
         package = module.partition(".")[0]
         raise error(
             f"{purpose} with {package}, which cannot be imported ({reason}): "
-            f"pip install 'cmfsim[{extra}]'"
+            f"pip install '.[{extra}]' in cmfsim's folder"
         ) from reason

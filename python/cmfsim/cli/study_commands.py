@@ -314,6 +314,7 @@ def _figures(entry: WrittenPrediction, output: Path) -> dict[str, Any]:
         "contact_iterations": solution["contact_iterations"],
         "contact_gap": solution["contact_gap"],
         "plan": {name: m["clinical"] for name, m in entry.summary["plan"].items()},
+        "plan_digits": entry.summary.get("plan_digits", ""),
         "skin": dict(entry.summary["skin"]),
         "band": entry.summary.get("band"),
         "timings": dict(entry.summary["timings"]),
@@ -323,9 +324,12 @@ def _figures(entry: WrittenPrediction, output: Path) -> dict[str, Any]:
 
 
 def _plan_text(summary: Mapping[str, Any]) -> str:
-    """The plan as it was applied, a line for each segment."""
+    """The plan as it was applied, a line for each segment; last what the planning page calls it."""
     plan = {name: entry["clinical"] for name, entry in summary["plan"].items()}
-    return "\n".join(f"plan: {escaped(line)}" for line in plan_lines(plan))
+    lines = plan_lines(plan)
+    if "plan_digits" in summary:
+        lines.append(f"{summary['plan_digits']} (digits of its motions, as in a saved plan's name)")
+    return "\n".join(f"plan: {escaped(line)}" for line in lines)
 
 
 def _prediction_text(entry: dict[str, Any]) -> str:

@@ -69,7 +69,7 @@ def parse_itk_hdf5(path: str) -> Answer:
     except ImportError as error:
         raise CaseInputError(
             f"HDF5 transforms are read with SimpleITK, which cannot be imported ({error}): "
-            "pip install 'cmfsim[imaging]', or save the transform as .tfm (ITK text)"
+            "pip install '.[imaging]' in cmfsim's folder, or save the transform as .tfm (ITK text)"
         ) from error
     try:
         whole = sitk.ReadTransform(path)

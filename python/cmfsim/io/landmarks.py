@@ -37,7 +37,14 @@ UNSTATED: Mapping[str, str] = MappingProxyType({".json": "LPS", ".fcsv": "RAS"})
 # A number as Slicer writes it; Python takes more for one, 1_0 among them.
 NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?(?:nan|inf)")
 # Columns of a `.fcsv` file that does not name them.
-FCSV_COLUMNS = ("id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label")
+FCSV_COLUMNS = (
+    *("id", "x", "y", "z", "ow", "ox", "oy", "oz"),
+    *("vis", "sel", "lock", "label", "desc", "associatedNodeID"),
+)
+# Slicer 5 writes two more values than it names columns. The first is the status of the point: not
+# placed, shown under the mouse, or placed.
+STATUS = "positionStatus"
+NOT_PLACED = frozenset({"0", "1"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +61,15 @@ class LandmarkFile:
         Whether the file states it.
     findings : tuple of Finding
         An unstated frame, points that were never placed.
+    unset : tuple of str
+        The labels of the points that were never placed.
     """
 
     points: Mapping[str, Floats]
     frame: str
     stated: bool
     findings: tuple[Finding, ...] = ()
+    unset: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -246,6 +256,7 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
         )
     sign = frame_signs(its_frame or frame or UNSTATED[".fcsv"])
     points: list[_Point] = []
+    unset: list[str] = []
     for number, (line_number, line) in enumerate(rows, start=1):
         try:
             cells = next(csv.reader([line], strict=True))
@@ -255,7 +266,10 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
             raise LandmarkInputError(
                 f"point {number} (line {line_number}) has {len(cells)} of {len(columns)} columns"
             )
-        row = dict(zip(columns, cells, strict=False))
+        row = dict(zip((*columns, STATUS), cells, strict=False))
+        if row.get(STATUS, "").strip() in NOT_PLACED:
+            unset.append(row["label"].strip() or str(number))
+            continue
         numbers: list[object] = []
         for name in ("x", "y", "z"):
             cell = row[name].strip()
@@ -264,7 +278,7 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
             _Point(number, _label(number, row["label"]), sign * as_position(number, numbers))
         )
     chosen = its_frame or frame or UNSTATED[".fcsv"]
-    return _landmark_file(points, [], chosen, frame, path, stated=its_frame is not None)
+    return _landmark_file(points, unset, chosen, frame, path, stated=its_frame is not None)
 
 
 def _landmark_file(
@@ -302,7 +316,8 @@ def _landmark_file(
                 fix="place them in 3D Slicer, or delete them",
             )
         )
-    return LandmarkFile(MappingProxyType(_by_label(points)), chosen, stated, tuple(findings))
+    placed = MappingProxyType(_by_label(points))
+    return LandmarkFile(placed, chosen, stated, tuple(findings), tuple(unset))
 
 
 def _by_label(points: list[_Point]) -> dict[str, Floats]:

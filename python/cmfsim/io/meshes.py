@@ -113,7 +113,7 @@ def _by_meshio(path: Path) -> PlainMesh:
         )
     if find_spec("meshio") is None:
         raise CaseInputError(
-            f"files of {suffix} are read with meshio: pip install 'cmfsim[mesh]'; "
+            f"files of {suffix} are read with meshio: pip install '.[mesh]' in cmfsim's folder; "
             f"{', '.join(READERS)} need nothing more"
         )
     size = path.stat().st_size

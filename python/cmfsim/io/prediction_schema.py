@@ -22,7 +22,7 @@ from cmfsim.values.prediction import MODELS
 __all__ = ["PREDICTION", "is_prediction_file"]
 
 PREDICTION_FILES = re.compile(
-    r"prediction\.(vtp|stl|vtu|npz|png|json|mrb)|face\.(vtp|stl)|(bones|muscles)\.vtp"
+    r"prediction\.(vtp|stl|vtu|npz|png|json|mrb)|face\.(vtp|stl)|face_before\.vtp|(bones|muscles)\.vtp"
     r"|(plan|muscles|band)\.png|timings\.json"
 )
 
@@ -132,6 +132,7 @@ PREDICTION = table(
     },
     {
         "note": text,
+        "plan_digits": text,
         "left_out": listing(text),
         "achieved": table({"segments": mapping(_FIT, most=1000)}),
         "muscles": table(

@@ -191,8 +191,9 @@ def write_prediction(
     """The names of the files of a prediction, written to a folder, which is created if necessary.
 
     `prediction.vtp` (the mesh's skin at rest with its `displacement`, and with its band where it
-    has one), `prediction.stl` (the same where it goes), `face.vtp` and `face.stl` (likewise the
-    whole skin in full detail), `prediction.vtu` (tissue with `displacement`, `force`, muscle
+    has one), `prediction.stl` (the same where it goes), `face.vtp` and `face.stl` (the whole skin
+    in full detail, after the operation), `face_before.vtp` (the same before it; both with the
+    `displacement` between them), `prediction.vtu` (tissue with `displacement`, `force`, muscle
     `fraction` and `fibre`), `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments
     before the operation, with their `displacement`) and `muscles.vtp`, each vertex with the number
     of its `part` (the summary lists their names), `timings.json`, and `prediction.json` (counts,
@@ -236,7 +237,7 @@ def fill_prediction(
 ) -> list[str]:
     """The names of the files of a prediction, written into a folder that has none of them."""
     names = [f"prediction.{ending}" for ending in ("vtp", "stl", "vtu", "npz")]
-    names += ["face.vtp", "face.stl"]
+    names += ["face.vtp", "face.stl", "face_before.vtp"]
     result, skin = prediction.result, prediction.skin_before
     with replacing(fresh / names[0]) as file:
         moved = {
@@ -247,9 +248,10 @@ def fill_prediction(
         write_triangles(file, skin.vertices, skin.triangles, moved)
     write_surface(fresh / names[1], prediction.skin)
     face, before = prediction.face, prediction.face_before
-    with replacing(fresh / names[4]) as file:
-        carried = face.vertices - before.vertices
-        write_triangles(file, before.vertices, before.triangles, {"displacement": carried})
+    carried = face.vertices - before.vertices
+    for name, places in ((names[4], face.vertices), (names[6], before.vertices)):
+        with replacing(fresh / name) as file:
+            write_triangles(file, places, before.triangles, {"displacement": carried})
     write_surface(fresh / names[5], face)
     with replacing(fresh / names[2]) as file:
         points = {"displacement": result.displacements, "force": result.forces}
@@ -329,7 +331,9 @@ def read_parts(
     """
     folder = Path(folder)
     summary = read_prediction(folder)
-    found = {"skin": _read_part_file(checked_file(folder, summary, "face.vtp", AGAIN), ["skin"])}
+    found = {
+        "skin": _read_part_file(checked_file(folder, summary, "face_before.vtp", AGAIN), ["skin"])
+    }
     for kind, names in summary["parts"].items():
         path = checked_file(folder, summary, f"{kind}.vtp", AGAIN)
         found[kind] = _read_part_file(path, names)

@@ -53,7 +53,7 @@ class SceneNode:
     Attributes
     ----------
     kind : str
-        "model", "segmentation", "volume", "transform" or "markups".
+        "model", "segmentation", "volume", "transform", "markups", or "other": what no case uses.
     id, name : str
     file : Path or None
         Where its data are kept; None where the scene alone has them.
@@ -62,7 +62,10 @@ class SceneNode:
     parent : str or None
         The id of the transform that is applied to it.
     frame : str or None
-        The frame of a file that does not state its own.
+        The frame of a file that does not state its own. Of a model, "RAS" where the scene does not
+        state it either: 3D Slicer reads scenes from before it stated frames so.
+    tag : str
+        What Slicer calls its kind.
     """
 
     kind: str
@@ -73,6 +76,7 @@ class SceneNode:
     parent: str | None
     frame: str | None
     matrix: str | None = None
+    tag: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,28 +196,43 @@ def read_slicer_scene(path: str | os.PathLike[str]) -> SlicerScene:
         storages = {a["id"]: a for name, a in elements if name.endswith("Storage") and "id" in a}
         nodes: dict[str, SceneNode] = {}
         for name, attributes in elements:
-            kind = KINDS.get(name)
-            if kind is None:
+            if name not in KINDS and not _stores(attributes, storages):
                 continue
-            node = _node(kind, attributes, storages, path.parent)
+            node = _node(name, attributes, storages, path.parent)
             if not node.id or node.id in nodes:
                 raise CaseInputError(f"has two nodes, or one without a name, of id {node.id!r}")
             nodes[node.id] = node
     return SlicerScene(path, MappingProxyType(nodes))
 
 
+def _stored(
+    attributes: Mapping[str, str], storages: Mapping[str, Mapping[str, str]]
+) -> Mapping[str, str]:
+    """What the scene states of the file of a node."""
+    references = dict(REFERENCE.findall(attributes.get("references", "")))
+    storage = references.get("storage", attributes.get("storageNodeRef", "")).split(" ")[0]
+    return storages.get(storage, {})
+
+
+def _stores(attributes: Mapping[str, str], storages: Mapping[str, Mapping[str, str]]) -> bool:
+    """Whether an element has a file of its own."""
+    return bool(attributes.get("id")) and bool(_stored(attributes, storages).get("fileName"))
+
+
 def _node(
-    kind: str,
+    tag: str,
     attributes: Mapping[str, str],
     storages: Mapping[str, Mapping[str, str]],
     folder: Path,
 ) -> SceneNode:
     references = dict(REFERENCE.findall(attributes.get("references", "")))
-    storage = references.get("storage", attributes.get("storageNodeRef", "")).split(" ")[0]
     parent = references.get("transform", attributes.get("transformNodeRef", "")).strip() or None
-    stored = storages.get(storage, {})
+    kind = KINDS.get(tag, "other")
+    stored = _stored(attributes, storages)
     file, missing = _file(stored.get("fileName", ""), folder)
     frame = stored.get("coordinateSystem")
+    # Slicer's own rule (vtkMRMLModelStorageNode), for scenes from before it stated the frame.
+    unstated = "RAS" if kind == "model" else None
     return SceneNode(
         kind,
         attributes.get("id", ""),
@@ -221,8 +240,9 @@ def _node(
         file,
         missing,
         parent,
-        frame if frame in {"LPS", "RAS"} else None,
+        frame if frame in {"LPS", "RAS"} else unstated,
         attributes.get(MATRIX) if kind == "transform" else None,
+        tag,
     )
 
 

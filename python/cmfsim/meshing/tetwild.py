@@ -44,7 +44,7 @@ def mesh_with_tetwild(surface: SurfaceData, edge_length: float = 3.0) -> TetMesh
         tetwild = import_module("pytetwild")
     except ModuleNotFoundError as error:
         raise MeshInputError(
-            "meshing with fTetWild needs pytetwild: pip install 'cmfsim[tetwild]'; "
+            "meshing with fTetWild needs pytetwild: pip install '.[tetwild]' in cmfsim's folder; "
             "mesh_from_labels and mesh_from_level need nothing"
         ) from error
     with _elsewhere():

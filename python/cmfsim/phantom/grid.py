@@ -120,7 +120,7 @@ def level_surface(field: Field, low: Floats, high: Floats, spacing: float) -> Su
         from skimage.measure import marching_cubes  # noqa: PLC0415
     except ImportError as error:
         raise ImportError(
-            "surfaces of the phantom need scikit-image: pip install 'cmfsim[imaging]'"
+            "surfaces of the phantom need scikit-image: pip install '.[imaging]' in cmfsim's folder"
         ) from error
     axes = [
         a - 2.0 * spacing + spacing * np.arange(int(np.ceil((b - a) / spacing)) + 5)

@@ -398,5 +398,5 @@ def pyvista_module() -> Any:
         # VTK without libGL fails as an ImportError that names the library.
         raise CaseInputError(
             f"pictures are drawn with PyVista, which cannot be imported ({error}): pip install "
-            "'cmfsim[view]', and install libGL if it is missing (Debian: libgl1)"
+            "'.[view]' in cmfsim's folder, and install libGL if it is missing (Debian: libgl1)"
         ) from error

@@ -110,7 +110,7 @@ def write_figure(
     except ImportError as error:
         raise CaseInputError(
             f"charts are drawn with matplotlib, which cannot be imported ({error}): "
-            "pip install 'cmfsim[report]'"
+            "pip install '.[report]' in cmfsim's folder"
         ) from error
     # Text stays text in SVG, and ids and dates do not change from run to run.
     settings = {"svg.fonttype": "none", "svg.hashsalt": "cmfsim", "font.size": 9.0}

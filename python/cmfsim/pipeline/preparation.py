@@ -63,7 +63,7 @@ def check_extras(needs: Iterator[_Need] | Sequence[_Need]) -> None:
         return
     extras = ",".join(sorted({need.extra for need in missing}))
     reasons = "; ".join(dict.fromkeys(f"{need.module}: {need.purpose}" for need in missing))
-    line = f"{reasons}; install with: pip install 'cmfsim[{extras}]'"
+    line = f"{reasons}; install with: pip install '.[{extras}]' in cmfsim's folder"
     if all(need.is_optional for need in missing):
         _log.warning("skipped: %s", line)
         return

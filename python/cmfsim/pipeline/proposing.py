@@ -113,7 +113,7 @@ def head_surfaces(anatomy: Anatomy) -> tuple[dict[str, SurfaceData], SurfaceData
         if surface is None:
             raise CaseInputError(
                 "finding landmarks needs surfaces, which need scikit-image: install "
-                "'cmfsim[imaging]', or place the landmarks by hand"
+                "'.[imaging]' in cmfsim's folder, or place the landmarks by hand"
             )
         found[name] = surface
     skin = found.pop("skin")

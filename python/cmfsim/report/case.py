@@ -37,7 +37,8 @@ PICTURES: Mapping[str, str] = {
 
 NO_PICTURES = (
     "This report has no pictures because the machine that wrote it could not draw them. "
-    "Pictures need PyVista and OpenGL (pip install 'cmfsim[view]'; Debian: libgl1, libegl1)."
+    "Pictures need PyVista and OpenGL (pip install '.[view]' in cmfsim's folder; Debian: libgl1, "
+    "libegl1)."
 )
 
 

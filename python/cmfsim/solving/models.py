@@ -16,7 +16,7 @@ from cmfsim.solving.skin_tears import tear_finding
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
-from cmfsim.values.motion import decompose_motion
+from cmfsim.values.motion import decompose_motion, plan_digits
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.scene import Scene, SegmentData
@@ -148,6 +148,7 @@ def solved_patient(
         "model": model,
         "case_key": _case_key(patient, scene),
         "plan": {name: _motion(patient, scene, name) for name in scene.plan},
+        "plan_digits": plan_digits({n: _entries(motion) for n, motion in scene.plan.items()}),
         "skin": {
             "mean": float(moved.mean()),
             "p95": float(np.percentile(moved, 95)),
@@ -190,6 +191,13 @@ def _arrays(scene: Scene) -> Iterator[tuple[str, NDArray[Any]]]:
             yield f"moved {name}", motion.moved_vertices
         else:
             yield f"motion of {name}", motion
+
+
+def _entries(motion: NDArray[Any] | MovedSurface) -> NDArray[np.float64]:
+    """The numbers of a motion: a matrix, or how its vertices move."""
+    if isinstance(motion, MovedSurface):
+        return np.asarray(motion.moved_vertices - motion.surface.vertices, dtype=np.float64)
+    return np.asarray(motion, dtype=np.float64)
 
 
 def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:

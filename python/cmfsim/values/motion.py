@@ -1,6 +1,8 @@
 """Bone plans: rigid motions from the numbers that a planner writes down, and back again."""
 
 import math
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +12,10 @@ from cmfsim._core import rigid_matrix
 from cmfsim.errors import BoundaryInputError, CaseInputError
 from cmfsim.values.checks import as_unmasked
 
-__all__ = ["RigidMotion", "decompose_motion", "rigid_matrix", "rigid_motion"]
+__all__ = ["RigidMotion", "decompose_motion", "plan_digits", "rigid_matrix", "rigid_motion"]
+
+# Entries of motions are told apart to a millionth, mm or of a rotation.
+DIGITS = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,3 +214,23 @@ def _sine_cosine(degrees: float) -> tuple[float, float]:
 def _cross_matrix(k: NDArray[np.float64]) -> NDArray[np.float64]:
     """[k]×, for which [k]× v = k × v."""
     return np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
+
+
+def plan_digits(motions: Mapping[str, NDArray[np.float64]]) -> str:
+    """Eight hexadecimal digits that plans of other motions do not share.
+
+    The planning page writes the same digits into the plans that it saves. Segments that stay do
+    not count.
+
+    Parameters
+    ----------
+    motions : mapping of str to (4, 4) float64, mm
+        By segment; or (n, 3), the motion of its vertices.
+    """
+    texts = []
+    for name, motion in motions.items():
+        parts = motion - np.eye(4) if motion.shape == (4, 4) else motion
+        numbers = np.floor(parts.ravel() * DIGITS + 0.5).astype(np.int64)
+        if numbers.any():
+            texts.append(f"{name}:{','.join(map(str, numbers.tolist()))}")
+    return f"{zlib.crc32(chr(10).join(sorted(texts)).encode()):08x}"

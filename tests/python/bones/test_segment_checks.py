@@ -20,7 +20,7 @@ from cmfsim.pipeline.building.motions import PlannedBones
 from cmfsim.surfaces import levels as surfaces
 from head_case import HeadCase
 
-pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
+pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
 quadrics = pytest.importorskip("fast_simplification", reason="needs fast-simplification")
 
 PLAN = {"le_fort_1": {}, "bsso": {}}

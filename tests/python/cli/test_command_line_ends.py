@@ -176,13 +176,13 @@ def test_missing_packages_are_one_line_before_any_work(command, case, monkeypatc
     assert main([command, str(case)]) == 2
     err = capsys.readouterr().err
     assert err.count("pip install") == 1
-    assert "pip install 'cmfsim[imaging,mesh,report]'" in err
+    assert "pip install '.[imaging,mesh,report]' in cmfsim's folder" in err
     for name in missing:
         assert f"{name}: " in err
     assert "checking" not in err
     missing -= {"scipy", "meshio"}
     assert main([command, str(case)]) == 2
-    assert "pip install 'cmfsim[mesh,report]'" in capsys.readouterr().err
+    assert "pip install '.[mesh,report]' in cmfsim's folder" in capsys.readouterr().err
     # Without pictures there is still a report.
     missing -= {"jinja2"}
     monkeypatch.setattr("cmfsim.cli.study_commands.checked", stop)

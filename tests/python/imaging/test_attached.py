@@ -6,7 +6,7 @@ import pytest
 import cmfsim
 from synthetic_head import AIR, SOFT, made_head
 
-pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 pytest.importorskip("scipy.ndimage", reason="needs scipy")
 
 # How far the neck goes on below the made head, mm.

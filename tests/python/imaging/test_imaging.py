@@ -15,7 +15,7 @@ from phantom_reference import check_face, dice, distances, face, parted_as, surf
 from phantom_reference import reference as reference_surfaces
 from synthetic_head import made_head
 
-pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 ndimage = pytest.importorskip("scipy.ndimage", reason="needs scipy")
 measure = pytest.importorskip("skimage.measure", reason="needs scikit-image")
 

@@ -10,7 +10,7 @@ import cmfsim
 import ct_variants as variants
 from synthetic_head import made_head
 
-pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 pytest.importorskip("scipy.ndimage", reason="needs scipy")
 
 from cmfsim.imaging.plates import STEP, find_plates

@@ -17,7 +17,7 @@ from cmfsim.io.images import read_image_file
 from dicom_series import axial, tilted, write_classic_frames, write_enhanced, write_series
 from real_heads import data_folder
 
-pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 SHAPE = (12, 10, 8)
 
 

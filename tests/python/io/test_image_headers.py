@@ -20,7 +20,7 @@ from cmfsim.io.nifti import read_nifti
 from cmfsim.io.nrrd import nrrd_header
 from real_heads import data_folder
 
-sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 SHAPE = (4, 5, 6)
 VALUES = np.arange(120, dtype="<i2").reshape(SHAPE[::-1]).T
 SHEARED = [[1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.6, 6.0], [0.0, 0.0, 2.0, 7.0]]

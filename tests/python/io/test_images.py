@@ -7,7 +7,7 @@ import cmfsim
 from cmfsim import ImageData, ImageError
 from cmfsim.io.images import read_image, read_image_file, write_image
 
-sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 SHAPE = (12, 10, 8)
 SPACING = (0.5, 0.75, 2.0)
 ORIGIN = (-20.0, 7.0, 100.0)

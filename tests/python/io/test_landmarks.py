@@ -47,6 +47,20 @@ def test_both_frames_and_their_numbers_become_lps(frame, sign, tmp_path):
     assert read_landmark_file(path).findings == ()
 
 
+def test_points_of_a_fcsv_that_were_never_placed_are_skipped_with_a_note(tmp_path):
+    """Slicer 5 writes two values more than it names columns: the first is 2 if it is placed."""
+    rows = FCSV.format(frame="LPS").replace("nasion,,", "nasion,,,2,0")
+    rows = rows.replace('"menton, low",,', '"menton, low",,,0,0')
+    found = read_landmark_file(saved(tmp_path, rows, "points.fcsv"))
+    assert list(found.points) == ["nasion"]
+    assert found.unset == ("menton, low",)
+    assert [f.code for f in found.findings] == ["landmark-unset"]
+    # A description that is a number is none.
+    old = FCSV.format(frame="LPS").replace("nasion,,", "nasion,0,0")
+    old = "\n".join(line for line in old.splitlines() if "columns" not in line)
+    assert len(read_landmark_file(saved(tmp_path, old, "points.fcsv")).points) == 2
+
+
 @pytest.mark.parametrize(
     ("units", "length"), [("mm", 1.0), ("m", 1000.0), (["cm", "UCUM", "centimeter"], 10.0)]
 )

@@ -280,9 +280,31 @@ def test_a_segmentation_becomes_closed_outward_surfaces_where_its_voxels_lie(tmp
     assert np.abs(middle - [10.0 - 80.0, -20.0 + 80.0, 30.0 + 90.0]).max() < 1.0
 
 
+@pytest.mark.parametrize("place", range(4))
+def test_layers_are_found_by_the_axis_without_a_direction(tmp_path, place):
+    """NRRD lets a file have them at any of its four axes; 3D Slicer writes them first."""
+    layers = np.zeros((2, 4, 5, 6), np.uint8)
+    layers[0, 1:3, 2:4, 3:5] = 1
+    layers[1, 1:3, 1:5, 1:6] = 1
+    stored = np.moveaxis(layers, 0, place)
+    data = segmentation(stored, stored.shape, more=NAMES)
+    directions = ["(-2,0,0)", "(0,1,0)", "(0,0,3)"]
+    directions.insert(place, "none")
+    kinds = ["domain"] * 3
+    kinds.insert(place, "list")
+    data = data.replace(b"none (-2,0,0) (0,1,0) (0,0,3)", " ".join(directions).encode())
+    data = data.replace(b"list domain domain domain", " ".join(kinds).encode())
+    path = tmp_path / "s.seg.nrrd"
+    path.write_bytes(data)
+    found = read_segmentation(path)
+    assert [found.mask(segment).sum() for segment in found.segments] == [8, 40]
+    assert np.array_equal(found.affine, [[-2, 0, 0, 10], [0, 1, 0, -20], [0, 0, 3, 30]])
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        (lambda data: data.replace(b"list domain domain", b"domain domain list"), "four axes"),
         (lambda data: data[:-40], "cut short|damaged"),
         (lambda data: data.replace(b"unsigned char", b"double"), "labels are needed"),
         (lambda data: data.replace(b"Segment1_Layer:=1", b"Segment1_Layer:=7"), "layers"),

@@ -462,7 +462,7 @@ def test_near_skin_is_a_shell():
 def test_tets_of_tetwild_fill_a_surface(tmp_path, monkeypatch):
     """The optional mesher: volume, orientation, edge."""
     if importlib.util.find_spec("pytetwild") is None:
-        pytest.skip("needs pytetwild: pip install 'cmfsim[tetwild]'")
+        pytest.skip("needs pytetwild: pip install '.[tetwild]'")
     vertices, triangles = head_case.icosphere(2)
     surface = cmfsim.SurfaceData(10.0 * vertices, triangles)
     monkeypatch.chdir(tmp_path)
@@ -478,7 +478,7 @@ def test_tets_of_tetwild_fill_a_surface(tmp_path, monkeypatch):
 def test_without_tetwild_the_package_to_install_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pytetwild", None)
     vertices, triangles = head_case.icosphere(1)
-    with pytest.raises(cmfsim.MeshError, match=r"pip install 'cmfsim\[tetwild\]'"):
+    with pytest.raises(cmfsim.MeshError, match=r"pip install '\.\[tetwild\]'"):
         cmfsim.mesh_with_tetwild(cmfsim.SurfaceData(vertices, triangles))
 
 

@@ -155,5 +155,5 @@ def test_without_pyvista_the_package_to_install_is_named(scene, tmp_path, monkey
 
     monkeypatch.setattr(builtins, "__import__", without)
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(cmfsim.CaseError, match=r"pip install 'cmfsim\[view\]'.*libgl1"):
+    with pytest.raises(cmfsim.CaseError, match=r"pip install '\.\[view\]'.*libgl1"):
         pictures.picture_node_kinds(tmp_path / "kinds.png", nodes, triangles, kinds)

@@ -22,8 +22,8 @@ from cmfsim.pipeline.building import assembly, case_model, tissue_mesh
 from head_case import HeadCase
 from shared_values import drawn_levels
 
-pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
-meshio = pytest.importorskip("meshio", reason="needs meshio (pip install 'cmfsim[mesh]')")
+pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
+meshio = pytest.importorskip("meshio", reason="needs meshio (pip install '.[mesh]')")
 
 EDGE = 7.0
 PICTURES = {"anatomy.png", "node_kinds.png"}
@@ -75,7 +75,7 @@ def from_surfaces(head, truth, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def from_ct(head, tmp_path_factory):
-    pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
+    pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
     return built(phantom_case.ct_case(tmp_path_factory.mktemp("ct"), head))
 
 
@@ -580,7 +580,7 @@ except cmfsim.CaseError as error:
 
 def test_a_crash_of_opengl_is_a_named_error(tmp_path, monkeypatch):
     """VTK ends the process that asks for a window where there is none: only the probe's."""
-    pytest.importorskip("pyvista", reason="needs PyVista (pip install 'cmfsim[view]')")
+    pytest.importorskip("pyvista", reason="needs PyVista (pip install '.[view]')")
     monkeypatch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkXOpenGLRenderWindow")
     monkeypatch.delenv("DISPLAY", raising=False)
     done = subprocess.run(

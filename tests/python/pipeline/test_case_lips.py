@@ -10,7 +10,7 @@ import cmfsim
 import phantom_case
 from cmfsim.meshing.lips import seam_faces
 
-pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
+pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
 
 LIPS = "\n[lips]\ncontact = true\n"
 

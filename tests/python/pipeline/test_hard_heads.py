@@ -14,8 +14,8 @@ from cmfsim.cli import main
 from cmfsim.pipeline.building import case_model
 from real_heads import data_folder
 
-pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
-pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
+pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
 
 CASE = """format = "cmfsim-case"
 version = 1

@@ -127,7 +127,7 @@ def test_a_typed_matrix_without_a_frame_is_a_question(head):
     (head / "notes.txt").write_text("call the patient", encoding="utf-8")
     init_case(head)
     assert "plan.mandible.transform.frame" in refusal(head)
-    assert "notes.txt" not in text_of(head)
+    assert "notes.txt: not used (is no transform" in text_of(head)
 
 
 def test_a_stated_direction_is_kept(head):
@@ -460,7 +460,7 @@ def test_a_series_in_parts_beside_another_is_named_by_its_uid(tmp_path):
         ("RamusR", "ramus_right"),
         ("Genioplasty", "chin"),
         ("lowerJaw", "mandible"),
-        ("Lower teeth", "other"),
+        ("Lower teeth", "lower teeth"),
         ("softTissue", "skin"),
         ("Segment_7", ""),
         ("ramus", ""),

@@ -16,7 +16,7 @@ from cmfsim.pipeline.building.refinement import (
 from shared_values import drawn_levels
 
 # Hollows are told from tissue with scipy.
-pytest.importorskip("scipy", reason="needs scipy (pip install 'cmfsim[imaging]')")
+pytest.importorskip("scipy", reason="needs scipy (pip install '.[imaging]')")
 
 SPACING = (2.0, 1.0, 1.5)
 # The skin's front, the jaws' front, and their edges: a bite 8 mm open behind 10 mm of lip, mm.

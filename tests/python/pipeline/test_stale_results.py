@@ -14,7 +14,9 @@ import cmfsim
 import cmfsim.pipeline.building
 import cmfsim.pipeline.predicting
 from cmfsim.cli import main
+from cmfsim.cli.study_commands import _plan_text
 from cmfsim.io import finish_writing, read_parts
+from cmfsim.io.meshes import read_mesh
 from cmfsim.io.metrics import read_evaluation
 from cmfsim.io.predictions import predictions_of, read_prediction
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
@@ -369,15 +371,33 @@ def test_what_a_stopped_run_left_is_finished_before_it_is_read(tmp_path, predict
     assert read_parts(tmp_path)["skin"]
 
 
+def test_a_name_means_one_face_whatever_its_ending(tmp_path, prediction):
+    """`face` is the face after the operation; `face_before` and the displacement lead there."""
+    cmfsim.write_prediction(tmp_path, prediction)
+    after = np.asarray(prediction.face.vertices)
+    vtp = read_mesh(tmp_path / "face.vtp")
+    before = read_mesh(tmp_path / "face_before.vtp")
+    assert np.abs(vtp.points - after).max() < 1e-9
+    assert np.abs(before.points + before.point_data["displacement"] - after).max() < 1e-9
+    assert np.abs(before.points - np.asarray(prediction.face_before.vertices)).max() < 1e-9
+    stl = np.asarray(cmfsim.read_surface(tmp_path / "face.stl").vertices)
+    assert np.abs(np.ptp(stl, axis=0) - np.ptp(after, axis=0)).max() < 1e-3
+    assert np.abs(stl.min(axis=0) - after.min(axis=0)).max() < 1e-3
+    digits = prediction.summary["plan_digits"]
+    assert read_prediction(tmp_path)["plan_digits"] == digits
+    assert f"plan: {digits} (digits of its motions" in _plan_text(read_prediction(tmp_path))
+
+
 def test_files_of_two_runs_are_told_apart_by_their_content(tmp_path, prediction, replanned):
     """However they came together: each summary knows its files."""
     cmfsim.write_prediction(tmp_path / "a", prediction)
     cmfsim.write_prediction(tmp_path / "b", replanned)
-    (tmp_path / "a" / "face.vtp").replace(tmp_path / "b" / "face.vtp")
-    with pytest.raises(cmfsim.CaseError, match=r"face.vtp: is not the file"):
+    name = "face_before.vtp"
+    (tmp_path / "a" / name).replace(tmp_path / "b" / name)
+    with pytest.raises(cmfsim.CaseError, match=rf"{name}: is not the file"):
         read_parts(tmp_path / "b")
-    (tmp_path / "b" / "face.vtp").unlink()
-    with pytest.raises(FileNotFoundError, match=r"face.vtp"):
+    (tmp_path / "b" / name).unlink()
+    with pytest.raises(FileNotFoundError, match=name):
         read_parts(tmp_path / "b")
 
 

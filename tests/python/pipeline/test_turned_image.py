@@ -7,8 +7,8 @@ import cmfsim
 from cmfsim.cli import main
 from phantom_case import HEAD, IMAGE, write_case
 
-pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install 'cmfsim[imaging]')")
-pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
+pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
 
 # Without landmarks, as a scan comes: those given for the head would lie beside its bone.
 PLAN = """

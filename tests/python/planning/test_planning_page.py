@@ -29,6 +29,7 @@ from cmfsim.planning.page.page import joined_scripts
 from cmfsim.planning.replanning import plan_distance
 from cmfsim.planning.replanning.expected_error import plan_near
 from cmfsim.planning.server import PlanningServer, open_port
+from cmfsim.values.motion import plan_digits
 
 pytest.importorskip("skimage")
 pytest.importorskip("meshio")
@@ -485,13 +486,30 @@ def test_undo_and_redo_give_the_very_plans_back(opened, planning):
 def test_what_is_no_number_or_beyond_the_limits_is_refused(opened, planning):
     before = motions_of(opened, planning)
     field = opened.locator("#number-forwards")
-    for typed, said in (("", "Type a number"), ("31", "at most 30 mm"), ("-1e9", "at most 30 mm")):
+    for typed, said in (
+        ("", "Type a number"),
+        ("2,5,", "Type a number"),
+        ("31", "at most 30 mm"),
+        ("-1e9", "at most 30 mm"),
+    ):
         field.fill(typed)
         field.press("Enter")
         assert said in opened.locator("#message").inner_text()
         until(opened, "document.getElementById('number-forwards').value === '-3.50'")
     after = motions_of(opened, planning)
     assert all(np.array_equal(before[n], m) for n, m in after.items())
+
+
+def test_a_decimal_comma_is_a_point(opened):
+    """A browser drops it from a field of numbers: 2,5 was 25."""
+    field = opened.locator("#number-forwards")
+    field.click()
+    field.fill("")
+    opened.keyboard.type("2,5")
+    opened.keyboard.press("Enter")
+    until(opened, "document.getElementById('number-forwards').value === '2.50'")
+    opened.keyboard.press("ArrowUp")
+    until(opened, "document.getElementById('number-forwards').value === '2.60'")
 
 
 def test_a_turn_leaves_the_chosen_centre_in_place(opened, planning):
@@ -538,7 +556,9 @@ def test_a_saved_plan_is_what_predict_reads(opened, planning, folder, tmp_path):
     for name, motion in case.plan.items():
         np.testing.assert_allclose(motion.matrix, plan[name], atol=1e-12)
     command = opened.locator("#command").inner_text()
-    assert command == "cmfsim predict case.toml --plan demo-A.toml --model H+S"
+    digits = plan_digits(plan)
+    assert command == f"cmfsim predict case.toml --plan demo-A-{digits}.toml --model H+S"
+    assert f'"A" ({digits}) of the case' in file.read_text("utf-8")
     # Loaded again, it is a variant of its own with the same motions.
     opened.locator("#plan-file").set_input_files(file)
     until(opened, "cmfsimPage.plans.now.variants.length === 2")
@@ -588,7 +608,8 @@ def test_a_saved_transform_is_the_motion(opened, planning, tmp_path, direction):
     type_number(opened, "yaw", 4)
     opened.locator("#direction").select_option(direction)
     download = saved(opened, "#save-transform")
-    assert download.suggested_filename == f"demo-A-mandible_body.{direction}.tfm"
+    digits = plan_digits(motions_of(opened, planning))
+    assert download.suggested_filename == f"demo-A-{digits}-mandible_body.{direction}.tfm"
     file = tmp_path / download.suggested_filename
     download.save_as(file)
     motion = cmfsim.read_transform(file, direction=direction)

@@ -9,7 +9,7 @@ import cmfsim
 import contact_plans
 from shared_values import phantom_model
 
-pytest.importorskip("skimage", reason="needs scikit-image (pip install 'cmfsim[imaging]')")
+pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
 
 REACH = (6.0, 6.0)
 

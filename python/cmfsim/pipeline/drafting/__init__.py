@@ -10,16 +10,16 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing
 from cmfsim.pipeline.drafting.case_lines import Taken
 from cmfsim.pipeline.drafting.draft import CaseDraft, draft_case
-from cmfsim.pipeline.drafting.finds import EXTRACTED
+from cmfsim.pipeline.drafting.finds import CASE_FILE, EXTRACTED
 from cmfsim.pipeline.drafting.gathering import gather
+from cmfsim.pipeline.drafting.written import check_written
 
 __all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case"]
 
-CASE_FILE = "case.toml"
 SCENES = (".mrml", ".mrb")
 
 
@@ -50,7 +50,8 @@ def init_case(
         The path does not exist.
     CaseError
         (also `ValueError`) A case file exists already; the folder has no usable files; several
-        scenes; a scene that is damaged, or whose transforms are not rigid.
+        scenes; a scene that is damaged, or whose transforms are not rigid. Not `ValueError`: the
+        case that was written reads as something else than was found; it is removed again.
 
     Examples
     --------
@@ -77,9 +78,26 @@ def init_case(
         (folder / EXTRACTED).mkdir(exist_ok=True)
     for name, write in draft.files.items():
         write(folder / name)
-    with replacing(case_file) as file:
-        file.write(draft.text.encode())
+    before = case_file.read_bytes() if case_file.exists() else None
+    _write(case_file, draft.text.encode())
+    progress("reading the case back")
+    try:
+        check_written(case_file, draft.shown, is_open=bool(draft.questions))
+    except CaseInputError:
+        # It is the case's owner who has to correct it.
+        raise
+    except CmfsimError:
+        if before is None:
+            case_file.unlink()
+        else:
+            _write(case_file, before)
+        raise
     return draft
+
+
+def _write(path: Path, data: bytes) -> None:
+    with replacing(path) as file:
+        file.write(data)
 
 
 def _drafted(

@@ -4,6 +4,7 @@ import os
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 __all__ = ["Taken", "Text", "clean", "legible", "quoted"]
 
@@ -26,6 +27,8 @@ class Taken:
         If they apply.
     question : bool
         Whether a person has to decide something about it.
+    paths : tuple of Path
+        The files that it is about, where its label does not name each.
     """
 
     label: str
@@ -34,6 +37,7 @@ class Taken:
     unit: str = ""
     frame: str = ""
     question: bool = False
+    paths: tuple[Path, ...] = ()
 
     def as_dict(self) -> dict[str, object]:
         """Plain values, ready for JSON."""
@@ -44,6 +48,7 @@ class Taken:
             "frame": self.frame,
             "why": self.why,
             "question": self.question,
+            **({"files": [path.name for path in self.paths]} if self.paths else {}),
         }
 
 

@@ -12,6 +12,8 @@ from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
 __all__ = ["Images", "Marks", "choose_images", "choose_landmarks"]
 
+# LPS to RAS, and back.
+TURN = np.array([-1.0, -1.0, 1.0])
 # A CT in HU has air, some -1000 HU.
 AIR = -500.0
 # What stored values are when an offset of 1024 was added to HU.
@@ -87,9 +89,6 @@ def _no_ct(find: ImageFind) -> str:
         return f"cannot be read: {find.error}"
     if find.modality not in {"", "CT"}:
         return f"its header says {find.modality}, which is not a CT"
-    low, high = find.values
-    if low >= 0.0 and high <= 20.0:
-        return f"its values are {low:g} to {high:g}: labels, not a CT"
     return ""
 
 
@@ -142,7 +141,13 @@ class Marks:
     @property
     def points(self) -> Mapping[str, Floats]:
         """The skull landmarks, LPS mm, as they are placed in their file."""
-        return {} if self.skull is None else self.skull.read.points
+        return {} if self.skull is None else self.placed(self.skull)
+
+    def placed(self, find: LandmarkFind) -> Mapping[str, Floats]:
+        """The landmarks of a file in LPS mm, in the frame that was found for it."""
+        if find.read.stated or self.frame in {None, find.read.frame}:
+            return find.read.points
+        return {label: point * TURN for label, point in find.read.points.items()}
 
 
 def choose_landmarks(found: Sequence[LandmarkFind], box: Floats | None) -> Marks:
@@ -202,6 +207,11 @@ def _taken(find: LandmarkFind, kind: str) -> Taken:
     why = f"{count} of its {len(find.read.points)} labels are those of {kind} landmarks"
     if kind == "after":
         why = f"skin landmarks, and its name says it is from after the operation ({count} labels)"
+    others = [label for label in find.read.points if label not in known]
+    if others:
+        why += f"; not used: {', '.join(others)}"
+    if find.read.unset:
+        why += f"; never placed: {', '.join(find.read.unset)}"
     frame = find.read.frame if find.read.stated else ""
     name = "skin landmarks after the operation" if kind == "after" else f"{kind} landmarks"
     return Taken(
@@ -221,9 +231,12 @@ def _choose_frame(marks: Marks, box: Floats | None) -> None:
     names = ", ".join(find.label for find in silent)
     fits: dict[str, bool] = {}
     for frame in ("LPS", "RAS"):
-        points = np.concatenate([np.array(list(find.read.points.values())) for find in silent])
-        turned = points if frame == silent[0].read.frame else points * [-1.0, -1.0, 1.0]
-        middle = turned.mean(axis=0)
+        # Formats differ in what they mean where they state nothing.
+        points = [
+            np.array(list(find.read.points.values())) * (1.0 if frame == find.read.frame else TURN)
+            for find in silent
+        ]
+        middle = np.concatenate(points).mean(axis=0)
         fits[frame] = box is not None and bool(((middle >= box[0]) & (middle <= box[1])).all())
     if fits["LPS"] != fits["RAS"]:
         marks.frame = "LPS" if fits["LPS"] else "RAS"

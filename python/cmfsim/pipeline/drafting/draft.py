@@ -7,29 +7,38 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.errors import CaseInputError
-from cmfsim.io.landmarks import write_landmarks
-from cmfsim.io.surfaces import write_surface
 from cmfsim.pipeline.drafting.case_lines import Taken, Text, legible, quoted
-from cmfsim.pipeline.drafting.choices import Images, Marks, choose_images, choose_landmarks
-from cmfsim.pipeline.drafting.finds import EXTRACTED, LandmarkFind, SurfaceFind
+from cmfsim.pipeline.drafting.choices import choose_images, choose_landmarks
+from cmfsim.pipeline.drafting.finds import ImageFind, LandmarkFind
 from cmfsim.pipeline.drafting.gathering import Gathered
 from cmfsim.pipeline.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
-from cmfsim.pipeline.drafting.roles import MOVING, safe_key
-from cmfsim.pipeline.drafting.surfaces import Anatomy, Question, choose_surfaces
+from cmfsim.pipeline.drafting.roles import MOVING
+from cmfsim.pipeline.drafting.surfaces import Anatomy, choose_surfaces
+from cmfsim.pipeline.drafting.written import (
+    SAME,
+    Draft,
+    Shown,
+    choices_of,
+    image_path,
+    landmark_path,
+    place_after,
+    place_before,
+    surface_path,
+    unaccounted,
+)
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats
-from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["CaseDraft", "draft_case"]
 
-SAME = 1e-9
 # Middles of the skins before and after that are farther apart are those of two scans, mm.
 APART = 20.0
-EXAMPLE = """# No plan was found. To move a segment, state how it moves, such as:
-# [plan.maxilla]
-# translation = [0, -5, 0]          # mm, LPS: -y is forwards
-# transform = {file = "maxilla.h5", direction = "from-parent"}   # saved by 3D Slicer"""
+# Questions about what there is after the operation.
+AFTER = "postoperative."
+CUT = ("[[osteotomies]]", 'procedure = "le_fort_1"', "")
+EXAMPLE = """[plan.{name}]
+translation = [0, -5, 0]  # mm, LPS: -y is forwards
+# or, as 3D Slicer saves it: transform = {{file = "{name}.h5", direction = "from-parent"}}"""
 
 
 @dataclass
@@ -46,12 +55,15 @@ class CaseDraft:
         What a person has to decide before the case can be used.
     files : dict of str to callable
         Functions that write further files, by path; each is called with the path.
+    shown : Shown
+        Where everything lies, and how it moves, as it was reported.
     """
 
     text: str = ""
     taken: list[Taken] = field(default_factory=list)
     questions: list[str] = field(default_factory=list)
     files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
+    shown: Shown = field(default_factory=Shown)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -60,22 +72,6 @@ class CaseDraft:
             "questions": self.questions,
             "written": sorted(self.files),
         }
-
-
-@dataclass
-class _Draft:
-    """What a case is made of, and the text that is made of it."""
-
-    found: Gathered
-    unpacked: Path
-    images: Images
-    anatomy: Anatomy
-    marks: Marks
-    plan: Plan
-    reference: Floats
-    by_image: bool
-    text: Text = field(default_factory=Text)
-    files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
 
 
 def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
@@ -120,14 +116,31 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
     _write_after(draft)
     text.table("output")
     text.value("folder", '"out"')
-    return CaseDraft(str(text), taken, text.questions, draft.files)
+    for segment, motion in draft.plan.motions.items():
+        if motion.shown is not None and not motion.question:
+            draft.shown.motions[segment] = motion.shown
+    return CaseDraft(str(text), taken, text.questions, draft.files, draft.shown)
 
 
-def _has_after(draft: _Draft) -> bool:
-    return bool(draft.anatomy.after_bones) or draft.images.after is not None
+def _has_after(draft: Draft) -> bool:
+    """Whether there are bones after the operation, on which the plan can be measured."""
+    return bool(draft.anatomy.after_bones) or _uses_image_after(draft)
 
 
-def _decide(found: Gathered, unpacked: Path) -> _Draft:
+def _uses_image_after(draft: Draft) -> bool:
+    """Whether the face after the operation is that of a CT: there is no surface of it."""
+    anatomy = draft.anatomy
+    surfaces = anatomy.after or any(q.key.startswith(AFTER) for q in anatomy.questions)
+    return draft.images.after is not None and not surfaces
+
+
+def _has_any_after(draft: Draft) -> bool:
+    """Whether there is anything after the operation."""
+    asked = any(question.key.startswith(AFTER) for question in draft.anatomy.questions)
+    return bool(draft.anatomy.after) or asked or draft.images.after is not None
+
+
+def _decide(found: Gathered, unpacked: Path) -> Draft:
     images = choose_images(found.images)
     boxes = [(i.label, i.box) for i in (images.ct,) if i is not None and i.box is not None]
     boxes += [
@@ -152,7 +165,7 @@ def _decide(found: Gathered, unpacked: Path) -> _Draft:
     if found.scene:
         scene_motions(plan, anatomy.bones, found.loose, reference, in_image=by_image)
     file_motions(plan, found.transforms, by_slicer=found.by_slicer)
-    return _Draft(found, unpacked, images, anatomy, marks, plan, reference, by_image)
+    return Draft(found, unpacked, images, anatomy, marks, plan, reference, by_image)
 
 
 def _is_cut(anatomy: Anatomy) -> bool:
@@ -168,7 +181,7 @@ def _box_of(anatomy: Anatomy) -> Floats | None:
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-def _taken(draft: _Draft) -> list[Taken]:
+def _taken(draft: Draft) -> list[Taken]:
     """What each file was taken for, those that the case does not use included."""
     surfaces = draft.anatomy.taken
     if draft.by_image:
@@ -180,11 +193,33 @@ def _taken(draft: _Draft) -> list[Taken]:
             else t
             for t in draft.images.taken
         ]
-    others = [Taken(o.label, "not used", o.why) for o in (*draft.found.others, *draft.plan.others)]
-    return [*draft.images.taken, *surfaces, *draft.marks.taken, *draft.plan.taken, *others]
+    images, marks = draft.images.taken, draft.marks.taken
+    if draft.images.after is not None and not _uses_image_after(draft):
+        images = _without(images, draft.images.after, "surfaces after the operation are there")
+    if draft.marks.after is not None and not _has_any_after(draft):
+        marks = _without(marks, draft.marks.after, "there is no face after the operation")
+    others = [
+        Taken(o.label, "not used", o.why, paths=o.paths)
+        for o in (*draft.found.others, *draft.plan.others)
+        if not o.paths or not set(o.paths) <= set(draft.found.names)
+    ]
+    others += [
+        Taken(draft.found.shown(path), "names of labels", "nnU-Net writes them next to its labels")
+        for path in draft.found.names
+    ]
+    taken = [*images, *surfaces, *marks, *draft.plan.taken, *others]
+    return [*taken, *unaccounted(draft.found, draft.plan, taken)]
 
 
-def _beside_image(draft: _Draft, taken: Taken) -> Taken:
+def _without(taken: list[Taken], find: ImageFind | LandmarkFind, why: str) -> list[Taken]:
+    """The entries with that of a file as not used."""
+    return [
+        replace(t, taken_for="not used", why=f"{why}; {t.why}") if t.label == find.label else t
+        for t in taken
+    ]
+
+
+def _beside_image(draft: Draft, taken: Taken) -> Taken:
     if "after the operation" in taken.taken_for or taken.taken_for == "not used":
         return taken
     kept = f"would be the {taken.taken_for}" if taken.taken_for else "not clear what it is"
@@ -193,7 +228,7 @@ def _beside_image(draft: _Draft, taken: Taken) -> Taken:
     return replace(taken, taken_for="not used", why=why, question=False)
 
 
-def _write_head(draft: _Draft) -> None:
+def _write_head(draft: Draft) -> None:
     if draft.by_image:
         _write_image(draft)
         if draft.anatomy.skin is not None and draft.anatomy.bones:
@@ -204,7 +239,7 @@ def _write_head(draft: _Draft) -> None:
     _write_surfaces(draft)
 
 
-def _write_image(draft: _Draft) -> None:
+def _write_image(draft: Draft) -> None:
     text, images = draft.text, draft.images
     text.table("image")
     if images.question is not None:
@@ -212,7 +247,7 @@ def _write_image(draft: _Draft) -> None:
     elif images.ct is not None:
         low, high = images.ct.values
         why = f"{images.ct.words}, {low:g} to {high:g}"
-        text.value("file", quoted(_image_path(draft)), why)
+        text.value("file", quoted(image_path(draft, images.ct)), why)
         if images.ct.series is not None:
             text.value("series", quoted(images.ct.series), "the folder holds others as well")
         if not np.allclose(images.ct.to_world, np.eye(4), rtol=0.0, atol=SAME):
@@ -223,94 +258,41 @@ def _write_image(draft: _Draft) -> None:
         text.ask("rescale", *images.rescale)
 
 
-def _image_path(draft: _Draft) -> str:
-    """The path of the CT; that of a bundle is copied next to the case."""
-    image = draft.images.ct
-    if image is None:  # asked before
-        raise AssertionError
-    if not image.path.is_relative_to(draft.unpacked):
-        return "." if image.path == draft.found.folder else draft.found.shown(image.path)
-    name = f"{EXTRACTED}/{safe_key(image.path.name.partition('.')[0])}"
-    name += "".join(image.path.suffixes[-2:]) if image.path.suffix == ".gz" else image.path.suffix
-    data = image.path.read_bytes()
-    draft.files[name] = lambda path: _keep(path, data)
-    return name
-
-
-def _keep(path: Path, data: bytes) -> None:
-    path.write_bytes(data)
-
-
-def _write_surfaces(draft: _Draft, lead: str = "") -> None:
+def _write_surfaces(draft: Draft, lead: str = "") -> None:
     text, anatomy = Text(), draft.anatomy
+    place = place_before(draft)
     text.table("surfaces")
     if (asked := anatomy.asks("skin")) is not None:
-        text.ask("skin", asked.text, _choices(draft, asked))
+        text.ask("skin", asked.text, choices_of(draft, asked, place))
     elif anatomy.skin is not None:
-        text.value("skin", quoted(_surface_path(draft, anatomy.skin, "skin")))
+        text.value("skin", quoted(surface_path(draft, anatomy.skin, "skin", place)))
     else:
         text.ask("skin", "no surface that was found is a skin: which file is it?", ())
     if (asked := anatomy.asks("units")) is not None:
-        text.ask("units", asked.text, _choices(draft, asked))
+        text.ask("units", asked.text, choices_of(draft, asked, place))
     else:
         text.value("units", '"mm"', anatomy.units_why)
     if (asked := anatomy.asks("frame")) is not None:
-        text.ask("frame", asked.text, _choices(draft, asked))
-    elif anatomy.frame is not None:
-        text.value("frame", quoted(anatomy.frame), anatomy.frame_why)
+        text.ask("frame", asked.text, choices_of(draft, asked, place))
+    elif place.frame is not None:
+        text.value("frame", quoted(place.frame), anatomy.frame_why)
     elif anatomy.frame_why:
         text.comment(f"frame: {anatomy.frame_why}")
     text.table("surfaces.bones")
     for name, find in anatomy.bones.items():
-        text.value(name, quoted(_surface_path(draft, find, name)))
+        text.value(name, quoted(surface_path(draft, find, name, place)))
     for question in anatomy.questions:
         part, _, name = question.key.partition(".")
         if part == "bones":
-            text.ask(name, question.text, _choices(draft, question))
+            text.ask(name, question.text, choices_of(draft, question, place))
+    if not anatomy.bones and not any(q.key.startswith("bones.") for q in anatomy.questions):
+        text.ask("cranium", "no surface that was found is a bone: which file is it?", ())
     draft.text.lines += [f"{lead}{line}".rstrip() for line in text.lines]
     if not lead:
         draft.text.questions += text.questions
 
 
-def _choices(draft: _Draft, question: Question) -> list[str]:
-    """What may be written for a question; a surface of a scene gets a file, so that it can be."""
-    return [
-        words if find is None else f"{quoted(_candidate_path(draft, find))}: {words}"
-        for find, words in question.choices
-    ]
-
-
-def _candidate_path(draft: _Draft, find: SurfaceFind) -> str:
-    name = safe_key(find.label.rpartition(": ")[2].rpartition(" / ")[2])
-    taken = {path for path in draft.files if path.startswith(f"{EXTRACTED}/{name}")}
-    return _surface_path(draft, find, f"{name}_{len(taken) + 1}" if taken else name)
-
-
-def _has_copy(draft: _Draft, find: SurfaceFind) -> bool:
-    """Whether a surface needs a copy: its file is packed, holds voxels, or is elsewhere."""
-    moved = not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
-    return (find.in_scene and (moved or find.path.is_relative_to(draft.unpacked))) or find.is_made
-
-
-def _surface_path(draft: _Draft, find: SurfaceFind, name: str) -> str:
-    """The path of a surface in the case; where it lies before the operation, in LPS mm."""
-    if not _has_copy(draft, find):
-        return draft.found.shown(find.path)
-    reference = draft.reference if find.in_scene and not draft.by_image else np.eye(4)
-    if draft.anatomy.asks("units") is not None:
-        raise CaseInputError(
-            f"{find.label} is {find.extent.max():.4g} long: a scene of 3D Slicer is in mm, so its "
-            "transforms do not fit this surface: scale it to mm, and save the scene again"
-        )
-    vertices = draft.anatomy.placed(find) @ reference[:3, :3].T + reference[:3, 3]
-    surface = SurfaceData(vertices, find.surface.triangles)
-    path = f"{EXTRACTED}/{name}.ply"
-    if not draft.by_image:
-        draft.files[path] = lambda target: write_surface(target, surface)
-    return path
-
-
-def _write_landmarks(draft: _Draft) -> None:
+def _write_landmarks(draft: Draft) -> None:
     text, marks = draft.text, draft.marks
     if not marks.skull and not marks.skin and not marks.questions:
         text.table("landmarks", "there is no file of landmarks")
@@ -332,7 +314,7 @@ def _write_landmarks(draft: _Draft) -> None:
         elif find is not None:
             frame = f"{find.read.frame}, stated" if find.read.stated else "frame not stated"
             why = f"{len(find.read.points)} points, {frame}"
-            text.value(key, quoted(_landmark_path(draft, find, key)), why)
+            text.value(key, quoted(landmark_path(draft, find, key)), why)
     if "frame" in marks.questions:
         text.ask("frame", *marks.questions["frame"])
     elif marks.frame is not None:
@@ -341,28 +323,12 @@ def _write_landmarks(draft: _Draft) -> None:
         )
 
 
-def _shows_skull(draft: _Draft) -> bool:
+def _shows_skull(draft: Draft) -> bool:
     """Whether landmarks of the skull can be found: by a CT, or a cranium as a surface."""
     return draft.by_image or "cranium" in draft.anatomy.bones
 
 
-def _landmark_path(draft: _Draft, find: LandmarkFind, key: str) -> str:
-    """The path of landmarks in the case; where they lie before the operation."""
-    # A list under a segment's transform went with the segment; before, it lay with the head.
-    apart = find.in_scene and not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
-    if not apart and not find.path.is_relative_to(draft.unpacked):
-        return draft.found.shown(find.path)
-    reference = draft.reference if find.in_scene and not draft.by_image else np.eye(4)
-    points = {
-        label: reference[:3, :3] @ point + reference[:3, 3]
-        for label, point in find.read.points.items()
-    }
-    name = f"{EXTRACTED}/{key}.mrk.json"
-    draft.files[name] = lambda path: write_landmarks(path, points)
-    return name
-
-
-def _write_plan(draft: _Draft) -> None:
+def _write_plan(draft: Draft) -> None:
     text, plan = draft.text, draft.plan
     bones = set(draft.anatomy.bones) if not draft.by_image else {"cranium", "mandible"}
     asked = {q.key.partition(".")[2] for q in draft.anatomy.questions if not draft.by_image}
@@ -379,9 +345,18 @@ def _write_plan(draft: _Draft) -> None:
         if draft.found.scene:
             text.comment("It cuts by landmarks, not where the scene's pieces were cut.")
     if not plan.motions:
-        text.lines += ["", *EXAMPLE.splitlines()]
+        _propose_plan(text, bones)
     for name, motion in plan.motions.items():
         _write_motion(text, name, motion)
+
+
+def _propose_plan(text: Text, bones: set[str]) -> None:
+    """Adds a plan as a comment: of a piece that is there, or of one that a procedure cuts."""
+    # A whole mandible does not leave its joints: it is cut first.
+    pieces = [name for name in MOVING if name in bones - {"mandible"}]
+    lines = EXAMPLE.format(name=pieces[0] if pieces else "maxilla").splitlines()
+    text.lines += ["", "# No plan was found. To move a segment, state how it moves, such as:"]
+    text.lines += [f"# {line}".rstrip() for line in (*(() if pieces else CUT), *lines)]
 
 
 def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
@@ -400,7 +375,7 @@ def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
         text.value("transform", motion.transform)
 
 
-def _write_muscles(draft: _Draft) -> None:
+def _write_muscles(draft: Draft) -> None:
     text = draft.text
     given = draft.marks.skin is not None or draft.marks.questions
     if draft.marks.skull is None and (given or not _shows_skull(draft)):
@@ -411,53 +386,69 @@ def _write_muscles(draft: _Draft) -> None:
     text.table("muscles", "the built-in template, placed by the skull landmarks")
 
 
-def _write_place_after(draft: _Draft) -> None:
-    """Unit and frame of surfaces after the operation, and whether they lie where the head was."""
+def _write_place_after(draft: Draft) -> str | None:
+    """Unit and frame of surfaces after the operation, and whether they lie where the head was.
+
+    Returns the frame of the files that state none, as far as it is known.
+    """
     text, anatomy = draft.text, draft.anatomy
     silent = [find for find in anatomy.after if find.stated is None]
     if (asked := anatomy.asks("units")) is not None and anatomy.after:
-        text.ask("units", asked.text, _choices(draft, asked))
+        text.ask("units", asked.text, [words for _, words in asked.choices])
     frame = anatomy.frame
     if silent and (asked := anatomy.asks("frame")) is not None:
-        text.ask("frame", asked.text, _choices(draft, asked))
+        text.ask("frame", asked.text, [words for _, words in asked.choices])
     elif silent and _distance_after(draft, frame or "LPS") >= APART:
         other = "LPS" if frame == "RAS" else "RAS"
         frame = other if _distance_after(draft, other) < APART else frame
-    if silent and anatomy.asks("frame") is None and frame is not None:
-        text.value("frame", quoted(frame), "so that they are where the skin was before")
+    stated = place_after(draft, frame).frame
+    if anatomy.after and anatomy.asks("frame") is None and stated is not None:
+        text.value("frame", quoted(stated), "so that they are where the skin was before")
     away = _distance_after(draft, frame or "LPS")
     if not np.isfinite(away):
         text.value("aligned", "true", "it is where the head was before; if not, write false")
-        return
+        return frame
     why = f"the middles of the skins before and after are {away:.0f} mm apart"
     text.value("aligned", "true" if away < APART else "false", why)
+    return frame
 
 
-def _distance_after(draft: _Draft, frame: str) -> float:
+def _distance_after(draft: Draft, frame: str) -> float:
     """How far the middles of the skins before and after are apart, mm; infinite if not known."""
     anatomy = draft.anatomy
     if anatomy.skin is None or anatomy.after_skin is None or anatomy.asks("units") is not None:
         return float("inf")
-    before = anatomy.placed(anatomy.skin)
-    after = replace(anatomy, frame=frame).placed(anatomy.after_skin)
+    here, there = place_before(draft).matrix(anatomy.skin), place_after(draft, frame).matrix
+    before = anatomy.placed(anatomy.skin) @ here[:3, :3].T + here[:3, 3]
+    matrix = there(anatomy.after_skin)
+    placed = replace(anatomy, frame=frame).placed(anatomy.after_skin)
+    after = placed @ matrix[:3, :3].T + matrix[:3, 3]
     middles = [0.5 * (points.min(axis=0) + points.max(axis=0)) for points in (before, after)]
     return float(np.linalg.norm(middles[1] - middles[0]))
 
 
-def _write_after(draft: _Draft) -> None:
+def _write_after(draft: Draft) -> None:
     text, anatomy, images = draft.text, draft.anatomy, draft.images
-    if anatomy.after_skin is None and not anatomy.after_bones and images.after is None:
+    if not _has_any_after(draft):
         return
     text.table("postoperative", "after the operation, by the names of the files")
-    if images.after is not None and anatomy.after_skin is None:
-        text.value("image", quoted(draft.found.shown(images.after.path)))
-    elif anatomy.after_skin is not None:
-        text.value("skin", quoted(draft.found.shown(anatomy.after_skin.path)))
     if draft.marks.after is not None:
-        text.value("landmarks", quoted(draft.found.shown(draft.marks.after.path)))
-    _write_place_after(draft)
-    if anatomy.after_bones and (images.after is None or anatomy.after_skin is not None):
+        marks = draft.marks.after
+        text.value("landmarks", quoted(landmark_path(draft, marks, "landmarks_after")))
+    if images.after is not None and _uses_image_after(draft):
+        text.value("image", quoted(image_path(draft, images.after)))
+        _write_place_after(draft)
+        return
+    place = place_after(draft, _write_place_after(draft))
+    skin, asked = anatomy.after_skin, anatomy.asks(f"{AFTER}skin")
+    if asked is not None:
+        text.ask("skin", asked.text, choices_of(draft, asked, place))
+    elif skin is not None:
+        text.value("skin", quoted(surface_path(draft, skin, "skin_after", place)))
+    questions = [q for q in anatomy.questions if q.key.startswith(f"{AFTER}bones.")]
+    if anatomy.after_bones or questions:
         text.table("postoperative.bones")
-        for name, find in anatomy.after_bones.items():
-            if name in ("cranium", *MOVING):
-                text.value(name, quoted(draft.found.shown(find.path)))
+    for name, find in anatomy.after_bones.items():
+        text.value(name, quoted(surface_path(draft, find, f"{name}place_after", place)))
+    for question in questions:
+        text.ask(question.key.rpartition(".")[2], question.text, choices_of(draft, question, place))

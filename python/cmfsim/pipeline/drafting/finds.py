@@ -11,6 +11,7 @@ from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.dicom import dicom_places
 from cmfsim.io.images import read_image_file
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file
+from cmfsim.io.segmentations import NAMES_FILE, are_labels, read_labels
 from cmfsim.io.stated_frames import is_own_file
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.pipeline.drafting.roles import NameRole, name_role
@@ -20,6 +21,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
+    "CASE_FILE",
     "EXTRACTED",
     "ImageFind",
     "LandmarkFind",
@@ -38,8 +40,27 @@ MAX_DEPTH, MAX_FILES = 6, 20_000
 SURFACES = (".stl", ".ply", ".obj", ".vtp", ".vtk")
 IMAGES = (".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd")
 TRANSFORMS = (".tfm", ".h5", ".txt", ".mat")
+LABELS = (".seg.nrrd", ".seg.nhdr")
 MARKUPS = (".mrk.json", ".fcsv")
 SCENES = (".mrml", ".mrb")
+# Endings that files beside DICOM slices have, and no slice.
+NO_SLICES = (
+    ".txt",
+    ".jpg",
+    ".jpeg",
+    ".png",
+    ".pdf",
+    ".json",
+    ".xml",
+    ".html",
+    ".csv",
+    ".zip",
+    ".toml",
+)
+# Names of an entry that stands for several files.
+SHOWN = 3
+# The case file that is written.
+CASE_FILE = "case.toml"
 # Where what is made from a scene is put, below the folder of the case.
 EXTRACTED = "from_scene"
 # Files by which a folder is known as one that cmfsim wrote.
@@ -66,6 +87,8 @@ class SurfaceFind:
     surface : SurfaceData
     stated : str or None
         The frame that its header, or its scene, states.
+    is_silent : bool
+        Whether the file itself states none: its scene does, or nothing.
     is_closed : bool
     to_world : (4, 4) float64, mm, LPS
         What its scene applies to it.
@@ -74,6 +97,8 @@ class SurfaceFind:
     in_scene : bool
     is_made : bool
         Whether it was made of voxels: it has no file of its own.
+    joined : tuple of str
+        The labels of the teeth that were added to it.
     """
 
     label: str
@@ -86,6 +111,8 @@ class SurfaceFind:
     chain: tuple[str, ...] = ()
     in_scene: bool = False
     is_made: bool = False
+    is_silent: bool = False
+    joined: tuple[str, ...] = ()
 
     @property
     def extent(self) -> Floats:
@@ -119,6 +146,8 @@ class ImageFind:
         Why it cannot be read; empty if it can.
     series : str or None
         UID of the DICOM series that is meant, where the folder holds several.
+    is_labels : bool
+        Whether its values are labels of segments, and not those of a CT.
     """
 
     label: str
@@ -131,6 +160,7 @@ class ImageFind:
     error: str = ""
     series: str | None = None
     findings: tuple[Finding, ...] = ()
+    is_labels: bool = False
     to_world: Floats = field(default_factory=lambda: np.eye(4))
     chain: tuple[str, ...] = ()
     in_scene: bool = False
@@ -160,15 +190,24 @@ class TransformFind:
 
 @dataclass(frozen=True)
 class OtherFind:
-    """What is not used, and why."""
+    """What is not used, and why; files of one kind in one folder may share an entry."""
 
     label: str
     why: str
+    paths: tuple[Path, ...] = ()
 
 
 @dataclass
 class Listing:
-    """The paths in a folder, by what their endings say."""
+    """The paths in a folder, by what their endings say.
+
+    Attributes
+    ----------
+    unread : dict of (Path, str) to list of Path
+        What no case reads, by its folder and the reason.
+    seen : list of Path
+        Every file, read or not.
+    """
 
     surfaces: list[Path] = field(default_factory=list)
     images: list[Path] = field(default_factory=list)
@@ -178,18 +217,25 @@ class Listing:
     scenes: list[Path] = field(default_factory=list)
     dicom: list[tuple[Path, str | None]] = field(default_factory=list)
     unread: dict[tuple[Path, str], list[Path]] = field(default_factory=dict)
+    seen: list[Path] = field(default_factory=list)
 
     def skip(self, path: Path, why: str) -> None:
-        """Notes a file that is not read."""
+        """Notes a file or folder that is not read."""
         self.unread.setdefault((path.parent, why), []).append(path)
 
     def others(self, folder: Path) -> list[OtherFind]:
-        """What is not read, and why."""
-        return [
-            OtherFind(path.relative_to(folder).as_posix(), why)
-            for (_, why), paths in self.unread.items()
-            for path in paths
-        ]
+        """What no case reads, with its names."""
+        found = []
+        for (_, why), paths in self.unread.items():
+            names = [path.relative_to(folder).as_posix() for path in paths]
+            if len(names) <= SHOWN:
+                found += [
+                    OtherFind(name, why, (path,)) for name, path in zip(names, paths, strict=True)
+                ]
+                continue
+            more = f" and {len(names) - SHOWN} more"
+            found.append(OtherFind(", ".join(names[:SHOWN]) + more, why, tuple(paths)))
+        return found
 
 
 def listing(folder: Path) -> Listing:
@@ -208,35 +254,28 @@ def listing(folder: Path) -> Listing:
                 f"{folder}: contains more than {MAX_FILES} files: give the folder of one patient"
             )
         name = path.name.lower()
-        kind = (
-            found.labels
-            if name.endswith((".seg.nrrd", ".seg.nhdr"))
-            else found.markups
-            if name.endswith(MARKUPS)
-            else next(
-                (
-                    paths
-                    for endings, paths in (
-                        (SCENES, found.scenes),
-                        (SURFACES, found.surfaces),
-                        (IMAGES, found.images),
-                        (TRANSFORMS, found.transforms),
-                    )
-                    if name.endswith(endings)
-                ),
-                None,
-            )
+        kinds = (
+            (LABELS, found.labels),
+            (MARKUPS, found.markups),
+            (SCENES, found.scenes),
+            (SURFACES, found.surfaces),
+            (IMAGES, found.images),
+            (TRANSFORMS, found.transforms),
         )
+        kind = next((paths for endings, paths in kinds if name.endswith(endings)), None)
         if kind is not None:
             kind.append(path)
-        elif path.parent not in dicom and _is_dicom(path):
+        elif path.suffix.lower() in NO_SLICES or not (path.parent in dicom or _is_dicom(path)):
+            names = path.name == NAMES_FILE
+            found.skip(path, "it has names of labels" if names else "no case reads such files")
+        else:
             dicom[path.parent] = None
     found.dicom = dicom_places(list(dicom))
     return found
 
 
 def _files(folder: Path, found: Listing) -> Iterator[Path]:
-    """The plain files of a folder in a fixed order; hidden ones and cmfsim's results left out.
+    """The plain files of a folder in a fixed order; the others are noted in `found`.
 
     Links are followed: the folder is the user's own. Files that no case can name are noted, and
     links to folders that were seen already, or that this one lies in.
@@ -252,18 +291,27 @@ def _files(folder: Path, found: Listing) -> Iterator[Path]:
         seen.add(real)
         if here != folder and any(name in names for name in OURS):
             folders.clear()
+            found.skip(here, "results that cmfsim wrote")
             continue
-        deep = len(here.relative_to(folder).parts) >= MAX_DEPTH
-        folders[:] = [] if deep else sorted(f for f in folders if f[0] != "." and f != EXTRACTED)
+        if len(here.relative_to(folder).parts) >= MAX_DEPTH:
+            for name in folders:
+                found.skip(here / name, f"is more than {MAX_DEPTH} folders down")
+            folders.clear()
+        for name in folders:
+            if name[0] == ".":
+                found.skip(here / name, "is hidden: its name begins with a dot")
+        folders[:] = sorted(f for f in folders if f[0] != "." and f != EXTRACTED)
         for name in sorted(names):
             path = here / name
             if name[0] == ".":
-                continue
-            if not _is_utf8(path.relative_to(folder).as_posix()):
+                found.skip(path, "is hidden: its name begins with a dot")
+            elif not _is_utf8(path.relative_to(folder).as_posix()):
                 found.skip(path, NOT_UTF8)
             elif path.is_symlink() and not path.exists():
                 found.skip(path, NOT_HERE)
-            elif path.is_file():
+            elif not path.is_file():
+                found.skip(path, "is no file")
+            elif path != folder / CASE_FILE:
                 yield path
 
 
@@ -294,10 +342,12 @@ def surface_find(path: Path, label: str) -> SurfaceFind:
     """
     read = surface_as_stored(path)
     surface, stated = read.surface, read.frame
-    if stated is None and is_own_file(path):
+    is_silent = stated is None
+    if is_silent and is_own_file(path):
         stated = "LPS"
-    name = path.name[: -len(path.suffix)]
-    return SurfaceFind(label, name_role(name), path, surface, stated, is_closed(surface))
+    role = name_role(path.name[: -len(path.suffix)])
+    closed = is_closed(surface)
+    return SurfaceFind(label, role, path, surface, stated, closed, is_silent=is_silent)
 
 
 def is_closed(surface: SurfaceData) -> bool:
@@ -331,7 +381,18 @@ def image_find(path: Path, label: str, series: str | None = None) -> ImageFind:
         box,
         series=series,
         findings=read.findings,
+        is_labels=are_labels(image.values) or _are_turned_labels(path, read.findings),
     )
+
+
+def _are_turned_labels(path: Path, findings: tuple[Finding, ...]) -> bool:
+    """Whether a file on a turned grid has labels, which are none once they are resampled."""
+    if path.is_dir() or not any(f.code in {"image-oblique", "image-sheared"} for f in findings):
+        return False
+    try:
+        return are_labels(read_labels(path).labels[0])
+    except CmfsimError:
+        return False
 
 
 def landmark_find(path: Path, label: str) -> LandmarkFind:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io.segmentations import NAMES_FILE
 from cmfsim.io.slicer_bundles import unpack_bundle
 from cmfsim.io.slicer_scenes import read_slicer_scene
 from cmfsim.pipeline.drafting.finds import (
@@ -28,6 +29,9 @@ __all__ = ["Gathered", "gather"]
 
 # Images that are read to see which is the CT.
 MAX_IMAGES = 6
+# Masks that are read by their names.
+MAX_MASKS = 40
+NOT_NAMED = "the scene does not name this file"
 # Bytes of a header in which Slicer states itself, or the frame.
 HEADER = 1024
 BY_SLICER = (b"3D Slicer output", b"SPACE=LPS", b"SPACE=RAS", b"Segmentation_")
@@ -45,6 +49,14 @@ class Gathered:
         The label of the scene that was read; empty if there is none.
     by_slicer : bool
         Whether 3D Slicer saved any of the files.
+    seen : list of Path
+        Every file of the folder.
+    names : list of Path
+        Those with the names of labels.
+    scene_files : set of Path
+        Those that the scene names.
+    links : dict of str to tuple of str
+        The transforms of the scene, with what lies directly under each.
     """
 
     folder: Path
@@ -56,6 +68,10 @@ class Gathered:
     transforms: list[TransformFind] = field(default_factory=list)
     loose: list[LooseMotion] = field(default_factory=list)
     others: list[OtherFind] = field(default_factory=list)
+    seen: list[Path] = field(default_factory=list)
+    names: list[Path] = field(default_factory=list)
+    scene_files: set[Path] = field(default_factory=set)
+    links: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def shown(self, path: Path) -> str:
         """A path as the case file will have it."""
@@ -102,7 +118,6 @@ def gather(
         found.others += [
             OtherFind(found.shown(path), f"the scene {found.scene} does not have it")
             for path in rest(paths.transforms)
-            if path.suffix.lower() != ".txt"
         ]
     else:
         _gather_files(found, paths, progress)
@@ -133,15 +148,34 @@ def _gather_images(
 ) -> None:
     """Adds the images of files and folders; the CT of a scene comes before them."""
     has_ct = any(not image.role.is_after and not image.error for image in found.images)
+    labels: list[tuple[Path, str]] = []
+    # Masks of a hundred organs come one per file: those of a head have its names.
+    named = [path for path, _ in places if name_role(path.name).part not in {"", "other"}]
+    others = [path for path, _ in places if path not in named]
+    read = {*named[:MAX_MASKS], *others[:MAX_IMAGES]}
     for path, series in places:
         label = found.shown(path) + ("" if series is None else f" (series {series})")
         if has_ct and not name_role(path.name).is_after:
             found.others.append(OtherFind(label, f"the scene {found.scene} has another CT"))
-        elif len(found.images) >= MAX_IMAGES:
-            found.others.append(OtherFind(label, f"more than {MAX_IMAGES} images: not looked at"))
+        elif path not in read:
+            why = f"more than {MAX_IMAGES} images, and its name is none of a head's part: not read"
+            found.others.append(OtherFind(label, why))
         else:
             progress(f"reading {label}")
-            found.images.append(image_find(path, label, series))
+            image = image_find(path, label, series)
+            if image.is_labels and found.scene and not image.role.is_after:
+                found.others.append(OtherFind(label, f"the scene {found.scene} does not have it"))
+            elif image.is_labels:
+                labels.append((path, label))
+            else:
+                found.images.append(image)
+    segments = segment_finds(labels)
+    found.surfaces += segments.surfaces
+    found.others += segments.others
+    folders = {path.parent for path, _ in labels}
+    found.names = [
+        path for path in found.seen if path.name == NAMES_FILE and path.parent in folders
+    ]
 
 
 def _gather_scene(
@@ -162,6 +196,11 @@ def _gather_scene(
         scene = next(iter(paths.scenes), None)
     if scene is None:
         return set()
+    found.others += [
+        OtherFind(found.shown(path), "another scene was given")
+        for path in paths.scenes
+        if not path.samefile(scene)
+    ]
     found.scene = found.shown(scene)
     progress(f"reading {found.scene}")
     bundled = scene.suffix.lower() == ".mrb"
@@ -172,6 +211,13 @@ def _gather_scene(
     found.landmarks += read.landmarks
     found.loose += read.loose
     found.others += read.others
+    found.links = read.links
+    if bundled:
+        found.others += [
+            OtherFind(f"{found.scene}: {path.relative_to(unpacked).as_posix()}", NOT_NAMED)
+            for path in sorted(unpacked.rglob("*"))
+            if path.is_file() and path != file and path.resolve() not in read.files
+        ]
     return read.files
 
 
@@ -182,14 +228,14 @@ def _gather_files(found: Gathered, paths: Listing, progress: Callable[[str], Non
     for path in paths.labels:
         label = found.shown(path)
         progress(f"reading {label}")
-        try:
-            found.surfaces += segment_finds(path, label)
-        except (CmfsimError, OSError) as error:
-            found.others.append(OtherFind(label, str(error)))
+        segments = segment_finds([(path, label)])
+        found.surfaces += segments.surfaces
+        found.others += segments.others
     for path in paths.transforms:
         label = found.shown(path)
         role = name_role(path.name[: -len(path.suffix)])
         if path.suffix.lower() == ".txt" and not _is_matrix(path):
+            found.others.append(OtherFind(label, "is no transform: not 16 numbers"))
             continue
         found.transforms.append(TransformFind(label, role, path))
 

@@ -38,6 +38,8 @@ class DraftMotion:
     question : str
         Why a person has to decide; empty if not.
     choices : tuple of str
+    shown : (4, 4) float64, mm, LPS, or None
+        The motion that `words` describes.
     """
 
     words: str
@@ -46,6 +48,7 @@ class DraftMotion:
     transform: str = ""
     question: str = ""
     choices: tuple[str, ...] = ()
+    shown: Floats | None = None
 
 
 @dataclass
@@ -61,6 +64,8 @@ class Plan:
     motions : dict of str to DraftMotion
     taken : list of Taken
     others : list of OtherFind
+    links : set of str
+        The names of the transforms of the scene that are motions of segments.
     """
 
     anatomy: Anatomy
@@ -68,6 +73,7 @@ class Plan:
     motions: dict[str, DraftMotion] = field(default_factory=dict)
     taken: list[Taken] = field(default_factory=list)
     others: list[OtherFind] = field(default_factory=list)
+    links: set[str] = field(default_factory=set)
 
     def words(self, segment: str, matrix: Floats) -> str:
         """A motion in words."""
@@ -101,6 +107,9 @@ def scene_motions(
     """
     back = np.linalg.inv(reference)
     asked = _asked(plan.anatomy)
+    # What the skin lies under as well moves no segment.
+    skin = plan.anatomy.skin
+    shared = set() if skin is None else {*skin.chain}
     # A piece that has a segment's name moves by it, wherever its surface comes from.
     known = {n: finds[0] for n, finds in asked.items() if n in MOVING and len(finds) == 1}
     for name, find in {**moved, **known}.items():
@@ -114,7 +123,8 @@ def scene_motions(
             "the rest of the head, in LPS mm: from where it is to where it goes.",
         )
         question, choices = _unusual(name, find, words)
-        plan.motions[name] = DraftMotion(words, source, matrix, "", question, choices)
+        plan.motions[name] = DraftMotion(words, source, matrix, "", question, choices, matrix)
+        plan.links |= {*find.chain} - shared
         why = f"transform to parent of {find.label} in the scene: {words}"
         plan.taken.append(
             Taken(", ".join(find.chain) or find.label, f"motion of {name}", why, "mm", "LPS")
@@ -157,6 +167,7 @@ def _ask_whose(
         "", (), moved[0][1] if len(moved) == 1 else None, "", question, tuple(choices)
     )
     label = ", ".join(dict.fromkeys(link for find, _ in moved for link in find.chain))
+    plan.links |= {link for find, _ in moved for link in find.chain}
     plan.taken.append(Taken(label, f"motion of {name}", question, "mm", "LPS", question=True))
 
 
@@ -265,9 +276,8 @@ def _of_file(plan: Plan, name: str, find: TransformFind, *, by_slicer: bool) -> 
     """
     file = f"file = {quoted(find.label)}"
 
-    def said(direction: str, frame: str | None = None) -> str:
-        read = read_transform_file(find.path, direction=direction, frame=frame)
-        return plan.words(name, read.matrix)
+    def read_as(direction: str) -> Floats:
+        return read_transform_file(find.path, direction=direction).matrix
 
     itk = is_itk_file(find.path) or _holds_itk(find.path)
     if not itk:
@@ -275,14 +285,14 @@ def _of_file(plan: Plan, name: str, find: TransformFind, *, by_slicer: bool) -> 
     try:
         stated = read_transform_file(find.path)
     except CmfsimError:
-        slicer, other = said("from-parent"), said("to-parent")
+        slicer, other = (plan.words(name, read_as(way)) for way in ("from-parent", "to-parent"))
         if by_slicer:
             source: tuple[str, ...] = (
                 f"{find.label} is taken as 3D Slicer saves it, from-parent: other files are its.",
                 f'If ITK registered the bone before to the one after: "to-parent", which {other}.',
             )
             toml = f'{{{file}, direction = "from-parent"}}'
-            return DraftMotion(slicer, source, None, toml)
+            return DraftMotion(slicer, source, None, toml, shown=read_as("from-parent"))
         text = f"{find.label} does not record its direction: which of these is the plan?"
         choices = (
             f'"from-parent" (as 3D Slicer saves it): {slicer}',
@@ -291,7 +301,8 @@ def _of_file(plan: Plan, name: str, find: TransformFind, *, by_slicer: bool) -> 
         return DraftMotion("", (), None, f'{{{file}, direction = "?"}}', text, choices)
     words = plan.words(name, stated.matrix)
     source = (f"{find.label} states its direction: {stated.direction}",)
-    return DraftMotion(words, source, None, f'{{{file}, direction = "{stated.direction}"}}')
+    toml = f'{{{file}, direction = "{stated.direction}"}}'
+    return DraftMotion(words, source, None, toml, shown=stated.matrix)
 
 
 def _of_text(plan: Plan, name: str, find: TransformFind) -> DraftMotion:
@@ -301,11 +312,13 @@ def _of_text(plan: Plan, name: str, find: TransformFind) -> DraftMotion:
     file = f"file = {quoted(find.label)}"
     if "frame" not in read.assumed:
         source = (f"{find.label}: {read.text}",)
-        return DraftMotion(here, source, None, f'{{{file}, frame = "{read.frame}"}}')
+        toml = f'{{{file}, frame = "{read.frame}"}}'
+        return DraftMotion(here, source, None, toml, shown=read.matrix)
     other = plan.words(name, motion_in_lps(read.matrix, "RAS"))
     if here == other:
         source = (f"{find.label}: LPS or RAS, which give the same motion",)
-        return DraftMotion(here, source, None, f'{{{file}, frame = "LPS"}}')
+        toml = f'{{{file}, frame = "LPS"}}'
+        return DraftMotion(here, source, None, toml, shown=read.matrix)
     text = f"{find.label} does not state its frame: which of these is the plan?"
     choices = (
         f'"RAS" (the matrix that 3D Slicer shows): {other}',

@@ -2,28 +2,74 @@
 
 import itertools
 import re
+import unicodedata
 from dataclasses import dataclass
 
-__all__ = ["MOVING", "NameRole", "name_role", "safe_key"]
+__all__ = ["JAWS_OF_TEETH", "MOVING", "NameRole", "name_role", "safe_key"]
 
-# Parts that are no bone of a case, by the words that programs and people use.
+# Words that programs and people use, without accents: English, then German, French, Spanish and
+# Italian. "schaedel" and "schadel" are the two ways to write an umlaut without it.
+# Parts that are no bone of a case.
 NO_BONE = frozenset(
-    ("teeth", "tooth", "canal", "airway", "sinus", "tongue", "muscle", "muscles", "plate", "plates")
+    ("canal", "airway", "sinus", "tongue", "muscle", "muscles", "plate", "plates", "pulp")
     + ("screw", "screws", "splint", "guide", "plane", "planes", "eye", "eyes", "brain", "vertebra")
-    + ("vertebrae", "spine", "cartilage", "implant", "couch", "predicted")
+    + ("vertebrae", "spine", "cartilage", "implant", "couch", "predicted", "bridge", "pharynx")
+    + ("kanal", "atemweg", "zunge", "muskel", "platte", "schiene", "hirn", "gehirn", "nerv")
+    + ("wirbel", "wirbelsaule", "wirbelsaeule", "knorpel", "implantat", "langue", "lengua")
 )
+TEETH = frozenset(
+    ("teeth", "tooth", "incisor", "canine", "premolar", "molar", "dentition")
+    + ("zahn", "zahne", "zaehne", "zahnreihe", "dent", "dents", "diente", "dientes", "dente")
+    + ("denti",)
+)
+JOINING = frozenset(["with", "and", "including", "incl", "mit", "und", "avec", "et", "con"])
+UPPER = frozenset(
+    ("upper", "maxillary", "maxilla", "oben", "obere", "oberer", "oberkiefer")
+    + ("superieure", "superieures", "sup", "superior", "superiores", "superiori")
+)
+LOWER = frozenset(
+    ("lower", "mandibular", "mandible", "unten", "untere", "unterer", "unterkiefer")
+    + ("inferieure", "inferieures", "inf", "inferior", "inferiores", "inferiori")
+)
+# The first of these that a head has holds the row of teeth.
+JAWS_OF_TEETH = {
+    "upper teeth": ("maxilla", "midface", "cranium", "bone"),
+    "lower teeth": ("mandible", "mandible_body", "bone"),
+}
 AFTER = frozenset(
     ("post", "postop", "postoperative", "after", "achieved", "postsurgery", "postsurgical")
+    + ("postoperativ", "nachher", "nach", "apres", "postoperatoire", "despues", "dopo")
 )
-SKIN = frozenset(["skin", "face", "softtissue", "softtissues", "epidermis", "soft"])
-CRANIUM = frozenset(["cranium", "cranial", "skull", "neurocranium"])
-MANDIBLE = frozenset(["mandible", "mandibula", "mandibular", "jaw"])
-MAXILLA = frozenset(["maxilla", "maxillary", "lefort", "lefort1", "lf1", "upperjaw"])
-MIDFACE = frozenset(["midface", "lefort3", "lf3"])
-CHIN = frozenset(["chin", "genio", "genioplasty"])
-RAMUS = frozenset(["ramus", "proximal", "condyle", "condylar"])
-BONE = frozenset(["bone", "bones", "skeleton"])
-LEFT, RIGHT = frozenset(("left", "l", "lt")), frozenset(("right", "r", "rt"))
+SKIN = frozenset(
+    ("skin", "face", "softtissue", "softtissues", "epidermis", "soft", "haut", "gesicht")
+    + ("gesichtshaut", "weichteil", "weichteile", "weichgewebe", "peau", "visage", "piel", "cara")
+    + ("pelle", "viso")
+)
+CRANIUM = frozenset(
+    ("cranium", "cranial", "skull", "neurocranium", "schadel", "schaedel", "hirnschadel")
+    + ("hirnschaedel", "crane", "craneo", "cranio")
+)
+MANDIBLE = frozenset(
+    ("mandible", "mandibula", "mandibular", "jaw", "unterkiefer", "unterkieferknochen")
+    + ("mandibule", "mandibola")
+)
+MAXILLA = frozenset(
+    ("maxilla", "maxillary", "lefort", "lefort1", "lf1", "upperjaw", "upperjawbone")
+    + ("oberkiefer", "oberkieferknochen", "maxillaire", "maxilar", "mascella")
+)
+MIDFACE = frozenset(["midface", "lefort3", "lf3", "mittelgesicht"])
+CHIN = frozenset(["chin", "genio", "genioplasty", "kinn", "kinnplastik", "menton", "mento"])
+RAMUS = frozenset(
+    ("ramus", "proximal", "condyle", "condylar", "proximales", "kieferast", "unterkieferast")
+    + ("gelenkfortsatz", "kondylus")
+)
+JAW = frozenset(["jaw", "jawbone", "kiefer", "machoire", "mascellare"])
+DISTAL = frozenset(["distal", "distales"])
+BONE = frozenset(["bone", "bones", "skeleton", "knochen", "skelett"])
+LEFT = frozenset(("left", "l", "lt", "links", "linke", "linker", "linkes", "gauche", "izquierda"))
+RIGHT = frozenset(
+    ("right", "r", "rt", "rechts", "rechte", "rechter", "rechtes", "droit", "droite", "derecha")
+)
 # Words of a transform that brings data together, and moves no bone.
 REGISTERS = frozenset(
     ("registration", "register", "registered", "align", "alignment", "aligned", "icp")
@@ -39,7 +85,11 @@ MOVING = (
     "chin",
 )
 # A name in two cases, or with digits, holds several words.
-WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zà-ÿ]+|\d+")
+WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+UMLAUTS = str.maketrans({"ß": "ss", "œ": "oe", "æ": "ae"})
+# Teeth by their numbers (ISO 3950): the first digit is the quadrant, 1, 2, 5 and 6 the upper ones.
+TOOTH_NUMBER = re.compile(r"[1-8][1-8]")
+UPPER_QUADRANTS = "1256"
 
 
 @dataclass(frozen=True)
@@ -49,8 +99,9 @@ class NameRole:
     Attributes
     ----------
     part : str
-        "skin", "bone" (a skull with its jaw), "cranium", one of `MOVING`, "other" (no bone of a
-        case), or empty: the name does not say it.
+        "skin", "bone" (a skull with its jaw), "cranium", one of `MOVING`, "upper teeth", "lower
+        teeth", "teeth" (of which jaw, the name does not say), "other" (no bone of a case), or
+        empty: the name does not say it.
     is_after : bool
         Of the patient after the operation.
     registers : bool
@@ -73,7 +124,9 @@ def name_role(name: str) -> NameRole:
     >>> name_role("Maxilla_postOp").part, name_role("Maxilla_postOp").is_after
     ('maxilla', True)
     """
-    words = [word.lower() for word in WORDS.findall(name)]
+    letters = unicodedata.normalize("NFKD", name.translate(UMLAUTS))
+    plain = "".join(c for c in letters if not unicodedata.combining(c))
+    words = [word.lower() for word in WORDS.findall(re.sub(r"[&+]", " and ", plain))]
     # le fort 1, soft tissue, post op: two or three words for one.
     pairs = [a + b for a, b in itertools.pairwise(words)]
     triples = [a + b for a, b in zip(pairs, words[2:], strict=False)]
@@ -90,6 +143,10 @@ def _part(words: set[str]) -> tuple[str, str]:
 
     if word := said(NO_BONE):
         return "other", word
+    if word := said(TEETH):
+        # "Mandible with teeth" is the bone, "mandibular teeth" are its teeth.
+        bone = _part(words - TEETH - JOINING) if words & JOINING else ("", "")
+        return bone if bone[0] else (_row(words), word)
     if word := said(CHIN):
         return "chin", word
     if word := said(RAMUS):
@@ -97,23 +154,38 @@ def _part(words: set[str]) -> tuple[str, str]:
         if left != right:
             return ("ramus_left" if left else "ramus_right"), word
         return "", word
-    if words & MANDIBLE and words & {"body", "distal"}:
-        return "mandible_body", said(frozenset(("body", "distal")))
+    if words & MANDIBLE and (word := said(DISTAL | {"body"})):
+        return "mandible_body", word
     if word := said(CRANIUM):
         return "cranium", word
     if word := said(MIDFACE):
         return "midface", word
-    if (word := said(MAXILLA)) or {"upper", "jaw"} <= words:
-        return "maxilla", word or "upper jaw"
-    if word := said(MANDIBLE):
-        return "mandible", word
-    if "distal" in words:
-        return "mandible_body", "distal"
+    for part, known, side in (("maxilla", MAXILLA, UPPER), ("mandible", MANDIBLE, LOWER)):
+        if word := said(known - {"jaw"}):
+            return part, word
+        if words & side and (word := said(JAW)):
+            return part, word
+    if "jaw" in words:
+        return "mandible", "jaw"
+    if word := said(DISTAL):
+        return "mandible_body", word
     if word := said(SKIN):
         return "skin", word
+    if "head" in words:
+        return "skin", "head"
     if word := said(BONE):
         return "bone", word
     return "", ""
+
+
+def _row(words: set[str]) -> str:
+    """Upper or lower teeth, by words or by the numbers of teeth; else "teeth"."""
+    quadrants = {word[0] for word in words if TOOTH_NUMBER.fullmatch(word)}
+    upper = bool(words & UPPER) or bool(quadrants & set(UPPER_QUADRANTS))
+    lower = bool(words & LOWER) or bool(quadrants - set(UPPER_QUADRANTS))
+    if upper == lower:
+        return "teeth"
+    return "upper teeth" if upper else "lower teeth"
 
 
 def safe_key(name: str) -> str:

@@ -42,7 +42,10 @@ class LooseMotion:
 
 @dataclass
 class SceneFinds:
-    """What was found in a scene, by kind, and the files that it names."""
+    """What was found in a scene, by kind, the files that it names, and what each transform moves.
+
+    `links` has the name of each with the names of what lies directly under it.
+    """
 
     surfaces: list[SurfaceFind] = field(default_factory=list)
     images: list[ImageFind] = field(default_factory=list)
@@ -50,6 +53,7 @@ class SceneFinds:
     loose: list[LooseMotion] = field(default_factory=list)
     others: list[OtherFind] = field(default_factory=list)
     files: set[Path] = field(default_factory=set)
+    links: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def scene_finds(scene: SlicerScene, label: str) -> SceneFinds:
@@ -65,9 +69,15 @@ def scene_finds(scene: SlicerScene, label: str) -> SceneFinds:
     for node in scene.nodes.values():
         if node.file is not None:
             found.files.add(node.file.resolve())
-        if node.kind == "transform" or node.name.endswith(SLICE_MODELS):
-            continue
         shown = f"{label}: {node.name}"
+        if node.kind == "transform":
+            continue
+        if node.name.endswith(SLICE_MODELS) or node.kind == "other":
+            why = f"no case uses a {node.tag} of 3D Slicer"
+            if node.name.endswith(SLICE_MODELS):
+                why = "it is a plane in which Slicer shows the image"
+            found.others.append(OtherFind(shown, why))
+            continue
         if node.file is None or node.missing:
             why = node.missing or "the scene names no file for it: save the scene with its data"
             found.others.append(OtherFind(shown, why))
@@ -89,15 +99,17 @@ def _add(found: SceneFinds, scene: SlicerScene, node: SceneNode, shown: str) -> 
     matrix, role = scene.to_world(node), name_role(node.name)
     if node.kind == "model":
         read = surface_find(node.file, shown)
-        stated = read.stated or node.frame or "LPS"
+        stated = read.stated or node.frame
         found.surfaces.append(
             replace(read, role=role, stated=stated, to_world=matrix, chain=chain, in_scene=True)
         )
     elif node.kind == "segmentation":
-        for segment in segment_finds(node.file, shown):
-            found.surfaces.append(replace(segment, to_world=matrix, chain=chain, in_scene=True))
+        _add_segments(found, node.file, shown, matrix, chain)
     elif node.kind == "volume":
         image = image_find(node.file, shown)
+        if image.is_labels:
+            _add_segments(found, node.file, shown, matrix, chain)
+            return
         found.images.append(replace(image, role=role, to_world=matrix, chain=chain, in_scene=True))
     else:
         points = landmark_find(node.file, shown)
@@ -106,13 +118,25 @@ def _add(found: SceneFinds, scene: SlicerScene, node: SceneNode, shown: str) -> 
         )
 
 
+def _add_segments(
+    found: SceneFinds, file: Path, shown: str, matrix: Floats, chain: tuple[str, ...]
+) -> None:
+    """Adds the segments of a file, where the scene shows them."""
+    read = segment_finds([(file, shown)])
+    found.others += read.others
+    found.surfaces += [
+        replace(segment, to_world=matrix, chain=chain, in_scene=True) for segment in read.surfaces
+    ]
+
+
 def _add_loose(found: SceneFinds, scene: SlicerScene, label: str) -> None:
     """Adds the transforms that nothing lies under."""
-    used = {node.parent for node in scene.nodes.values()}
     for node in scene.of("transform"):
-        if node.id in used:
-            continue
+        below = tuple(other.name for other in scene.nodes.values() if other.parent == node.id)
         shown = f"{label}: {node.name}"
+        if below:
+            found.links[node.name] = below
+            continue
         try:
             matrix = scene.to_parent(node)
         except CmfsimError as error:

@@ -49,7 +49,7 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
     if face is None:
         raise CaseInputError(
             f"{patient.name}: predictions are compared on the detailed face, which is read from "
-            "the image with scikit-image: pip install 'cmfsim[imaging]'"
+            "the image with scikit-image: pip install '.[imaging]' in cmfsim's folder"
         )
     vertices = face.vertices
     landmarks = patient.landmarks.get("skin", {})

@@ -9,7 +9,7 @@ from cmfsim.errors import CaseError
 from cmfsim.meshing.lips import seam_faces
 from cmfsim.surfaces.topology import connected_labels, edges_of
 
-pytest.importorskip("scipy", reason="needs scipy (pip install 'cmfsim[imaging]')")
+pytest.importorskip("scipy", reason="needs scipy (pip install '.[imaging]')")
 
 EDGE, HEIGHT = 4.0, 10.0
 

@@ -10,7 +10,7 @@ import lip_head
 import real_heads
 from cmfsim.errors import CaseError
 
-pytest.importorskip("scipy", reason="needs scipy (pip install 'cmfsim[imaging]')")
+pytest.importorskip("scipy", reason="needs scipy (pip install '.[imaging]')")
 
 
 def height_at(surface, points):

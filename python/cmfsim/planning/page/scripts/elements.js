@@ -25,6 +25,16 @@ export function table(caption, heads, rows) {
   ));
 }
 
+/** A field for a number: as text, because browsers drop a decimal comma from a field of numbers. */
+export const numberField = (properties) =>
+  element("input", { type: "text", inputMode: "decimal", autocomplete: "off", className: "number", ...properties });
+
+/** The number that a person typed, a comma being its point; NaN for everything else. */
+export function typedNumber(text) {
+  const plain = text.trim().replace(/^[−–]/, "-").replace(",", ".");
+  return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) ? Number(plain) : NaN;
+}
+
 /** A number with its sign, such as "+1.2" or "−0.3"; "0.0" has none. */
 export function signed(value, digits = 1) {
   const text = Math.abs(value).toFixed(digits);

@@ -1,7 +1,7 @@
 // What leaves the page: the plan, its transforms, the face, a picture; and a plan that comes back.
 
 import { button, copied, element } from "./elements.js";
-import { fileName, planOf, planText, save, stlBytes, transformText } from "./exporting.js";
+import { fileName, planDigits, planOf, planText, save, stlBytes, transformText } from "./exporting.js";
 
 // A plan of a hundred segments has some 30 kB.
 const MOST_BYTES = 1_000_000;
@@ -33,7 +33,9 @@ export class ExportPanel {
   }
 
   get stem() {
-    return `${fileName(this.app.page.case)}-${fileName(this.app.plans.active.name)}`;
+    const { page, plans } = this.app;
+    const digits = planDigits(page, plans.active.motions);
+    return `${fileName(page.case)}-${fileName(plans.active.name)}-${digits}`;
   }
 
   show() {

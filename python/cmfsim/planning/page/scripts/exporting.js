@@ -12,10 +12,42 @@ const matrixRows = (m) => [0, 4, 8, 12].map((r) => m.slice(r, r + 4));
 // A text that stays in its comment or quotes, whatever a case or variant is called.
 const oneLine = (text) => JSON.stringify(String(text)).replace(/\u007f|[\u0080-\u009f\u2028\u2029]/g, " ");
 
+// Entries of motions are told apart to a millionth, mm or of a rotation.
+const DIGITS = 1e6;
+
+/**
+ * Eight hexadecimal digits that plans of other motions do not share: those that `cmfsim predict`
+ * prints (`plan_digits` of Python). Segments that stay do not count.
+ */
+export function planDigits(page, motions) {
+  const texts = page.segments.flatMap(({ name }, s) => {
+    const numbers = motions[s].map((v, i) => Math.floor((v - (i % 5 === 0 ? 1 : 0)) * DIGITS + 0.5) + 0);
+    return numbers.some((v) => v !== 0) ? [`${name}:${numbers.join(",")}`] : [];
+  });
+  return checksum(new TextEncoder().encode(texts.sort(byCodePoints).join("\n")));
+}
+
+/** The order of Python's strings. */
+function byCodePoints(a, b) {
+  const [x, y] = [[...a], [...b]].map((text) => text.map((c) => c.codePointAt(0)));
+  const i = x.findIndex((c, k) => c !== y[k]);
+  return i < 0 ? x.length - y.length : x[i] - (y[i] ?? -1);
+}
+
+/** CRC-32 (ISO 3309) in hexadecimal digits. */
+function checksum(bytes) {
+  let crc = 0xffffffff;
+  for (const byte of bytes) {
+    crc ^= byte;
+    for (let bit = 0; bit < 8; bit++) crc = (crc >>> 1) ^ (crc & 1 ? 0xedb88320 : 0);
+  }
+  return ((crc ^ 0xffffffff) >>> 0).toString(16).padStart(8, "0");
+}
+
 /** A plan as `cmfsim predict --plan` reads it, and as a case.toml may hold it. */
 export function planText(page, variant) {
   const lines = [
-    `${FIRST} ${oneLine(variant.name)} of the case ${oneLine(page.case)}. Not a medical device.`,
+    `${FIRST} ${oneLine(variant.name)} (${planDigits(page, variant.motions)}) of the case ${oneLine(page.case)}. Not a medical device.`,
     "# Each matrix carries the bone from where it is to where it goes: LPS, mm.",
     "# cmfsim predict case.toml --plan THIS_FILE; or copy the tables into the case in place of its [plan].",
     `# made for: ${page.built_for}`,

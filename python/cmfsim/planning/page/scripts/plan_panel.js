@@ -1,7 +1,7 @@
 // The controls of one segment: where it is measured, about what it turns, and its six numbers.
 
 import { NUMBERS, clinicalNumbers, withNumber } from "./clinical.js";
-import { button, element, signed, table } from "./elements.js";
+import { button, element, numberField, signed, table, typedNumber } from "./elements.js";
 import { LIMITS, beyondLimits } from "./plans.js";
 import { STAYS, moved } from "./rigid.js";
 
@@ -53,8 +53,9 @@ export class PlanPanel {
   row({ key, label, unit, low, high }) {
     const limit = LIMITS[unit];
     const id = `number-${key}`;
-    const field = element("input", {
-      type: "number", id, step: STEP, min: -limit, max: limit,
+    const field = numberField({
+      id, title: `${-limit} to ${limit} ${unit}; the arrow keys change it by ${STEP}`,
+      onkeydown: (e) => this.stepped(key, e),
       oninput: () => { this.typing = key; },
       onchange: (e) => this.typed(key, e.target),
       onblur: () => { this.typing = null; },
@@ -99,14 +100,24 @@ export class PlanPanel {
 
   typed(key, input) {
     this.typing = null;
-    // An empty or half-typed field is no zero.
-    const value = input.value.trim() === "" ? NaN : input.valueAsNumber;
+    const value = typedNumber(input.value);
     if (!Number.isFinite(value)) {
-      this.app.report("Type a number; the plan was not changed.");
+      this.app.report("Type a number, such as 2.5 or 2,5; the plan was not changed.");
       this.app.changed();
       return;
     }
     this.change(key, value, true);
+  }
+
+  /** Changes a number by the arrow keys. */
+  stepped(key, event) {
+    const step = { ArrowUp: STEP, ArrowDown: -STEP }[event.key];
+    if (!step) return;
+    event.preventDefault();
+    const value = typedNumber(event.target.value);
+    if (!Number.isFinite(value)) return;
+    this.typing = null;
+    this.change(key, Math.round((value + step) * 100) / 100, true);
   }
 
   /** Sets one number; a change that is not kept yet is a preview. */

@@ -1,10 +1,9 @@
 // Pulling a point of the skin: in the picture, or by the movement that it should make.
 
-import { button, element, signed } from "./elements.js";
+import { button, element, numberField, signed, typedNumber } from "./elements.js";
 import { Pull, PulledPoint, seenVertex } from "./pulling.js";
 import { STAYS } from "./rigid.js";
 
-const WISH_STEP = 0.5;
 const MOST_WISH = 30;
 // The movement of a point from where it was before the operation, with a surgeon's signs.
 const WISHES = [
@@ -25,8 +24,8 @@ export class PullPanel {
       type: "checkbox", id: `follows-${i}`, checked: moving[i] || !moving.includes(true),
     }));
     this.choice = element("select", { id: "pull-point", onchange: () => this.choose() });
-    this.fields = Object.fromEntries(WISHES.map(({ key }) => [key, element("input", {
-      type: "number", id: `wish-${key}`, step: WISH_STEP, min: -MOST_WISH, max: MOST_WISH,
+    this.fields = Object.fromEntries(WISHES.map(({ key }) => [key, numberField({
+      id: `wish-${key}`,
       onkeydown: (e) => { if (e.key === "Enter") this.typed(); },
     })]));
     this.state = element("p", { className: "note", id: "pull-state", role: "status" });
@@ -125,7 +124,7 @@ export class PullPanel {
     this.point ??= this.chosen();
     const wish = [0, 0, 0];
     for (const { key, axis, sign } of WISHES) {
-      const value = this.fields[key].valueAsNumber;
+      const value = typedNumber(this.fields[key].value);
       if (!Number.isFinite(value) || Math.abs(value) > MOST_WISH) {
         this.app.report(`Type three numbers of at most ${MOST_WISH} mm; the plan was not changed.`);
         return;

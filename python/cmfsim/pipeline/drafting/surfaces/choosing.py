@@ -1,110 +1,37 @@
 """The surfaces of a case, their unit and their frame, with the reasons."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from cmfsim._core import Surface
 from cmfsim.pipeline.drafting.case_lines import Taken
 from cmfsim.pipeline.drafting.finds import SurfaceFind
 from cmfsim.pipeline.drafting.roles import MOVING, safe_key
+from cmfsim.pipeline.drafting.surfaces.anatomy import (
+    FLIP,
+    SAMPLES,
+    UNITS,
+    Anatomy,
+    Question,
+    index_of,
+)
+from cmfsim.pipeline.drafting.surfaces.teeth import ROWS, add_teeth, report_joined
 from cmfsim.values.checks import Floats
 
-__all__ = ["Anatomy", "Question", "choose_surfaces"]
+__all__ = ["choose_surfaces"]
 
 # Longest extent of a skin from a face mask to a head with neck, and of bones, mm.
 SKIN_EXTENT, BONE_EXTENT = (110.0, 420.0), (15.0, 320.0)
-# Lengths of other units that numbers may be in, mm.
-UNITS: Mapping[str, float] = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inch": 25.4, "um": 0.001}
-# Vertices at which it is asked whether one surface holds another.
-SAMPLES = 300
 # Share of a piece in a bone from which on it is part of it, and distance that counts as in it, mm.
 PART_SHARE, NEAR = 0.8, 0.6
 # The jaw's middle lies so far in front of the cranium's, mm, for this to tell the frame.
 IN_FRONT = 5.0
-FLIP = np.array([-1.0, -1.0, 1.0])
+# A ramus that lies so far beyond the middle, mm, is on the other side.
+OFF_MIDDLE = 5.0
 PIECES_OF = {
     "mandible": ("mandible_body", "ramus_left", "ramus_right", "chin"),
     "cranium": ("maxilla", "midface"),
 }
-
-
-@dataclass(frozen=True)
-class Question:
-    """A decision about a key that a person has to make.
-
-    Attributes
-    ----------
-    key : str
-        Below [surfaces].
-    text : str
-        The question.
-    choices : tuple of (SurfaceFind or None, str)
-        What may be written: the file of a surface, or none, and words about it.
-    """
-
-    key: str
-    text: str
-    choices: tuple[tuple[SurfaceFind | None, str], ...]
-
-
-@dataclass
-class Anatomy:
-    """The surfaces of a case.
-
-    Attributes
-    ----------
-    skin : SurfaceFind or None
-    bones : dict of str to SurfaceFind
-        By the name that the case gives them.
-    units : str
-    frame : str or None
-        What the case states; None where every file states its own, or nothing needs to be stated.
-    frame_why, units_why : str
-    questions : list of Question
-        Keys "skin", "units", "frame" of [surfaces], or "bones.NAME".
-    after_skin, after_bones
-        The same after the operation.
-    taken : list of Taken
-    """
-
-    skin: SurfaceFind | None = None
-    bones: dict[str, SurfaceFind] = field(default_factory=dict)
-    units: str = "mm"
-    units_why: str = ""
-    frame: str | None = None
-    frame_why: str = ""
-    questions: list[Question] = field(default_factory=list)
-    after_skin: SurfaceFind | None = None
-    after_bones: dict[str, SurfaceFind] = field(default_factory=dict)
-    taken: list[Taken] = field(default_factory=list)
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether there is a skin, or a question about it, and a bone."""
-        asked = {question.key.partition(".")[0] for question in self.questions}
-        return (self.skin is not None or "skin" in asked) and (bool(self.bones) or "bones" in asked)
-
-    @property
-    def chosen(self) -> list[SurfaceFind]:
-        """Skin and bones before the operation."""
-        return [*([self.skin] if self.skin else []), *self.bones.values()]
-
-    @property
-    def after(self) -> list[SurfaceFind]:
-        """Skin and bones after the operation."""
-        return [*([self.after_skin] if self.after_skin else []), *self.after_bones.values()]
-
-    def asks(self, key: str) -> Question | None:
-        """The question about a key, where there is one."""
-        return next((question for question in self.questions if question.key == key), None)
-
-    def placed(self, find: SurfaceFind) -> Floats:
-        """The vertices of a surface in LPS mm, as far as unit and frame are known, (v, 3)."""
-        frame = find.stated or self.frame or "LPS"
-        scale = UNITS.get(self.units, 1.0) * (FLIP if frame == "RAS" else np.ones(3))
-        return find.surface.vertices * scale
 
 
 def choose_surfaces(
@@ -121,13 +48,18 @@ def choose_surfaces(
     anatomy = Anatomy()
     before = [find for find in found if not find.role.is_after]
     parts = _by_part(anatomy, before)
+    teeth = [find for row in ROWS for find in parts.pop(row, [])]
     _choose_skin(anatomy, parts)
     _choose_bones(anatomy, parts)
     _check_pieces(anatomy)
     _choose_units(anatomy)
     _choose_frame(anatomy, boxes)
+    _check_sides(anatomy)
+    for row in teeth:
+        add_teeth(anatomy, row)
     _choose_after(anatomy, [find for find in found if find.role.is_after])
     _report(anatomy)
+    report_joined(anatomy, found)
     return anatomy
 
 
@@ -261,10 +193,7 @@ def _share(piece: SurfaceFind, whole: SurfaceFind) -> float:
         return 0.0
     points = piece.surface.vertices
     points = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLES)], dtype=np.float64)
-    index = Surface(
-        np.ascontiguousarray(whole.surface.vertices, dtype=np.float64),
-        np.ascontiguousarray(whole.surface.triangles, dtype=np.uint32),
-    )
+    index = index_of(whole.surface.vertices, whole)
     closest, _, _ = index.closest(points)
     near = np.linalg.norm(closest - points, axis=1) < NEAR * whole.extent.max() / 150.0
     inside = index.winding_number(points) > 0.5
@@ -305,11 +234,11 @@ def _choose_frame(anatomy: Anatomy, boxes: Sequence[tuple[str, Floats]]) -> None
     silent = [find for find in chosen if find.stated is None]
     stated = sorted({find.stated for find in chosen if find.stated is not None})
     if not silent:
-        anatomy.frame_why = f"stated by the header of each file: {' and '.join(stated)}"
+        anatomy.frame_why = f"stated by each file, its scene or its labels: {' and '.join(stated)}"
         return
     names = ", ".join(find.label for find in silent[:4]) + (", …" if len(silent) > 4 else "")
     frame, why = _shown_frame(anatomy, silent, boxes)
-    if frame is None or (frame == "RAS" and "LPS" in stated):
+    if frame is None:
         anatomy.questions.append(
             Question(
                 "frame",
@@ -365,22 +294,64 @@ def _middle(find: SurfaceFind) -> Floats:
     return centre
 
 
+def _check_sides(anatomy: Anatomy) -> None:
+    """Asks about a left ramus that lies on the right, or the other way round."""
+    if anatomy.asks("frame") is not None or anatomy.asks("units") is not None:
+        return
+    rami = {n: anatomy.bones[n] for n in ("ramus_left", "ramus_right") if n in anatomy.bones}
+    middles = {name: float(anatomy.placed(find)[:, 0].mean()) for name, find in rami.items()}
+    if len(rami) == 2:
+        middle = 0.5 * sum(middles.values())
+    else:
+        rest = [find for name, find in anatomy.bones.items() if name not in rami]
+        whole = anatomy.skin or next(iter(rest), None)
+        if whole is None or not rami:
+            return
+        middle = float(np.ptp(anatomy.placed(whole)[:, 0])) / 2.0
+        middle += float(anatomy.placed(whole)[:, 0].min())
+    for name, x in middles.items():
+        side, other = ("left", "right") if name == "ramus_left" else ("right", "left")
+        away = (x - middle) * (1.0 if side == "left" else -1.0)
+        if away > -OFF_MIDDLE:
+            continue
+        find = anatomy.bones.pop(name)
+        text = (
+            f"{find.label}: by its name it is the {side} ramus, but it lies {-away:.0f} mm to the "
+            f"patient's {other}: are the names exchanged, or is the frame wrong?"
+        )
+        choices = [
+            (other_find, "if the names are exchanged")
+            for other_find in rami.values()
+            if other_find is not find
+        ]
+        choices.append((find, "if its name is right: the head is a mirror image, then"))
+        anatomy.questions.append(Question(f"bones.{name}", text, tuple(choices)))
+        anatomy.taken.append(Taken(find.label, "", text, question=True))
+
+
 def _choose_after(anatomy: Anatomy, found: Sequence[SurfaceFind]) -> None:
+    parts: dict[str, list[SurfaceFind]] = {}
     for find in found:
         part = find.role.part
-        if part == "skin" and anatomy.after_skin is None:
-            anatomy.after_skin = find
-        elif part in ("cranium", *MOVING) and part not in anatomy.after_bones:
-            anatomy.after_bones[part] = find
-        elif part == "" and anatomy.after_skin is None and anatomy.skin is not None:
+        if part in ("skin", "cranium", *MOVING):
+            parts.setdefault(part, []).append(find)
+        elif part == "" and anatomy.skin is not None:
             ratio = float(find.extent.max() / anatomy.skin.extent.max())
             if 0.5 < ratio < 2.0:
-                anatomy.after_skin = find
+                parts.setdefault("skin", []).append(find)
                 continue
             anatomy.taken.append(Taken(find.label, "not used", "after the operation; which part?"))
         else:
-            why = "after the operation, and it is not clear which part it is"
-            anatomy.taken.append(Taken(find.label, "not used", why))
+            why = f"{find.role.part or 'a part that its name does not say'} after the operation"
+            anatomy.taken.append(Taken(find.label, "not used", f"{why}, which no case uses"))
+    for part, finds in parts.items():
+        if len(finds) > 1:
+            key = "skin" if part == "skin" else f"bones.{part}"
+            _ask_which(anatomy, f"postoperative.{key}", finds)
+        elif part == "skin":
+            anatomy.after_skin = finds[0]
+        else:
+            anatomy.after_bones[part] = finds[0]
 
 
 def _report(anatomy: Anatomy) -> None:
@@ -410,7 +381,8 @@ def _shape(find: SurfaceFind, unit: str = "") -> str:
     size = " × ".join(f"{length:.3g}" for length in find.extent)
     closed = "closed" if find.is_closed else "open"
     count = len(find.surface.triangles)
-    return f"{size} {unit or 'in its own unit'}, {count} triangles, {closed}"
+    unit = unit or ("mm" if find.is_made else "in its own unit")
+    return f"{size} {unit}, {count} triangles, {closed}"
 
 
 def _said(find: SurfaceFind) -> str:
