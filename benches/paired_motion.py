@@ -174,10 +174,10 @@ def moved_mandible(head: Head, x: Floats, move: str, jaw: str) -> Floats:
 
 
 def ground(x: Floats, place: Floats) -> Floats:
-    """Vertices of a patch squeezed onto the plane that a burr leaves."""
+    """Vertices round a landmark squeezed onto the plane that a burr leaves behind it."""
     radius, depth = GROUND
-    near = np.linalg.norm(x - place, axis=1) < radius
-    front = x[near, 1].min()
+    away = np.linalg.norm(x - place, axis=1)
+    near, front = away < radius, x[int(np.argmin(away)), 1]
     flat = x.copy()
     flat[near, 1] = np.maximum(x[near, 1], front + depth)
     return flat

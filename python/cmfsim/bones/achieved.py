@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface, rigid_fit
-from cmfsim.bones.coherent_motion import CoherentMotion, RigidPiece, coherent_motion
+from cmfsim.bones.coherent_motion import RigidPiece, coherent_motion
 from cmfsim.bones.matching import MatchOptions, lay_on
 from cmfsim.bones.motion import RemovedBone, missing_patches
-from cmfsim.bones.paired_surfaces import PairedShape, paired_shape
+from cmfsim.bones.paired_surfaces import paired_shape
 from cmfsim.bones.shape_fit import ShapeFit
 from cmfsim.bones.stray_patches import StrayPatch, stray_patches
 from cmfsim.errors import RegistrationError, RegistrationInputError
@@ -50,9 +50,9 @@ _LOG = logging.getLogger(__name__)
 # A motion counts as rigid if it reproduces the place of every vertex to this, mm: a tenth of the
 # accuracy of a segmented bone, and far above the rounding of a surface file.
 RIGID_TOLERANCE = 0.1
-# A piece within a bone moved otherwise if the rigid motion of the whole leaves it this far off the
-# bone after, mm rms, and farther than neighbourhoods deviate from motions of their own.
-AS_ONE = 0.15
+# A bone did not move as one if it, or a piece of it, lies this far off the bone after on average
+# over neighbours, mm rms, with its change of size removed.
+BENT = 0.15
 Segments: TypeAlias = Mapping[str, SurfaceData | BoneSegment]
 
 
@@ -280,8 +280,8 @@ def measure_pair(
 ) -> AchievedMotion:
     """The motion between two surfaces with the same triangles, without slip of the vertices.
 
-    If the bone has the same shape before and after, the motion is the rigid one that aligns the
-    two, however the vertices slid along the surface; a bone that was not operated on keeps its
+    If the bone has the same shape before and after, neither cut nor bent, the motion is the rigid
+    one that aligns the two, however the vertices slid along the surface; a bone that was not operated on keeps its
     change along the normals. Otherwise the vertices are followed in rigid pieces
     (`coherent_motion`). `fit` is None if the shapes cannot be compared.
 
@@ -316,7 +316,7 @@ def measure_pair(
     except RegistrationError as error:
         _LOG.warning("using the vertices, because the shapes cannot be compared: %s", error)
         return by_vertex
-    if not shape.is_rigid or _moved_apart(coherent, shape):
+    if not shape.is_rigid or _is_bent(shape.bent, coherent.pieces):
         return replace(by_vertex, fit=shape.fit, stray=shape.stray)
     known = {"removed": shape.removed, "stray": shape.stray, "slip": shape.slip}
     if is_still:
@@ -434,7 +434,7 @@ def _matched(
         segment,
         fit,
         centre,
-        removed=missing_patches(segment, bone, fit.similarity),
+        removed=missing_patches(segment, bone, fit.carried(segment.vertices)),
         stray=stray,
     )
 
@@ -461,14 +461,10 @@ def _by_shape(
     )
 
 
-def _moved_apart(coherent: CoherentMotion, shape: PairedShape) -> bool:
-    """Whether the rigid motion of the whole leaves a piece of a bone off the bone after."""
-    off = shape.fit.off.copy()
-    for patch in shape.removed:
-        off[patch.vertices] = 0.0
-    most = max(AS_ONE, coherent.spread)
-    pieces = coherent.pieces if len(coherent.pieces) > 1 else ()
-    return any(float(np.sqrt((off[p.vertices] ** 2).mean())) > most for p in pieces)
+def _is_bent(off: Floats, pieces: Sequence[RigidPiece]) -> bool:
+    """Whether a bone, or a piece of it, lies off where the rigid motion of the whole takes it."""
+    parts = [off, *(off[piece.vertices] for piece in pieces)]
+    return any(float(np.sqrt((part**2).mean())) > BENT for part in parts)
 
 
 def _surfaces(segments: Segments) -> dict[str, SurfaceData]:

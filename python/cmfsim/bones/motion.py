@@ -150,7 +150,7 @@ def moves_as_one(one: MovedSurface, other: MovedSurface) -> bool:
 
 
 def missing_patches(
-    segment: SurfaceData, bone: Surface, matrix: Floats, *, shown: float = SHOWN
+    segment: SurfaceData, bone: Surface, moved: Floats, *, shown: float = SHOWN
 ) -> tuple[RemovedBone, ...]:
     """Patches of a segment that are missing from the post-operative bone after registration.
 
@@ -160,8 +160,8 @@ def missing_patches(
         Before.
     bone : Surface
         After; a surface that is not closed encloses nothing, so nothing is found with it.
-    matrix : (4, 4) float64, mm
-        The motion of the segment, or the similarity that registers it to the bone.
+    moved : (n, 3) float64, mm
+        Where the motion of the segment takes its vertices, with its change of size.
     shown : float, mm
         What lies further from the post-operative bone may be outside its scan, not removed.
 
@@ -172,7 +172,6 @@ def missing_patches(
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)
-    moved = here @ matrix[:3, :3].T + matrix[:3, 3]
     off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
     far = np.flatnonzero((off > REMOVED_RIM) & (off < shown))
     gone = np.zeros(len(here), dtype=bool)

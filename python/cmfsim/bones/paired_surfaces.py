@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, rigid_fit
+from cmfsim.bones.along_surface import AlongSurface
 from cmfsim.bones.motion import RemovedBone, missing_patches
 from cmfsim.bones.shape_fit import (
     LEAST_SIGMA,
@@ -34,6 +35,9 @@ LIES = 1.0
 # share of them this near to the bone after, mm: two and a half times noise of 0.3 mm. The end of a
 # bone, squeezed flat on to the stump, stands off it by its height. Crumbs at its rim do not count.
 OWN, OWN_SHARE = 0.75, 0.8
+# How much it bent is averaged over this length, mm: noise is not bending. Vertices that do not
+# count have the second weight.
+AVERAGED, LEAST_WEIGHT = 3.0, 1e-6
 # Rounds of weights for the motion to begin with: a fifth of the vertices that went 4 mm elsewhere
 # are left out by then.
 TRIM_ROUNDS = 20
@@ -51,6 +55,9 @@ class PairedShape:
     fit : ShapeFit
     is_rigid : bool
         Whether the bone moved rigidly, apart from a change of size and removed bone.
+    bent : (n,) float64, mm
+        How far the bone after lies off along the normals, on average over neighbours, with the
+        change of size removed: how it bent. 0 where it was removed.
     slip : float, mm
         How far vertices slid along the surface, median.
     slid_free : (n, 3) float64, mm
@@ -62,6 +69,7 @@ class PairedShape:
 
     fit: ShapeFit
     is_rigid: bool
+    bent: Floats
     slip: float
     slid_free: Floats
     removed: tuple[RemovedBone, ...]
@@ -86,10 +94,10 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
     here, there = before.vertices, after.vertices
     bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
     fit = fit_shape(before, bone, _trimmed_motion(here, there))
-    carried = _carried(fit.similarity, here)
+    carried = fit.carried(here)
     closest, normals, _ = bone.closest(carried)
     # The mesh shows all the bone that is left, so whatever lies off it is known to be off.
-    removed = missing_patches(before, bone, fit.similarity, shown=np.inf)
+    removed = missing_patches(before, bone, carried, shown=np.inf)
     stray = stray_patches(before, bone, fit.similarity, fit.sigma)[0]
     on = fit.off <= LIES
     gone = np.zeros(len(here), dtype=bool)
@@ -111,12 +119,20 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
             and areas[on & ~gone].sum() >= LEAST_LYING * total
             and not any(_is_displaced(here, there, bone, patch) for patch in large)
         ),
+        _bent(before, ((closest - carried) * normals).sum(axis=1), ~gone),
         float(np.median(np.linalg.norm(along[kept], axis=1))) if kept.any() else 0.0,
         moved + rest,
         removed,
         # Removed bone is reported once.
         () if removed else stray,
     )
+
+
+def _bent(before: SurfaceData, off: Floats, kept: NDArray[np.bool_]) -> Floats:
+    """Distances along normals, averaged over neighbours that count; 0 for the others, (n,) mm."""
+    near, weights = np.clip(off, -LIES, LIES), np.where(kept, 1.0, LEAST_WEIGHT)
+    mean = AlongSurface(before).averaged_within(near, weights, AVERAGED)
+    return np.where(kept, mean, 0.0)
 
 
 def _trimmed_motion(here: Floats, there: Floats) -> Floats:

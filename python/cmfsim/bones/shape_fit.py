@@ -142,6 +142,11 @@ class ShapeFit(Frozen):
         found[:3, 3] += (1.0 - self.scale) * (self.matrix[:3, :3] @ self.middle)
         return found
 
+    def carried(self, points: Floats) -> Floats:
+        """Where the motion takes points, with the change of size, (n, 3) mm."""
+        matrix = self.similarity
+        return points @ matrix[:3, :3].T + matrix[:3, 3]
+
     @property
     def rms(self) -> float:
         """Of the distances of the vertices that count, mm."""

@@ -101,10 +101,11 @@ def test_noise_is_averaged_out_and_what_has_none_is_let_be():
     assert found.noise == pytest.approx(0.2 * np.sqrt(3.0), rel=0.1)
     left = np.linalg.norm(np.asarray(found.motion.moved_vertices) - there, axis=1)
     assert np.sqrt((left**2).mean()) < 0.35 * found.noise
-    # A smooth bend of 1 mm, along the surface where it is largest, is kept but for a third.
+    # A smooth bend of 1 mm, along the surface where it is largest: shells do not bend like that, so
+    # it may be slip, and is kept but for two thirds there.
     bent = there + np.outer((vertices[:, 0] / 30.0) ** 2, [0.0, 1.0, 0.0])
     found = coherent_motion(cmfsim.MovedSurface(surface, bent))
-    assert np.linalg.norm(np.asarray(found.motion.moved_vertices) - bent, axis=1).max() < 0.35
+    assert np.linalg.norm(np.asarray(found.motion.moved_vertices) - bent, axis=1).max() < 0.7
 
 
 def test_triangles_without_area_are_left_out_on_both_sides():
@@ -335,10 +336,10 @@ def test_bone_that_is_gone_is_reported_where_a_segment_is_laid_on_the_bone_after
     assert len(fewer.vertices) != len(trimmed)
     after = cmfsim.SurfaceData(carried(np.asarray(fewer.vertices), FORWARDS), fewer.triangles)
     core = cmfsim.Surface(after.vertices, after.triangles)
-    (patch,) = missing_patches(before, core, FORWARDS)
+    (patch,) = missing_patches(before, core, carried(np.asarray(before.vertices), FORWARDS))
     assert patch.depth == pytest.approx(8.0, abs=0.3)
     assert patch.place[1] == pytest.approx(-38.0, abs=0.5)
-    assert missing_patches(ball(3), core, FORWARDS) == ()
+    assert missing_patches(fewer, core, after.vertices) == ()
 
 
 def test_a_trimmed_bone_of_a_case_is_reported_and_its_tissue_follows_the_bone(tmp_path):
