@@ -281,9 +281,9 @@ def measure_pair(
     """The motion between two surfaces with the same triangles, without slip of the vertices.
 
     If the bone has the same shape before and after, neither cut nor bent, the motion is the rigid
-    one that aligns the two, however the vertices slid along the surface; a bone that was not operated on keeps its
-    change along the normals. Otherwise the vertices are followed in rigid pieces
-    (`coherent_motion`). `fit` is None if the shapes cannot be compared.
+    one that aligns the two, however the vertices slid along the surface; a bone that was not
+    operated on keeps its change along the normals. Otherwise the vertices are followed in rigid
+    pieces (`coherent_motion`). `fit` is None if the shapes cannot be compared.
 
     Parameters
     ----------
