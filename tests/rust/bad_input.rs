@@ -388,7 +388,7 @@ fn inadmissible_materials_are_named_with_tet_and_value() {
             "allowed"
         );
     }
-    // The paper's Table 1 with Picinbono's law: smallest eigenvalue −0.026 MPa (DESIGN 3.2).
+    // The paper's Table 1 with Picinbono's law: smallest eigenvalue −0.026 MPa.
     let m = FibreElastic { young_along: 0.5, young_across: 0.79, poisson: 0.43 };
     let error = refused(
         Tissue::transversely_isotropic(&[m], &[[1.0, 0.0, 0.0]], FibreLaw::Picinbono),

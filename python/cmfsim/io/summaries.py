@@ -326,12 +326,9 @@ def table(
 def finding(where: str, value: object) -> None:
     """The values of a `Finding`."""
     known = {"severity": one_of(*SEVERITIES), "code": text, "what": text}
-    # Files of earlier builds have `mend` for `fix`.
-    table({**known, "where": text, "why": text}, {"fix": text, "mend": text})(where, value)
+    table({**known, "where": text, "why": text, "fix": text})(where, value)
     if isinstance(value, dict) and not (value["code"] and value["what"]):
         raise CaseInputError(f"{where} states nothing")
-    if isinstance(value, dict) and not {"fix", "mend"} & set(value):
-        raise CaseInputError(f"{where} lacks 'fix'")
 
 
 def _refuse(where: str, value: object, needed: str) -> NoReturn:

@@ -75,13 +75,9 @@ class Finding:
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> "Finding":
-        """The finding stored in a file as plain values; other names in it are ignored.
-
-        Files of earlier builds have `mend` for `fix`.
-        """
-        fix = values.get("fix", values.get("mend", ""))
-        known = ("severity", "code", "what", "where", "why")
-        return cls(**{name: values[name] for name in known if name in values}, fix=fix)
+        """The finding stored in a file as plain values; other names in it are ignored."""
+        known = ("severity", "code", "what", "where", "why", "fix")
+        return cls(**{name: values[name] for name in known if name in values})
 
 
 # What is called with new findings as a stage notices them.

@@ -231,7 +231,7 @@ def test_a_node_of_two_kinds_is_named():
 
 
 def test_conflicts_can_be_resolved_and_are_counted():
-    """Fixed wins over joined, joined over sliding (DESIGN 3.5)."""
+    """Fixed wins over joined, joined over sliding."""
     boundary = cmfsim.Boundary(
         fixed=[0, 1],
         joined={"a": [1, 2]},

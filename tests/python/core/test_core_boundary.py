@@ -28,7 +28,7 @@ FAMILY = (
 
 
 def test_arrays_come_back_in_their_contract():
-    """DESIGN 4: float64 and uint32 in C order with the documented shapes."""
+    """Float64 and uint32 in C order with the documented shapes."""
     nodes, tets = meshes.random_body(30)
     n, m = len(nodes), len(tets)
     mesh = cmfsim.TetMesh(nodes, tets)
@@ -304,7 +304,7 @@ def test_one_solver_serves_many_threads():
 
 
 def test_import_needs_numpy_alone():
-    """Nothing optional is loaded by `import cmfsim` (DESIGN 1)."""
+    """Nothing optional is loaded by `import cmfsim`."""
     script = (
         "import sys, cmfsim; "
         "heavy = {'scipy', 'meshio', 'matplotlib', 'pyvista', 'vtk', 'dask', 'skimage'};"

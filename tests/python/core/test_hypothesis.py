@@ -58,7 +58,7 @@ def test_the_solution_is_linear_in_the_prescribed_displacements(body, axis, angl
 
 @given(body=bodies(), axis=units, angle=st.floats(-20, 20), seed=seeds)
 def test_operator_and_solve_agree(body, axis, angle, seed):
-    """Twelve columns per segment are exact for any finite rigid motion (DESIGN 3.6)."""
+    """Twelve columns per segment are exact for any finite rigid motion."""
     nodes, tensors = body
     low, high = split(nodes)
     solver = cmfsim.StaticSolver(tensors, cmfsim.Boundary(low, {"bone": high}), "cholesky")
@@ -90,7 +90,7 @@ def test_turning_the_whole_scene_turns_the_answer(seed, axis, angle, along, acro
 
 @given(along=moduli, across=moduli, poisson=st.floats(-0.9, 0.4999), fibre=units)
 def test_every_admissible_fibre_tissue_is_positive_definite(along, across, poisson, fibre):
-    """1 − ν_tt − 2 ν_lt ν_tl ≥ (1+ν)(1−2ν) > 0 for ν ≥ 0, any ratio of moduli (DESIGN 3.2)."""
+    """1 − ν_tt − 2 ν_lt ν_tl ≥ (1+ν)(1−2ν) > 0 for ν ≥ 0, any ratio of moduli."""
     a = np.array(fibre) / np.linalg.norm(fibre)
     try:
         tissue = cmfsim.Tissue.transversely_isotropic(along, across, poisson, a)

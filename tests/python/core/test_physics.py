@@ -45,7 +45,7 @@ def test_infinitesimal_rotation_gives_no_force(build):
 
 @pytest.mark.parametrize("build", [isotropic, random_fibres])
 def test_vertex_tensor_is_minus_the_sum_of_its_edge_tensors(build):
-    """K_jj = −Σ_k K_jk, with K_kj = K_jkᵀ (Cotin 2000; DESIGN 3.1)."""
+    """K_jj = −Σ_k K_jk, with K_kj = K_jkᵀ (Cotin 2000)."""
     nodes, tets = meshes.random_body(50, seed=3)
     tensors = build(nodes, tets)
     total = np.zeros_like(tensors.vertex)
@@ -168,7 +168,7 @@ def test_pulled_bar_stretches_by_the_closed_form(along, across, degrees):
 
 
 def test_stiffness_is_the_inverse_of_the_engineering_compliance():
-    """C = S⁻¹ turned onto the fibre, for ratios E_l/E_t of 1e-3 to 1e3 (DESIGN 3.2)."""
+    """C = S⁻¹ turned onto the fibre, for ratios E_l/E_t of 1e-3 to 1e3."""
     fibres = meshes.unit_vectors(5, 9)
     for (ratio, poisson), fibre in itertools.product(
         itertools.product((1e-3, 0.1, 1.0, 10.0, 1e3), (0.0, 0.3, 0.49)), fibres
@@ -181,7 +181,7 @@ def test_stiffness_is_the_inverse_of_the_engineering_compliance():
 
 
 def test_equal_moduli_give_the_isotropic_stiffness():
-    """E_l = E_t makes the fibre law isotropic, with G_lt = E/2(1+ν) (DESIGN 3.2)."""
+    """E_l = E_t makes the fibre law isotropic, with G_lt = E/2(1+ν)."""
     fibre = meshes.unit_vectors(1, 10)[0]
     found = cmfsim.Tissue.transversely_isotropic(0.6, 0.6, 0.4, fibre).stiffness()
     expected = cmfsim.Tissue.isotropic(0.6, 0.4).stiffness()
@@ -202,7 +202,7 @@ def test_presets_mix_moduli_as_the_paper_does():
 
 
 def test_stiffness_mixing_is_the_weighted_sum():
-    """C = p C_muscle + (1−p) C_fat with mixing="stiffness" (DESIGN 3.3)."""
+    """C = p C_muscle + (1−p) C_fat with mixing="stiffness"."""
     fraction, fibre = np.array([0.3, 0.9]), meshes.unit_vectors(2, 12)
     found = cmfsim.Tissue.preset("kim2010", fraction, fibre, mixing="stiffness").stiffness()
     fat = meshes.tensor_to_voigt(meshes.isotropic_tensor(0.003, 0.46))

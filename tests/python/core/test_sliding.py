@@ -1,4 +1,4 @@
-"""Sliding contact against exact answers (Kim et al. 2010, section 2.5, eq. 2; DESIGN 3.5)."""
+"""Sliding contact against exact answers (Kim et al. 2010, section 2.5, eq. 2)."""
 
 import itertools
 

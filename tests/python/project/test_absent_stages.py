@@ -1,4 +1,4 @@
-"""A scene pays for what it has: stages that it lacks take no time and load no module (DESIGN 1)."""
+"""A scene pays for what it has: stages that it lacks take no time and load no module."""
 
 import json
 import subprocess

@@ -24,6 +24,6 @@ def test_a_finding_is_read_back_from_its_plain_values():
     assert cmfsim.Finding.from_values(dataclasses.asdict(found)) == found
 
 
-def test_files_of_older_builds_called_the_fix_otherwise():
-    values = {"severity": "note", "code": "code", "what": "what", "mend": "that", "other": 1}
+def test_unknown_names_of_a_stored_finding_are_ignored():
+    values = {"severity": "note", "code": "code", "what": "what", "fix": "that", "other": 1}
     assert cmfsim.Finding.from_values(values) == cmfsim.Finding.note("code", "what", fix="that")

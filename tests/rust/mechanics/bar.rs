@@ -17,7 +17,7 @@ fn bar() -> BoxShape {
     BoxShape { cells: [8, 3, 3], size: [20.0, 6.0, 6.0], jitter: 0.15 }
 }
 
-/// Strain of the law of DESIGN 3.2 under stress σ e⊗e, with the compliance written out: in axes with
+/// Strain of the transversely isotropic law under stress σ e⊗e, with the compliance written out: in axes with
 /// the fibre first, ε = S σ.
 fn strain(m: FibreElastic, fibre: Vec3, e: Vec3, stress: f64) -> Matrix3<f64> {
     let FibreElastic { young_along: el, young_across: et, poisson: nu } = m;

@@ -223,7 +223,7 @@ fn a_surface_inside_out_is_turned() {
 }
 
 /// Two balls in one surface: the closest normal errs where one covers the other, the winding number does
-/// not (DESIGN: 19 % of the inside lost, and 0.07 %).
+/// not (19 % of the inside lost, and 0.07 %).
 #[test]
 fn overlaps_holes_and_flips_cost_the_normal_test_volume_and_the_winding_number_little() {
     let mesh = BoxShape { cells: [12; 3], size: [12.0; 3], jitter: 0.2 }.mesh();
