@@ -190,7 +190,9 @@ def test_the_doctor_tells_what_is_wrong_with_a_moved_bone(code, change, words, t
         head.surfaces["mandible_post"] = head.surfaces["mandible"]
     findings = cmfsim.diagnose(cmfsim.Case.load(head.write(tmp_path)))
     found = {f.code: f for f in findings if f.code.startswith(("moved", "plan"))}
-    assert set(found) in ({code}, {code, "plan-far"})
+    # A bone that moves far may pass through others.
+    assert code in found
+    assert set(found) <= {code, "plan-far", "plan-through-bone"}
     text = " ".join([found[code].what, found[code].why, found[code].fix])
     assert words in text
     assert found[code].where.startswith("case.toml:")

@@ -637,12 +637,14 @@ def test_the_error_is_stated_and_warned_of_beyond_what_was_tried(opened, errors,
     state = opened.locator("#error-state")
     assert "solved exactly" in state.inner_text()
     type_number(opened, "forwards", -4.5)
-    until(opened, "document.getElementById('error-state').textContent.startsWith('Expected')")
+    until(
+        opened, "document.getElementById('error-state').textContent.startsWith('The face differs')"
+    )
     plan = motions_of(opened, planning)
     distance = plan_distance(planning, plan)
     mean, largest = errors.at(distance)
     assert (
-        f"{mean:.2f} mm on average; at most {errors.usual(distance):.2f} mm in nine of ten plans "
+        f"{mean:.2f} mm on average, at most {errors.usual(distance):.2f} mm in nine of ten plans "
         f"as far away, {largest:.2f} mm in the worst"
     ) in state.inner_text()
     type_number(opened, "forwards", -28)

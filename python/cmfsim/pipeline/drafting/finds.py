@@ -248,8 +248,9 @@ def listing(folder: Path) -> Listing:
     """
     found = Listing()
     dicom: dict[Path, None] = {}
-    for count, path in enumerate(_files(folder, found)):
-        if count >= MAX_FILES:
+    for path in _files(folder, found):
+        found.seen.append(path)
+        if len(found.seen) > MAX_FILES:
             raise CaseInputError(
                 f"{folder}: contains more than {MAX_FILES} files: give the folder of one patient"
             )

@@ -101,7 +101,8 @@ def gather(
     found = Gathered(folder)
     paths = listing(folder)
     found.others += paths.others(folder)
-    named_by_scene = _gather_scene(found, paths, scene, unpacked, progress)
+    found.seen = paths.seen
+    named_by_scene = found.scene_files = _gather_scene(found, paths, scene, unpacked, progress)
 
     def rest(of: list[Path]) -> list[Path]:
         return [path for path in of if path.resolve() not in named_by_scene]
