@@ -60,8 +60,8 @@ test-rust: $(ENV_STAMP)
 test-python: $(DEVELOP_STAMP)
 	"$(PY)" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-test-slow: $(DEVELOP_STAMP) ## run the tests that take minutes: README and docs, typed from top to bottom
-	"$(PY)" -m pytest -m slow tests/python/project/test_documented_code.py
+test-slow: $(DEVELOP_STAMP) ## run the tests that take minutes, such as README and docs typed from top to bottom
+	"$(PY)" -m pytest -m slow
 
 lint: lint-rust lint-python ## rustfmt, clippy, ruff, mypy, stubtest, the import rules and the licences
 

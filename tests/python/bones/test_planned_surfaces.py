@@ -113,7 +113,7 @@ def test_resected_bone_of_a_fitted_plan_is_removed_and_takes_no_tissue_along(tmp
     assert finding.severity == "warning"
 
 
-@pytest.mark.parametrize("ratio", [0.1, 10.0])
+@pytest.mark.parametrize("ratio", [pytest.param(0.1, marks=pytest.mark.slow), 10.0])
 def test_a_remeshed_bone_of_another_unit_is_refused_by_name(ratio, tmp_path):
     before = bumpy(4)
     after = resliced(before)

@@ -165,7 +165,9 @@ def predicted(case, tmp_path_factory):
     return out
 
 
-@pytest.mark.parametrize("words", [["build"], ["evaluate", "--model", "H"]])
+@pytest.mark.parametrize(
+    "words", [["build"], pytest.param(["evaluate", "--model", "H"], marks=pytest.mark.slow)]
+)
 def test_a_killed_command_leaves_the_results_of_the_one_before(words, case, tmp_path):
     """Old and new results are the same but for their times; none is mixed, none is left over."""
     out = tmp_path / "out"
@@ -348,6 +350,7 @@ def test_a_study_on_a_dask_cluster_gives_what_one_machine_gives(case, tmp_path):
     assert local.outcomes[0].evaluation["models"] == report.outcomes[0].evaluation["models"]
 
 
+@pytest.mark.slow
 def test_a_cluster_that_does_not_answer_is_bad_input(case, tmp_path):
     pytest.importorskip("distributed")
     with pytest.raises(cmfsim.CaseError, match="no Dask scheduler answers at"):

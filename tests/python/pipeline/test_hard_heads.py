@@ -150,7 +150,14 @@ def built(folder):
     return summary, models[0].anatomy
 
 
-@pytest.fixture(scope="module", params=HARD)
+# The others take as long again, and are near to one of these.
+OFTEN = ("metal", "chin off", "nose off", "pillow and holder")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[k if k in OFTEN else pytest.param(k, marks=pytest.mark.slow) for k in HARD],
+)
 def hard(request, coarse, tmp_path_factory):
     """A hard CT, built: its name, summary and anatomy."""
     folder = tmp_path_factory.mktemp("hard")

@@ -137,6 +137,7 @@ def test_doubtful_jaws_are_separated_again_by_the_landmarks_found(tmp_path, monk
     assert kept.anatomy is anatomy
 
 
+@pytest.mark.slow
 def test_a_head_that_nods_far_forwards_has_its_landmarks(tmp_path):
     """By 20°: shape alone takes 148 cm³ for the mandible, and no tooth is found."""
     pytest.importorskip("SimpleITK")

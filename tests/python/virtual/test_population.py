@@ -213,6 +213,7 @@ def test_the_skin_is_thicker_where_nothing_moved(made):
     assert off.max() < 0.04
 
 
+@pytest.mark.slow
 def test_another_process_gives_the_same_bytes(made, tmp_path):
     """The core with three threads, against that of a worker, which has one."""
     folder, _ = made
