@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import cmfsim
+import meshes
 from cmfsim.bones.achieved import measure_pair
+from cmfsim.bones.along_surface import AlongSurface
 from cmfsim.bones.coherent_motion import coherent_motion
 from paired_motion import (
     ALL,
@@ -58,6 +60,23 @@ def test_slip_noise_and_bending_at_once_leave_the_motion(head, bone):
     raw = np.linalg.norm(np.asarray(pair.after.vertices) - pair.true, axis=1)[near].mean()
     assert error < ALL
     assert error < 0.8 * raw
+
+
+def test_averages_along_a_surface_are_those_of_a_walk():
+    """Step by step; and over 10 mm, a spot becomes as wide as that along each axis."""
+    surface = cmfsim.SurfaceData(*meshes.icosphere(5, 40.0))
+    along = AlongSurface(surface)
+    matrix, step = along._walk
+    values = np.random.default_rng(0).normal(size=(len(along.here), 3))
+    walked = values
+    for _ in range(round(10.0**2 / step)):
+        walked = matrix @ walked
+    np.testing.assert_allclose(along.averaged(values, 10.0), walked, atol=1e-9)
+    spot = np.zeros(len(along.here))
+    spot[0] = 1.0
+    share = along.averaged(spot, 10.0) * along.areas
+    away = np.linalg.norm(along.here - along.here[0], axis=1)
+    assert np.sqrt((share * away**2).sum() / share.sum() / 2.0) == pytest.approx(10.0, rel=0.1)
 
 
 def test_a_ground_spine_is_found_in_a_jaw_that_moved(head):
