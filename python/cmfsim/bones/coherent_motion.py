@@ -57,7 +57,8 @@ OUT_OF_LINE = 0.75
 MOST_REMOVED = 1500.0
 # Smaller ones, mm², are corners and rims.
 LEAST_PATCH = 20.0
-# A patch lies within a piece, away from others, if so much of its surroundings is of that piece.
+# A patch lies within a piece, away from others, if so much of its surroundings is of that piece;
+# its vertices lie well within.
 WITHIN = 0.9
 # What vertices slide along curved bone is no sign of missing bone: a patch is deeper than so many
 # times their slip, rms. For slip of two directions, that is the second times the median.
@@ -267,7 +268,7 @@ def _removed(
         ring = _ring(paired.here, inside, RING)
         # Between pieces that moved apart the mesh is stretched or squeezed: vertices are followed.
         together = deviation.apart <= 0.5 * APART
-        within = (deviation.own >= WITHIN) | together
+        within = (deviation.own >= WELL_WITHIN) | together
         if (
             LEAST_PATCH <= patch.area <= MOST_REMOVED
             and patch.depth >= SLID * slid
