@@ -157,12 +157,16 @@ class HeadCase:
         assert old in self.toml
         self.toml = self.toml.replace(old, new)
 
-    def write(self, folder: Path):
-        """The path of the case file, with everything beside it."""
+    def write_parts(self, folder: Path):
+        """The surfaces and landmarks, without a case file."""
         for name, surface in self.surfaces.items():
             cmfsim.write_surface(folder / f"{name}.ply", surface)
         cmfsim.write_landmarks(folder / "skull.mrk.json", self.skull)
         cmfsim.write_landmarks(folder / "skin.mrk.json", self.skin)
+
+    def write(self, folder: Path):
+        """The path of the case file, with everything beside it."""
+        self.write_parts(folder)
         path = folder / "case.toml"
         path.write_text(self.toml, encoding="utf-8")
         return path

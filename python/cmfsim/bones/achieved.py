@@ -34,7 +34,7 @@ from cmfsim.values.checks import (
     frozen,
 )
 from cmfsim.values.frozen import Frozen
-from cmfsim.values.motion import RigidMotion, decompose_motion, rigid_matrix
+from cmfsim.values.motion import RigidMotion, carried, decompose_motion, rigid_matrix
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = [
@@ -502,7 +502,7 @@ def _same_triangles(one: SurfaceData, other: SurfaceData) -> bool:
 
 
 def _transformed(surface: SurfaceData, matrix: Floats) -> SurfaceData:
-    vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = carried(matrix, surface.vertices)
     return SurfaceData(vertices, surface.triangles, surface.crease_angle)
 
 

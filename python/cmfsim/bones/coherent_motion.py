@@ -20,12 +20,12 @@ from cmfsim.bones.rigid_pieces import (
     PASSES,
     QUIET,
     PairedBone,
-    carried,
     median,
     rigid_pieces,
 )
 from cmfsim.values.checks import Floats
 from cmfsim.values.frozen import Frozen
+from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["CoherentMotion", "RigidPiece", "coherent_motion"]
@@ -168,8 +168,7 @@ def _denoised(
     if gone:
         rest = rest.copy()
     for patch in gone:
-        inside = np.zeros(len(rest), dtype=bool)
-        inside[patch.vertices] = True
+        inside = _inside(patch, len(rest))
         ring = _ring(paired.here, inside, RING)
         rest[inside] = np.average(rest[ring], axis=0, weights=paired.areas[ring])
     smooth = paired.averaged_within(rest, inner + LEAST_WEIGHT, AVERAGED)
@@ -244,7 +243,8 @@ def _removed(
     paired: PairedBone, pieces: list[Floats], piece: Integers, deviation: _Deviation
 ) -> tuple[RemovedBone, ...]:
     """The patches of bone that are gone from within their piece."""
-    after = Surface(paired.there, paired.triangles)
+    surface = paired.motion.surface
+    after = Surface(paired.there, surface.triangles)
     along = np.linalg.norm(deviation.split(deviation.rest)[1], axis=1)
     slid = TO_RMS * np.sqrt(median(along**2, paired.areas))
     # Bone is missing from where its surroundings went.
@@ -258,19 +258,16 @@ def _removed(
         median(np.abs(out[piece == number]), paired.areas[piece == number]) <= KNOWN
         for number in range(len(pieces))
     ]
+    # Between pieces that moved apart the mesh is stretched or squeezed: vertices are followed.
+    together = deviation.apart <= 0.5 * APART
+    within = (deviation.own >= WELL_WITHIN) | together
     found = []
-    for patch in missing_patches(
-        paired.motion.surface, after, deviation.rigid + slow, shown=np.inf
-    ):
-        inside = np.zeros(len(piece), dtype=bool)
-        inside[patch.vertices] = True
+    for patch in missing_patches(surface, after, deviation.rigid + slow, shown=np.inf):
+        inside = _inside(patch, len(piece))
         number = int(piece[patch.vertices[0]])
         ring = _ring(paired.here, inside, RING)
-        # Between pieces that moved apart the mesh is stretched or squeezed: vertices are followed.
-        together = deviation.apart <= 0.5 * APART
-        within = (deviation.own >= WELL_WITHIN) | together
         if (
-            LEAST_PATCH <= patch.area <= MOST_REMOVED
+            patch.area >= LEAST_PATCH
             and patch.depth >= SLID * slid
             and known[number]
             and within[inside].all()
@@ -287,6 +284,13 @@ def _has_another_side(paired: PairedBone, patch: Mask, out: Floats) -> bool:
     """Whether bone near a patch went outwards: the other side of a piece that moved."""
     raised = _ring(paired.here, patch, THICK) & (out > OUT_OF_LINE)
     return bool(paired.areas[raised].sum() >= 0.5 * paired.areas[patch].sum())
+
+
+def _inside(patch: RemovedBone, count: int) -> Mask:
+    """Which vertices lie in a patch."""
+    inside = np.zeros(count, dtype=bool)
+    inside[patch.vertices] = True
+    return inside
 
 
 def _ring(here: Floats, patch: Mask, reach: float) -> Mask:

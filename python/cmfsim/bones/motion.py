@@ -16,6 +16,7 @@ from cmfsim.errors import BoundaryInputError, RegistrationError
 from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.checks import Floats
+from cmfsim.values.motion import carried
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
@@ -215,7 +216,7 @@ def _misses(one: MovedSurface, other: MovedSurface) -> float:
     missed = [vertices + bent.displacement(vertices) - went]
     rigid = _rigid(surface.vertices, one.moved_vertices)
     if rigid is not None:
-        missed.append(vertices @ rigid[:3, :3].T + rigid[:3, 3] - went)
+        missed.append(carried(rigid, vertices) - went)
     return min(float(np.sqrt((m**2).sum(axis=1).mean())) for m in missed)
 
 

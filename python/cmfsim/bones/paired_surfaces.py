@@ -24,6 +24,7 @@ from cmfsim.bones.shape_fit import (
 from cmfsim.bones.stray_patches import LEAST_STRAY, StrayPatch, stray_patches
 from cmfsim.errors import RegistrationError
 from cmfsim.values.checks import Floats
+from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["PairedShape", "paired_shape"]
@@ -94,10 +95,10 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
     here, there = before.vertices, after.vertices
     bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
     fit = fit_shape(before, bone, _trimmed_motion(here, there))
-    carried = fit.carried(here)
-    closest, normals, _ = bone.closest(carried)
+    scaled = fit.carried(here)
+    closest, normals, _ = bone.closest(scaled)
     # The mesh shows all the bone that is left, so whatever lies off it is known to be off.
-    removed = missing_patches(before, bone, carried, shown=np.inf)
+    removed = missing_patches(before, bone, scaled, shown=np.inf)
     stray = stray_patches(before, bone, fit.similarity, fit.sigma)[0]
     on = fit.off <= LIES
     gone = np.zeros(len(here), dtype=bool)
@@ -105,11 +106,11 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
         gone[patch.vertices] = True
     areas = vertex_areas(before)
     total = areas.sum()
-    moved = _carried(fit.matrix, here)
+    moved = carried(fit.matrix, here)
     large = [patch.vertices for patch in removed if patch.area >= LEAST_STRAY]
     large += [patch.vertices for patch in stray]
-    rest = np.where(gone[:, None], 0.0, closest - carried)
-    along = there - carried
+    rest = np.where(gone[:, None], 0.0, closest - scaled)
+    along = there - scaled
     along -= (along * normals).sum(axis=1, keepdims=True) * normals
     kept = fit.kept & ~gone
     return PairedShape(
@@ -119,7 +120,7 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
             and areas[on & ~gone].sum() >= LEAST_LYING * total
             and not any(_is_displaced(here, there, bone, patch) for patch in large)
         ),
-        _bent(before, ((closest - carried) * normals).sum(axis=1), ~gone),
+        _bent(before, ((closest - scaled) * normals).sum(axis=1), ~gone),
         float(np.median(np.linalg.norm(along[kept], axis=1))) if kept.any() else 0.0,
         moved + rest,
         removed,
@@ -152,10 +153,6 @@ def _is_displaced(here: Floats, there: Floats, bone: Surface, patch: NDArray[np.
     except RegistrationError:
         # Squeezed to a point or a line.
         return False
-    moved = _carried(own, here[patch])
+    moved = carried(own, here[patch])
     off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
     return bool((off <= OWN).mean() >= OWN_SHARE)
-
-
-def _carried(matrix: Floats, points: Floats) -> Floats:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]

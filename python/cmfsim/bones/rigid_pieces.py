@@ -15,10 +15,10 @@ from cmfsim.bones.along_surface import AlongSurface
 from cmfsim.bones.shape_fit import LEAST_SIGMA, TO_SIGMA, TUKEY
 from cmfsim.surfaces.topology import connected_labels
 from cmfsim.values.checks import Floats
-from cmfsim.values.motion import rigid_motion
+from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["PASSES", "QUIET", "PairedBone", "carried", "median", "rigid_pieces"]
+__all__ = ["PASSES", "QUIET", "PairedBone", "median", "rigid_pieces"]
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -75,9 +75,8 @@ class PairedBone(AlongSurface):
         super().__init__(motion.surface)
         self.motion = motion
         self.there = motion.moved_vertices
-        self.triangles = motion.surface.triangles.astype(np.int64)
-        self.surface = Surface(motion.surface.vertices, motion.surface.triangles)
-        self.normals = self.surface.vertex_normals
+        before = Surface(motion.surface.vertices, motion.surface.triangles)
+        self.normals = before.vertex_normals
 
     def cost(self, matrix: Floats) -> Floats:
         """The mean square deviation from a rigid motion round each vertex, mm²."""
@@ -304,7 +303,7 @@ def _fitted_again(paired: PairedBone, pieces: list[Floats]) -> tuple[list[Floats
         costs = [paired.cost(matrix) for matrix in pieces]
         piece = np.argmin(costs, axis=0)
         if before is not None and areas[piece != before].sum() < SAME * areas.sum():
-            break
+            return pieces, costs
         held = [n for n in range(len(pieces)) if areas[piece == n].sum() >= LEAST_PIECE]
         before = piece if len(held) == len(pieces) else None
         pieces = [paired.fitted(piece == n, is_piece=True) for n in held]
@@ -359,9 +358,3 @@ def median(values: Floats, weights: Floats) -> float:
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
-def carried(matrix: Floats, points: Floats) -> Floats:
-    """Where a rigid motion takes points, (n, 3) mm."""
-    moved: Floats = points @ matrix[:3, :3].T + matrix[:3, 3]
-    return moved

@@ -14,7 +14,7 @@ from cmfsim._core import Surface
 from cmfsim.errors import RegistrationInputError
 from cmfsim.values.checks import Floats, frozen
 from cmfsim.values.frozen import Frozen
-from cmfsim.values.motion import rigid_motion
+from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
@@ -144,8 +144,7 @@ class ShapeFit(Frozen):
 
     def carried(self, points: Floats) -> Floats:
         """Where the motion takes points, with the change of size, (n, 3) mm."""
-        matrix = self.similarity
-        return points @ matrix[:3, :3].T + matrix[:3, 3]
+        return carried(self.similarity, points)
 
     @property
     def rms(self) -> float:

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from cmfsim.doctor.places import place_text
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
+from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 __all__ = ["BonePart", "check_jaws", "jaw_of"]
@@ -84,6 +86,7 @@ class BonePart:
             return False
         return np.array_equal(self.motion, np.eye(4))
 
+    @cached_property
     def points(self) -> tuple[Floats, Floats]:
         """Its own vertices and triangle centres before, and after the motion, (k, 3) mm each."""
         motion = self.motion
@@ -92,7 +95,7 @@ class BonePart:
         own = self.owns(before)
         if isinstance(motion, MovedSurface):
             return before[own], _sampled(motion.moved_vertices, surface.triangles)[own]
-        return before[own], before[own] @ motion[:3, :3].T + motion[:3, 3]
+        return before[own], carried(motion, before[own])
 
     def depth(self, places: Floats, motion: Floats | MovedSurface | None = None) -> Floats:
         """How deep places lie inside it, mm: 0 outside; before the operation without a motion."""
@@ -174,7 +177,7 @@ def _pairs(parts: Sequence[BonePart]) -> Iterator[tuple[BonePart, BonePart]]:
 
 def _deeper(lower: BonePart, upper: BonePart, joints: Sequence[Floats]) -> tuple[float, Floats]:
     """How much deeper than before the lower bone lies in the upper one at most, mm, and where."""
-    before, after = lower.points()
+    before, after = lower.points
     for joint in joints:
         away = np.linalg.norm(before - joint, axis=1) > AROUND_JOINT
         before, after = before[away], after[away]
@@ -275,7 +278,7 @@ def _joints(parts: Sequence[BonePart]) -> list[_Joint]:
     lower = [part for part in parts if part.jaw == "lower"]
     if not skull or not lower:
         return []
-    places = [part.points() for part in lower]
+    places = [part.points for part in lower]
     before, after = (np.concatenate(points) for points in zip(*places, strict=True))
     owner = np.repeat(np.arange(len(lower)), [len(points) for points, _ in places])
     far = np.linalg.norm(after - before, axis=1)

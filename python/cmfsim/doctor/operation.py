@@ -25,6 +25,7 @@ from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import Finding
+from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface
 
 __all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
@@ -233,7 +234,7 @@ def check_plan(
         apart = apart or flies
         if piece is not None and not flies:
             yield from check_against_skin(
-                evidence, name, piece[:, :3], _moved(matrix, piece[:, :3])
+                evidence, name, piece[:, :3], carried(matrix, piece[:, :3])
             )
     if not apart:
         yield from check_jaws(_parts(evidence), evidence.skull_landmarks)
@@ -325,7 +326,3 @@ def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Find
         why="moving it has no effect",
         fix="check region (posterior plane, lower, upper), and that the skin encloses it",
     )
-
-
-def _moved(matrix: Floats, points: Floats) -> Floats:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]

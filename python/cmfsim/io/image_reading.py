@@ -78,7 +78,7 @@ def _read(path: str, kind: str) -> Any:
     except RuntimeError as error:
         raise ImageInputError(
             f"{name}: cannot be decoded ({_last_line(error)[:100]}): copy it again; if other "
-            "programs show it, save it anew with one of them (DICOM: with gdcmconv or dcmconv)"
+            "programs show it, save it again with one of them (DICOM: with gdcmconv or dcmconv)"
         ) from error
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise ImageInputError(

@@ -12,9 +12,16 @@ from cmfsim._core import rigid_matrix
 from cmfsim.errors import BoundaryInputError, CaseInputError
 from cmfsim.values.checks import as_unmasked
 
-__all__ = ["RigidMotion", "decompose_motion", "plan_digits", "rigid_matrix", "rigid_motion"]
+__all__ = [
+    "RigidMotion",
+    "carried",
+    "decompose_motion",
+    "plan_digits",
+    "rigid_matrix",
+    "rigid_motion",
+]
 
-# Entries of motions are told apart to a millionth, mm or of a rotation.
+# Entries of motions are distinguished to a millionth, mm or of a rotation.
 DIGITS = 1e6
 
 
@@ -102,6 +109,12 @@ def rigid_motion(
             f"translation {t.tolist()} about centre {c.tolist()} overflows: give both in mm"
         )
     return matrix
+
+
+def carried(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where a motion takes points: (n, 3) mm."""
+    moved: NDArray[np.float64] = points @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved
 
 
 def decompose_motion(matrix: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> RigidMotion:

@@ -25,11 +25,7 @@ FORWARDS = cmfsim.rigid_motion((0.0, -4.0, 1.0))
 @pytest.fixture
 def head(tmp_path):
     """The files of the head of ellipsoids, without a case file."""
-    case = head_case.HeadCase()
-    for name, surface in case.surfaces.items():
-        cmfsim.write_surface(tmp_path / f"{name}.ply", surface)
-    cmfsim.write_landmarks(tmp_path / "skull.mrk.json", case.skull)
-    cmfsim.write_landmarks(tmp_path / "skin.mrk.json", case.skin)
+    head_case.HeadCase().write_parts(tmp_path)
     return tmp_path
 
 

@@ -124,14 +124,19 @@ def test_no_message_installs_what_is_not_published():
         assert not re.search(r"'?cmfsim\[", path.read_text("utf-8")), path
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/templates.md"])
-def test_python_that_needs_no_case_runs(page, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def names_after_python(page):
+    """What the Python blocks of a page define, typed one after the other."""
     reader = Reader()
     for language, text in blocks(page):
         if language == "python":
             reader.type(language, text)
-    assert reader.names
+    return reader.names
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/templates.md"])
+def test_python_that_needs_no_case_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert names_after_python(page)
 
 
 # ------------------------------------------------------------------ the README's case
@@ -215,11 +220,7 @@ def coarse_case(tmp_path_factory):
 @pytest.mark.parametrize("page", ["docs/building.md", "docs/predicting.md"])
 def test_python_about_a_case_runs(page, coarse_case, monkeypatch):
     monkeypatch.chdir(coarse_case)
-    reader = Reader()
-    for language, text in blocks(page):
-        if language == "python":
-            reader.type(language, text)
-    assert reader.names
+    assert names_after_python(page)
 
 
 # ------------------------------------------------------------------ whole pages, as typed

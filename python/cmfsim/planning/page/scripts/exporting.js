@@ -12,7 +12,7 @@ const matrixRows = (m) => [0, 4, 8, 12].map((r) => m.slice(r, r + 4));
 // A text that stays in its comment or quotes, whatever a case or variant is called.
 const oneLine = (text) => JSON.stringify(String(text)).replace(/\u007f|[\u0080-\u009f\u2028\u2029]/g, " ");
 
-// Entries of motions are told apart to a millionth, mm or of a rotation.
+// Entries of motions are distinguished to a millionth, mm or of a rotation.
 const DIGITS = 1e6;
 
 /**
