@@ -26,11 +26,7 @@ use crate::statics::settling::{
 use crate::statics::solution::Clock;
 use crate::vector::{add, sub};
 
-/// Maximum number of sliding nodes for which the whole flexibility is kept (three unknowns each, 12 bytes a
-/// pair: doubles and floats). A set of normals then costs a few dense products; with sweeps it costs a few
-/// passes over the factor.
-const MAX_DENSE_SLIDING: usize = 2500;
-/// Maximum number of sliding nodes for which the flexibility along the normals at rest is kept: 8 bytes a pair.
+/// Maximum number of sliding nodes for which their flexibility is kept: 54 bytes a pair of nodes, 1.9 GB.
 const MAX_KEPT_SLIDING: usize = 6000;
 
 /// Relative error of the loads of unstable springs in a plan operator: no further step corrects them.
@@ -41,10 +37,8 @@ type Rows = Vec<[f64; 3]>;
 
 /// What is kept from one plan to the next.
 enum Kept {
-    /// The factorisation of a body without sliding nodes.
-    Factor(Factor),
-    /// The factorisation, and the data for solving contact at the sliding nodes.
-    Flexible { factor: Factor, contact: ContactFactor },
+    /// The factorisation, and the data for solving contact at the sliding nodes, if there are any.
+    Factor { factor: Factor, contact: ContactFactor },
     /// The matrix, in which sliding nodes are constrained.
     Matrix(Unfactored),
 }
@@ -126,42 +120,31 @@ impl System {
             let slide_rows: Vec<u32> =
                 body.sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
             // If a part is constrained by sliding nodes alone, there is no flexibility without them.
-            let kept = !slide_rows.is_empty()
-                && body.held == Held::ByPrescribed
-                && slide_rows.len() <= MAX_KEPT_SLIDING;
-            let dense = kept && slide_rows.len() <= MAX_DENSE_SLIDING;
-            let symbolic = Arc::new(Symbolic::new(&matrix, if dense { &slide_rows } else { &[] })?);
+            let kept = body.held == Held::ByPrescribed && slide_rows.len() <= MAX_KEPT_SLIDING;
+            let symbolic = Arc::new(Symbolic::new(&matrix, if kept { &slide_rows } else { &[] })?);
             clock.lap("ordering", true);
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let fits = options.memory_limit.is_none_or(|limit| symbolic.factor_bytes() <= limit);
-            if fits && body.sliding.is_some() && !kept {
+            let contact_bytes = if kept { ContactFactor::bytes_for(slide_rows.len()) } else { 0 };
+            let needed = symbolic.factor_bytes() + contact_bytes;
+            let fits = options.memory_limit.is_none_or(|limit| needed <= limit);
+            if fits && !slide_rows.is_empty() && !kept {
                 let refactored = Unfactored::Refactored { symbolic, matrix };
                 return Ok((with(Kept::Matrix(refactored)), method));
             }
             if fits {
                 let factor = symbolic.factor(&matrix)?;
                 clock.lap("factor", true);
-                let contact = body.sliding.map(|sliding| {
-                    if dense {
-                        ContactFactor::dense(&factor, sliding)
-                    } else {
-                        ContactFactor::by_sweeps(&factor, sliding)
-                    }
-                });
-                let contact = contact.transpose()?;
-                clock.lap("contact_factor", contact.is_some());
-                let kept = match contact {
-                    Some(contact) => Kept::Flexible { factor, contact },
-                    None => Kept::Factor(factor),
-                };
-                return Ok((with(kept), method));
+                let normals = body.sliding.map_or(&[][..], Sliding::rest_normals);
+                let contact = ContactFactor::new(&factor, normals)?;
+                clock.lap("contact_factor", body.sliding.is_some());
+                return Ok((with(Kept::Factor { factor, contact }), method));
             }
             if options.method.has_factor() {
                 return Err(MtmError::OutOfMemory {
                     what: "the Cholesky factor",
-                    needed_mb: symbolic.factor_bytes() >> 20,
+                    needed_mb: needed >> 20,
                     limit_mb: options.memory_limit.map(|bytes| bytes >> 20),
                     advice: "use method=\"pcg\" or \"auto\"",
                 });
@@ -181,17 +164,14 @@ impl System {
     pub fn multigrid(&self) -> Option<&Arc<Multigrid>> {
         match &self.kept {
             Kept::Matrix(Unfactored::Iterative(iterative)) => Some(iterative.multigrid()),
-            Kept::Matrix(Unfactored::Refactored { .. })
-            | Kept::Factor(_)
-            | Kept::Flexible { .. } => None,
+            Kept::Matrix(Unfactored::Refactored { .. }) | Kept::Factor { .. } => None,
         }
     }
 
     /// Bytes of the factor or preconditioner.
     pub fn bytes(&self) -> usize {
         match &self.kept {
-            Kept::Factor(factor) => factor.bytes(),
-            Kept::Flexible { factor, contact } => factor.bytes() + contact.bytes(),
+            Kept::Factor { factor, contact } => factor.bytes() + contact.bytes(),
             Kept::Matrix(Unfactored::Refactored { symbolic, .. }) => symbolic.factor_bytes(),
             Kept::Matrix(Unfactored::Iterative(iterative)) => iterative.bytes(),
         }
@@ -200,7 +180,7 @@ impl System {
     /// A⁻¹ b without contact.
     pub fn solve(&self, b: &[[f64; 3]], solve: &mut Solve<'_>) -> Result<Vec<[f64; 3]>> {
         match &self.kept {
-            Kept::Factor(factor) | Kept::Flexible { factor, .. } => {
+            Kept::Factor { factor, .. } => {
                 let x = in_pool(|| factor.solve(b));
                 solve.effort.error_estimate = direct_error(factor, &x);
                 Ok(x)
@@ -220,14 +200,10 @@ impl System {
         solve: &mut Solve<'_>,
     ) -> Result<Settled> {
         match &self.kept {
-            Kept::Factor(_) | Kept::Flexible { .. } if !settle.linked.links.is_empty() => {
+            Kept::Factor { .. } if !settle.linked.links.is_empty() => {
                 Err(touching_needs_pcg(Method::Cholesky))
             }
-            Kept::Factor(factor) => {
-                let contact = ContactFactor::by_sweeps(factor, settle.sliding)?;
-                settled_by_flexibility(factor, &contact, b, settle, solve)
-            }
-            Kept::Flexible { factor, contact } => {
+            Kept::Factor { factor, contact } => {
                 settled_by_flexibility(factor, contact, b, settle, solve)
             }
             Kept::Matrix(system) => system.settled(b, settle, solve),
@@ -279,7 +255,7 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
         let Some((sliding, frozen)) = sliding else {
-            if let Kept::Factor(factor) | Kept::Flexible { factor, .. } = &self.kept {
+            if let Kept::Factor { factor, .. } = &self.kept {
                 factor.solve_many(&mut columns);
                 return Ok(columns);
             }
@@ -311,30 +287,13 @@ impl System {
                 reach,
             })
         };
-        let flexible = |factor: &Factor, contact: &ContactFactor, columns| match contact.tail() {
-            Some(tail) => {
-                let kept = FrozenContact::new(tail, frozen.rows, frozen.springs)?;
+        match &self.kept {
+            Kept::Factor { factor, contact } => {
+                let kept = FrozenContact::new(contact.flexibility(), frozen.rows, frozen.springs)?;
                 let forces = |k, free: &Rows| conditions(k, &mut |c| Ok(kept.forces(free, c)));
                 check()?;
                 all_together(factor, sliding, columns, forces)
             }
-            None => {
-                let solve = |(k, b): (usize, &Rows)| {
-                    check()?;
-                    conditions(k, &mut |c| {
-                        let mut answers = contact.answers(factor, b);
-                        let forces = answers.respond(c, 0.0)?.forces;
-                        Ok(answers.of_all(&forces))
-                    })
-                };
-                columns.iter().enumerate().map(solve).collect()
-            }
-        };
-        match &self.kept {
-            Kept::Factor(factor) => {
-                flexible(factor, &ContactFactor::by_sweeps(factor, sliding)?, columns)
-            }
-            Kept::Flexible { factor, contact } => flexible(factor, contact, columns),
             Kept::Matrix(system) => {
                 // All columns have the same constraints, so one trial serves them.
                 let mut trail = Trail::default();

@@ -18,7 +18,7 @@ pub struct TailFlexibility {
 impl TailFlexibility {
     /// The flexibility of the tail from `lower`, its part of the factor; `rows` is the row of the system of
     /// each tail node.
-    pub(super) fn new(lower: &DenseFactor, rows: Vec<u32>) -> Self {
+    pub(super) fn new(lower: DenseFactor, rows: Vec<u32>) -> Self {
         let flexibility = lower.inverse();
         Self { rough: Rough::of(&flexibility), flexibility, rows }
     }

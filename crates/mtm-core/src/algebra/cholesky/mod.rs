@@ -6,7 +6,6 @@ mod dense;
 mod grid;
 mod normal;
 mod numeric;
-mod reach;
 mod structure;
 mod sweep;
 mod symmetric;
@@ -23,7 +22,6 @@ pub use normal::{
     Found, NormalFactor, Precision, Preconditioner, Progress, ROUGH, RowKey, conjugate_gradients,
     hopeless,
 };
-pub use reach::Reach;
 use structure::{minimum_degree, supernodal_structure};
 use sweep::Sweep;
 pub use symmetric::{DenseFactor, DenseSymmetric, Rough};
@@ -163,13 +161,6 @@ impl Factor {
         self.symbolic.unpermuted(x)
     }
 
-    /// The part of the factor that the given rows of the system reach.
-    pub fn reach(&self, rows: &[u32]) -> Reach {
-        let position = structure::positions(&self.symbolic.order);
-        let places = rows.iter().map(|&row| 3 * position[row as usize] as usize).collect();
-        Reach::new(&self.symbolic.structure, places)
-    }
-
     /// The factor, after it has recovered a known solution.
     ///
     /// The residual of a solve is not a measure of its error; a known solution is, at the price of one product
@@ -278,51 +269,6 @@ impl Factor {
         self.symbolic.unpermuted(&x)
     }
 
-    /// Displacements of the rows of `reach` under forces on them alone; `x`, as long as the unknowns, is
-    /// zero before and after.
-    pub fn respond(&self, reach: &Reach, forces: &[[f64; 3]], x: &mut [f64]) -> Vec<[f64; 3]> {
-        let columns = (&self.symbolic.structure, self.values.as_slice());
-        reach.scatter(forces, x);
-        reach.forward(columns, x);
-        reach.backward(columns, x);
-        let found = reach.gather(x);
-        reach.clear(&self.symbolic.structure, x);
-        found
-    }
-
-    /// Displacements of the rows of `reach` from x = L⁻¹ P b; x stays as it is elsewhere.
-    pub fn reach_displacements(&self, reach: &Reach, x: &mut [f64]) -> Vec<[f64; 3]> {
-        reach.backward((&self.symbolic.structure, &self.values), x);
-        reach.gather(x)
-    }
-
-    /// Adds L⁻¹ P f for forces on the rows of `reach` to x = L⁻¹ P b; `work`, as long, is zero before and
-    /// after.
-    pub fn add_reach_forces(
-        &self,
-        reach: &Reach,
-        forces: &[[f64; 3]],
-        work: &mut [f64],
-        x: &mut [f64],
-    ) {
-        reach.scatter(forces, work);
-        reach.forward((&self.symbolic.structure, &self.values), work);
-        for (x, v) in x.iter_mut().zip(work.iter()) {
-            *x += v;
-        }
-        reach.clear(&self.symbolic.structure, work);
-    }
-
-    /// Flexibility of the rows of `reach` along a unit normal each, mm/N, and for each of its rows the row of
-    /// the set.
-    pub fn reach_flexibility(
-        &self,
-        reach: &Reach,
-        normals: &[[f64; 3]],
-    ) -> (DenseSymmetric, Vec<usize>) {
-        reach.normal_flexibility((&self.symbolic.structure, &self.values), normals)
-    }
-
     /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, order 3·n_tail, mm/N.
     pub fn tail_flexibility(&self) -> TailFlexibility {
         let (size, first) = (3 * self.symbolic.n_tail, self.symbolic.first_of_tail());
@@ -343,6 +289,6 @@ impl Factor {
             }
         }
         let rows = self.symbolic.order[self.symbolic.order.len() - self.symbolic.n_tail..].to_vec();
-        TailFlexibility::new(&DenseFactor::from_lower(size, lower), rows)
+        TailFlexibility::new(DenseFactor::from_lower(size, lower), rows)
     }
 }

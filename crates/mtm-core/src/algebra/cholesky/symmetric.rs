@@ -46,19 +46,31 @@ impl Number for f32 {
 /// Dense symmetric matrix, lower triangle by columns.
 pub struct DenseSymmetric<T = f64> {
     size: usize,
-    /// Column by column, `size` each; entries above the diagonal are not read.
+    /// Column by column, each from the diagonal down.
     values: Vec<T>,
 }
 
 /// L of A = L Lᵀ.
 pub struct DenseFactor {
     size: usize,
+    /// Column by column, `size` each; entries above the diagonal are not read.
     values: Vec<f64>,
+}
+
+/// Where column `c` of a triangle of `size` columns begins.
+#[inline(always)]
+fn column_start(size: usize, c: usize) -> usize {
+    c * (2 * size + 1 - c) / 2
 }
 
 impl DenseSymmetric {
     /// The lower triangle of `values`, `size` columns of `size` entries.
-    pub(super) fn from_lower(size: usize, values: Vec<f64>) -> Self {
+    fn from_square(size: usize, mut values: Vec<f64>) -> Self {
+        for c in 0..size {
+            values.copy_within(c * size + c..(c + 1) * size, column_start(size, c));
+        }
+        values.truncate(column_start(size, size));
+        values.shrink_to_fit();
         Self { size, values }
     }
 
@@ -69,7 +81,12 @@ impl DenseSymmetric {
 
     /// The Cholesky factor; on failure, the row of the first pivot that is not positive.
     pub fn factor(self) -> Result<DenseFactor, usize> {
-        let Self { size: n, mut values } = self;
+        let n = self.size;
+        let mut values = vec![0.0; n * n];
+        for c in 0..n {
+            values[c * n + c..(c + 1) * n].copy_from_slice(self.column(c));
+        }
+        drop(self);
         if n == 0 {
             return Ok(DenseFactor { size: n, values });
         }
@@ -92,7 +109,7 @@ impl<T: Number> DenseSymmetric<T> {
     /// The matrix of `size` rows whose columns `fill` writes from the diagonal down, in parallel: `fill`
     /// receives the column index and a slice of zeros.
     pub fn from_columns(size: usize, fill: impl Fn(usize, &mut [T]) + Sync) -> Self {
-        Self::from_columns_in(vec![T::default(); size * size], size, fill)
+        Self::from_columns_in(Vec::new(), size, fill)
     }
 
     /// The same in `values`, memory of an earlier matrix: `fill` receives what it holds.
@@ -101,11 +118,15 @@ impl<T: Number> DenseSymmetric<T> {
         size: usize,
         fill: impl Fn(usize, &mut [T]) + Sync,
     ) -> Self {
-        values.resize(size * size, T::default());
-        values
-            .par_chunks_mut(size.max(1))
-            .enumerate()
-            .for_each(|(c, column)| fill(c, &mut column[c..]));
+        values.resize(column_start(size, size), T::default());
+        let mut columns = Vec::with_capacity(size);
+        let mut rest = &mut values[..];
+        for c in 0..size {
+            let (column, after) = rest.split_at_mut(size - c);
+            columns.push(column);
+            rest = after;
+        }
+        columns.into_par_iter().enumerate().for_each(|(c, column)| fill(c, column));
         Self { size, values }
     }
 
@@ -117,7 +138,8 @@ impl<T: Number> DenseSymmetric<T> {
     /// Column `c` from the diagonal down.
     #[inline(always)]
     pub fn column(&self, c: usize) -> &[T] {
-        &self.values[c * self.size + c..(c + 1) * self.size]
+        let start = column_start(self.size, c);
+        &self.values[start..start + self.size - c]
     }
 
     /// A x: each entry below the diagonal is read once and used twice.
@@ -220,14 +242,12 @@ impl Rough {
     pub fn of(matrix: &DenseSymmetric) -> Self {
         let n = matrix.size;
         let scale: Vec<f64> = (0..n).map(|c| matrix.column(c)[0].sqrt()).collect();
-        let mut values = vec![0.0; n * n];
-        values.par_chunks_mut(n.max(1)).enumerate().for_each(|(c, column)| {
-            let entries = column[c..].iter_mut().zip(matrix.column(c)).zip(&scale[c..]);
-            for ((to, v), s) in entries {
+        let matrix = DenseSymmetric::from_columns(n, |c, column| {
+            for ((to, v), s) in column.iter_mut().zip(matrix.column(c)).zip(&scale[c..]) {
                 *to = (v / (s * scale[c])) as f32;
             }
         });
-        Self { matrix: DenseSymmetric { size: n, values }, scale }
+        Self { matrix, scale }
     }
 
     /// Bytes held.
@@ -252,13 +272,12 @@ impl DenseFactor {
     }
 
     /// A⁻¹ = L⁻ᵀ L⁻¹: for many products, each of which reads it once, whereas a solution reads L twice.
-    pub fn inverse(&self) -> DenseSymmetric {
-        let size = self.size;
+    pub fn inverse(self) -> DenseSymmetric {
+        let Self { size, mut values } = self;
         let par = parallelism(size);
-        let lower = MatRef::from_column_major_slice(&self.values, size, size);
+        let lower = MatRef::from_column_major_slice(&values, size, size);
         let mut inverse = Mat::<f64>::zeros(size, size);
         invert_lower_triangular(inverse.as_mut(), lower, par);
-        let mut values = vec![0.0; size * size];
         triangular::matmul(
             MatMut::from_column_major_slice_mut(&mut values, size, size),
             BlockStructure::TriangularLower,
@@ -270,7 +289,7 @@ impl DenseFactor {
             1.0,
             par,
         );
-        DenseSymmetric { size, values }
+        DenseSymmetric::from_square(size, values)
     }
 
     /// Bᵀ A⁻¹ B, for the columns of B one after the other.
@@ -294,7 +313,7 @@ impl DenseFactor {
             1.0,
             par,
         );
-        DenseSymmetric { size, values }
+        DenseSymmetric::from_square(size, values)
     }
 
     /// Bytes held.

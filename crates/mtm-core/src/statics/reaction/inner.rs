@@ -22,7 +22,7 @@ pub(super) enum Aim {
 
 /// The rows of one step with their preconditioner.
 pub(super) struct Inner<'a> {
-    along: Along<'a>,
+    along: Along,
     rows: &'a Rows,
     diagonal: Vec<f64>,
     /// The factorisation that preconditions, and whether it was made for these rows.
@@ -30,25 +30,25 @@ pub(super) struct Inner<'a> {
     pub is_made: bool,
     preconditioner: Preconditioner,
     most: usize,
-    /// The flexibility for a new factorisation, if it is stored.
-    tail: Option<&'a TailFlexibility>,
+    /// The flexibility for a new factorisation.
+    tail: &'a TailFlexibility,
 }
 
 impl<'a> Inner<'a> {
-    /// `most`: number of steps after which a solve is given up.
+    /// `most`: number of steps above which a new factorisation takes less time.
     pub fn new(
-        along: Along<'a>,
+        along: Along,
         rows: &'a Rows,
         (diagonal, kept): (Vec<f64>, Arc<NormalFactor>),
         most: usize,
-        tail: Option<&'a TailFlexibility>,
+        tail: &'a TailFlexibility,
     ) -> Self {
         let preconditioner = Preconditioner::new(diagonal.clone(), &rows.keys, kept.clone());
         Self { along, rows, diagonal, kept, is_made: false, preconditioner, most, tail }
     }
 
     /// Displacement along each row and axis under forces along them.
-    pub fn multiply(&mut self, forces: &[f64]) -> Vec<f64> {
+    pub fn multiply(&self, forces: &[f64]) -> Vec<f64> {
         self.along.multiply(forces)
     }
 
@@ -68,10 +68,10 @@ impl<'a> Inner<'a> {
             Aim::Measure(enough) => enough,
         };
         let first = self.iterate(goals, enough(self));
-        let (Err(_), Some(tail), false) = (&first, self.tail, self.is_made) else {
+        if first.is_ok() || self.is_made {
             return first;
-        };
-        self.kept = Arc::new(self.rows.factor(tail)?);
+        }
+        self.kept = Arc::new(self.rows.factor(self.tail)?);
         self.is_made = true;
         let diagonal = self.diagonal.clone();
         self.preconditioner = Preconditioner::new(diagonal, &self.rows.keys, self.kept.clone());
@@ -79,12 +79,8 @@ impl<'a> Inner<'a> {
     }
 
     fn iterate(&mut self, goals: &[f64], enough: f64) -> Result<Found> {
-        let Self { along, preconditioner, most, tail, .. } = self;
-        let can_factor = tail.is_some();
-        let give_up = |progress: &Progress| match can_factor {
-            true => hopeless(progress, *most),
-            false => progress.step >= *most,
-        };
+        let Self { along, preconditioner, most, .. } = self;
+        let give_up = |progress: &Progress| hopeless(progress, *most);
         let product = |forces: &[f64]| along.multiply(forces);
         conjugate_gradients(product, preconditioner, goals, enough, give_up).map_err(|left| {
             MtmError::NotConverged {
@@ -102,7 +98,7 @@ impl<'a> Inner<'a> {
     }
 
     /// Memory for the next one.
-    pub fn into_memory(self) -> (Vec<f32>, Vec<f64>) {
+    pub fn into_memory(self) -> Vec<f32> {
         self.along.into_memory()
     }
 }

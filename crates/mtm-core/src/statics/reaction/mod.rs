@@ -1,14 +1,11 @@
 //! How sliding nodes respond to constraints if the factorisation of the body without them is available.
 //!
 //! Contact forces λ along the normals N follow from (Nᵀ F N) λ = g − Nᵀ u_free, where F = A⁻¹ is the flexibility
-//! of the sliding nodes. Normals change with each step of contact. If there are few sliding nodes, F is stored,
-//! and the flexibility along the normals and the axes of springs, a ninth of it or a quarter, is assembled for
-//! each step in single precision. Conjugate gradients run in it, preconditioned with the matrix at rest. The sum
-//! of their forces is then applied to the nodes: by an approximate product in early steps, otherwise by exact
-//! ones, from which the forces are corrected (iterative refinement; Wilkinson 1963).
-//!
-//! If there are many sliding nodes, products are computed by sweeps through the part of the factor that the
-//! nodes reach. This takes less time to set up and less memory, but every product takes as long as a solve.
+//! of the sliding nodes, which is stored. Normals change with each step of contact. The flexibility along the
+//! normals and the axes of springs, a ninth of F or a quarter, is assembled for each step in single precision.
+//! Conjugate gradients run in it, preconditioned with the matrix at rest. The sum of their forces is then applied
+//! to the nodes: by an approximate product in early steps, otherwise by exact ones, from which the forces are
+//! corrected (iterative refinement; Wilkinson 1963).
 
 mod along;
 mod inner;
@@ -20,17 +17,15 @@ use std::sync::Arc;
 use along::Along;
 use inner::{Aim, Found, Inner};
 
-use crate::algebra::cholesky::{Factor, NormalFactor, Precision, ROUGH, Reach, TailFlexibility};
-use crate::contact::{Constraints, ContactRow, Sliding, Spring};
+use crate::algebra::cholesky::{Factor, NormalFactor, Precision, ROUGH, TailFlexibility};
+use crate::contact::{Constraints, ContactRow, Spring};
 use crate::error::{MtmError, Result};
 use crate::vector::{add, dot, norm, scaled, sub};
 use krylov::{Krylov, length};
 use rows::pushes;
 pub(crate) use rows::{Rows, singular};
 
-/// Maximum number of conjugate gradient steps with sweeps, and with an assembled matrix: ten are needed on smooth
-/// bone, a hundred on teeth. A new factorisation takes as long as sixty products of the matrix.
-const MOST_SWEEPS: usize = 1000;
+/// Maximum number of conjugate gradient steps: a new factorisation takes as long as sixty products of the matrix.
 const MOST_PRODUCTS: usize = 60;
 /// Accuracy of a step above which approximate products do for the nodes as well.
 const ROUGH_STEP: f64 = 1e-2;
@@ -54,30 +49,16 @@ const EXACT_SHARE: f64 = 1e-4;
 
 /// Data kept for sliding nodes: their flexibility, and the inverse of its part along the normals at rest.
 pub(crate) struct ContactFactor {
-    flexibility: Flexibility,
+    flexibility: TailFlexibility,
     rest: Arc<NormalFactor>,
 }
 
-/// Displacements of sliding nodes under forces on them.
-enum Flexibility {
-    /// Stored as a matrix.
-    Dense(TailFlexibility),
-    /// Computed by sweeps.
-    Sweeps {
-        reach: Reach,
-        /// Row of the system of each sliding node.
-        rows: Vec<u32>,
-        /// Flexibility of each on its own along its normal at rest, mm/N.
-        own: Vec<f64>,
-    },
-}
-
 impl ContactFactor {
-    /// The whole flexibility of the sliding nodes, which are last in the elimination order.
-    pub fn dense(factor: &Factor, sliding: &Sliding) -> Result<Self> {
-        let tail = factor.tail_flexibility();
+    /// The flexibility of the sliding nodes, which are last in the elimination order; `normals`: of each, at rest.
+    pub fn new(factor: &Factor, normals: &[[f64; 3]]) -> Result<Self> {
+        let flexibility = factor.tail_flexibility();
         let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
-        let rows: Vec<ContactRow> = sliding.rest_normals().iter().enumerate().map(row).collect();
+        let rows: Vec<ContactRow> = normals.iter().enumerate().map(row).collect();
         let offsets = vec![0.0; rows.len()];
         let rows = Rows::new(&Constraints {
             rows: &rows,
@@ -88,51 +69,26 @@ impl ContactFactor {
             spring_share: 0.0,
             reach: f64::INFINITY,
         });
-        let rest = Arc::new(rows.factor(&tail)?.inverse());
-        Ok(Self { flexibility: Flexibility::Dense(tail), rest })
+        let rest = Arc::new(rows.factor(&flexibility)?.inverse());
+        Ok(Self { flexibility, rest })
     }
 
-    /// The flexibility along the normals at rest, and the data that sweeps need for the rest of it.
-    pub fn by_sweeps(factor: &Factor, sliding: &Sliding) -> Result<Self> {
-        let rows: Vec<u32> = sliding.nodes().iter().map(|n| n.row).collect();
-        let reach = factor.reach(&rows);
-        let (normal, order) = factor.reach_flexibility(&reach, sliding.rest_normals());
-        let mut own = vec![0.0; rows.len()];
-        for (c, &i) in order.iter().enumerate() {
-            own[i] = normal.column(c)[0];
-        }
-        let keys = order.iter().map(|&i| (i, 0)).collect();
-        let rest = NormalFactor::new(normal, keys).map_err(|at| singular(rows[order[at]]))?;
-        let rest = Arc::new(rest.inverse());
-        Ok(Self { flexibility: Flexibility::Sweeps { reach, rows, own }, rest })
+    /// Bytes held for `nodes` sliding nodes: their flexibility in double and in single precision, and the inverse of
+    /// its part along the normals in single precision.
+    pub fn bytes_for(nodes: usize) -> usize {
+        let triangle = |size: usize| size * (size + 1) / 2;
+        12 * triangle(3 * nodes) + 4 * triangle(nodes)
     }
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        let flexibility = match &self.flexibility {
-            Flexibility::Dense(tail) => tail.bytes(),
-            Flexibility::Sweeps { reach, rows, .. } => reach.bytes() + 12 * rows.len(),
-        };
-        flexibility + self.rest.bytes()
+        self.flexibility.bytes() + self.rest.bytes()
     }
 
     /// The responses to the constraints of one plan, with forces `b`.
     pub fn answers<'a>(&'a self, factor: &'a Factor, b: &[[f64; 3]]) -> Answers<'a> {
-        let (free, swept) = match &self.flexibility {
-            Flexibility::Dense(tail) => {
-                let (forces, swept) = factor.on_tail(b);
-                (tail.respond(&forces), swept)
-            }
-            Flexibility::Sweeps { reach, .. } => {
-                let mut swept = factor.permuted(b);
-                factor.forward(&mut swept);
-                (factor.reach_displacements(reach, &mut swept.clone()), swept)
-            }
-        };
-        let work = match &self.flexibility {
-            Flexibility::Dense(_) => Vec::new(),
-            Flexibility::Sweeps { .. } => vec![0.0; swept.len()],
-        };
+        let (forces, swept) = factor.on_tail(b);
+        let free = self.flexibility.respond(&forces);
         let (moved, pushed) = (vec![[0.0; 3]; free.len()], vec![[0.0; 3]; free.len()]);
         Answers {
             contact: self,
@@ -142,18 +98,14 @@ impl ContactFactor {
             pushed,
             moved,
             precision: Precision::Exact,
-            work,
             memory: Vec::new(),
             made: None,
         }
     }
 
-    /// The whole flexibility of the sliding nodes, if it is stored.
-    pub fn tail(&self) -> Option<&TailFlexibility> {
-        match &self.flexibility {
-            Flexibility::Dense(tail) => Some(tail),
-            Flexibility::Sweeps { .. } => None,
-        }
+    /// The flexibility of the sliding nodes.
+    pub fn flexibility(&self) -> &TailFlexibility {
+        &self.flexibility
     }
 }
 
@@ -170,8 +122,6 @@ pub(crate) struct Answers<'a> {
     /// Their contribution to the displacements, mm, and its accuracy.
     moved: Vec<[f64; 3]>,
     precision: Precision,
-    /// Zeros for the sweeps.
-    work: Vec<f64>,
     /// Memory of the last assembled matrix.
     memory: Vec<f32>,
     /// The last factorisation made for this plan, if the one at rest was not good enough.
@@ -190,7 +140,7 @@ pub(crate) struct Answer {
     pub is_carried: bool,
 }
 
-impl Answers<'_> {
+impl<'a> Answers<'a> {
     /// The response of the sliding nodes to conditions `c`, with the relative accuracy that `c` requests;
     /// `tolerance`: of contact, over the size of the scene.
     ///
@@ -200,8 +150,7 @@ impl Answers<'_> {
     /// springs that make the body unstable.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` if the loads make the body unstable and their reach is unlimited, or if the rows
-    /// are degenerate.
+    /// `NotPositiveDefinite` if the rows are degenerate.
     pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Answer> {
         let unstable: Vec<Spring> =
             c.springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
@@ -211,7 +160,7 @@ impl Answers<'_> {
         if inner.is_made {
             self.made = Some(inner.kept.clone());
         }
-        (self.memory, self.work) = inner.into_memory();
+        self.memory = inner.into_memory();
         let (solved, is_carried) = found?;
         let (displacements, forces) = (self.displacements(), self.pushed.clone());
         Ok(Answer { displacements, forces, solved, is_carried })
@@ -288,9 +237,8 @@ impl Answers<'_> {
             let there = inner.multiply(&push);
             let goals: Vec<f64> = there[..n].iter().map(|v| -v).collect();
             // Later directions contribute less, so that errors of their responses count less (Simoncini &
-            // Szyld 2003). An operator has no next step that corrects them.
-            let most = if c.reach.is_finite() { MOST_PROBE_ERROR } else { ROUGH };
-            let error = (c.spring_share * size / krylov.left).min(most);
+            // Szyld 2003).
+            let error = (c.spring_share * size / krylov.left).min(MOST_PROBE_ERROR);
             let answer = inner.solve(&goals, Aim::Share(error))?;
             let moved: Vec<f64> =
                 there[n..].iter().zip(&answer.along[n..]).map(|(a, b)| a + b).collect();
@@ -301,10 +249,6 @@ impl Answers<'_> {
             if krylov.left <= c.spring_share * size {
                 break;
             }
-        }
-        let is_open = krylov.softness > 0.0 || krylov.left > c.spring_share * size;
-        if c.reach.is_infinite() && is_open {
-            return Err(unheld());
         }
         let mut loads = vec![0.0; unstable.len()];
         for ((y, q), answer) in krylov.solution.iter().zip(&krylov.basis).zip(&answered) {
@@ -320,23 +264,13 @@ impl Answers<'_> {
     /// The rows and the axes of `unstable` springs, ready to be solved for.
     fn inner<'r>(&mut self, rows: &'r Rows, unstable: &[Spring]) -> Inner<'r>
     where
-        Self: 'r,
+        'a: 'r,
     {
         let kept = self.made.as_ref().unwrap_or(&self.contact.rest).clone();
-        let diagonal = self.diagonal(rows);
-        match &self.contact.flexibility {
-            Flexibility::Dense(tail) => {
-                let memory = std::mem::take(&mut self.memory);
-                let along = Along::assembled(tail, rows, unstable, memory);
-                Inner::new(along, rows, (diagonal, kept), MOST_PRODUCTS, Some(tail))
-            }
-            Flexibility::Sweeps { reach, .. } => {
-                let work = std::mem::take(&mut self.work);
-                let body = (self.factor, reach, self.free.len());
-                let along = Along::by_sweeps(body, rows, unstable, work);
-                Inner::new(along, rows, (diagonal, kept), MOST_SWEEPS, None)
-            }
-        }
+        let contact: &'a ContactFactor = self.contact;
+        let tail = &contact.flexibility;
+        let along = Along::new(tail, rows, unstable, std::mem::take(&mut self.memory));
+        Inner::new(along, rows, (self.diagonal(rows), kept), MOST_PRODUCTS, tail)
     }
 
     /// Displacements after the last response, mm.
@@ -375,43 +309,24 @@ impl Answers<'_> {
         self.pushed = forces;
     }
 
-    fn respond_to(&mut self, forces: &[[f64; 3]], precision: Precision) -> Vec<[f64; 3]> {
-        match (&self.contact.flexibility, precision) {
-            (Flexibility::Dense(tail), Precision::Rough) => tail.respond_roughly(forces),
-            (Flexibility::Dense(tail), Precision::Exact) => tail.respond(forces),
-            (Flexibility::Sweeps { reach, .. }, _) => {
-                // Not while the iterations of a step hold the memory.
-                self.work.resize(self.swept.len(), 0.0);
-                self.factor.respond(reach, forces, &mut self.work)
-            }
+    fn respond_to(&self, forces: &[[f64; 3]], precision: Precision) -> Vec<[f64; 3]> {
+        match precision {
+            Precision::Rough => self.contact.flexibility.respond_roughly(forces),
+            Precision::Exact => self.contact.flexibility.respond(forces),
         }
     }
 
     /// Flexibility of each row on its own, mm/N.
     fn diagonal(&self, rows: &Rows) -> Vec<f64> {
-        let own = |r: &ContactRow| match &self.contact.flexibility {
-            Flexibility::Dense(tail) => tail.own(r.node, r.normal),
-            Flexibility::Sweeps { own, .. } => own[r.node],
-        };
+        let own = |r: &ContactRow| self.contact.flexibility.own(r.node, r.normal);
         rows.rows.iter().zip(&rows.softness).map(|(r, s)| own(r) + s).collect()
     }
 
     /// Displacements of all rows of the system with `forces` on the sliding nodes.
     pub fn of_all(self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let Self { factor, mut swept, mut work, .. } = self;
-        match &self.contact.flexibility {
-            Flexibility::Dense(tail) => {
-                let moved = tail.respond(forces);
-                let there: Vec<_> =
-                    moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
-                factor.above_tail(swept, &there)
-            }
-            Flexibility::Sweeps { reach, .. } => {
-                factor.add_reach_forces(reach, forces, &mut work, &mut swept);
-                factor.backward(&mut swept);
-                factor.unpermuted(&swept)
-            }
-        }
+        let moved = self.contact.flexibility.respond(forces);
+        let there: Vec<_> = moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
+        self.factor.above_tail(self.swept, &there)
     }
 }
 
