@@ -1,5 +1,7 @@
 """Variants of a CT: effects of other scanners, patients and exports on an image."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -223,3 +225,100 @@ def turned(image: ImageData, angles: tuple[float, float, float]) -> tuple[ImageD
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn, middle - turn @ middle
     return ImageData(seen, step, low), matrix
+
+
+def with_mouth_open(
+    image: ImageData, landmarks: Mapping[str, np.ndarray], degrees: float = 15.0
+) -> ImageData:
+    """The lower jaw turned about its joints, with the skin over it; the mouth is filled with air.
+
+    What is below the occlusal plane in front of the spine turns; between it and the rest, tissue is
+    stretched over a few millimetres.
+    """
+    place = landmarks
+    step, origin = np.asarray(image.spacing), np.asarray(image.lowest)
+    joint = 0.5 * (place["supraglenoid_L"] + place["supraglenoid_R"]) + [0.0, 3.0, -12.0]
+    bite = 0.5 * (place["supradentale"] + place["infradentale"])
+    left, right = place["occlusal_line_L"], place["occlusal_line_R"]
+    up = np.cross(left - right, bite - 0.5 * (left + right))
+    up *= np.sign(up[2]) / np.linalg.norm(up)
+    turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    points = origin + step * np.moveaxis(np.indices(image.values.shape), 0, -1)
+    middle, back = float(place["nasion"][0]), float(left[1])
+    # Where turned tissue comes from.
+    source = (points - joint) @ turn + joint
+    aside = np.abs(source[..., 0] - middle)
+    behind = np.clip((points[..., 1] - back - 2.0) / 8.0, 0.0, 1.0)
+    low = (source - bite) @ up < 0.0
+    low |= (behind > 0.5) & (aside > 30.0)
+    low &= source[..., 2] < joint[2] + 4.0
+    front = 1.0 / (1.0 + np.exp((points[..., 1] - joint[1] - 4.0) / 4.0))
+    share = (front * low)[..., None]
+    index = ((points + share * (source - points)) - origin) / step
+    values = np.asarray(image.values, dtype=np.float32)
+    opened = ndimage.map_coordinates(
+        values, np.moveaxis(index, -1, 0), order=1, mode="constant", cval=-1000.0
+    )
+    gap = ((points - bite) @ up < 0.0) & ~low & (front > 0.5)
+    body = ndimage.binary_erosion(ndimage.binary_fill_holes(values > -300.0), iterations=3)
+    mouth = gap & body & (np.abs(points[..., 0] - middle) < 24.0) & (points[..., 1] < back + 5.0)
+    opened[gap & (opened > 200.0)] = 40.0
+    opened[mouth] = -1000.0
+    return image.with_values(np.round(opened).clip(-1024, 3071).astype(np.int16))
+
+
+def without_teeth(image: ImageData, landmarks: Mapping[str, np.ndarray]) -> ImageData:
+    """Crowns and necks of both rows replaced by soft tissue."""
+    place = landmarks
+    bite = 0.5 * (place["supradentale"] + place["infradentale"])
+    left, right = place["occlusal_line_L"], place["occlusal_line_R"]
+    up = np.cross(left - right, bite - 0.5 * (left + right))
+    up *= np.sign(up[2]) / np.linalg.norm(up)
+    x, y, z = (a - b for a, b in zip(image.axes(), bite, strict=True))
+    height = x * up[0] + y * up[1] + z * up[2]
+    row = (np.abs(height) < 10.0) & (np.abs(x) < 34.0) & (y + bite[1] < left[1] - 2.0)
+    noise = np.random.default_rng(0).normal(40.0, 20.0, image.values.shape)
+    values = np.where(row & (image.values > 200), noise, image.values)
+    return image.with_values(np.round(values).astype(np.int16))
+
+
+def scaled(image: ImageData, factor: float) -> ImageData:
+    """A head of another size, such as a child's."""
+    spacing, lowest = np.asarray(image.spacing), np.asarray(image.lowest)
+    return ImageData(image.values, factor * spacing, factor * lowest)
+
+
+def resampled(image: ImageData, spacing: tuple[float, float, float]) -> ImageData:
+    """The same extent in other voxels, linearly."""
+    own, step = np.asarray(image.spacing), np.asarray(spacing)
+    counts = np.floor((np.array(image.values.shape) - 1) * own / step).astype(int) + 1
+    lines = [np.arange(n) * s / o for n, s, o in zip(counts, step, own, strict=True)]
+    values = image.values
+    for axis, line in enumerate(lines):
+        low = np.minimum(line.astype(int), values.shape[axis] - 2)
+        part = (line - low).reshape([-1 if a == axis else 1 for a in range(3)]).astype(np.float32)
+        values = values.take(low, axis) * (1 - part) + values.take(low + 1, axis) * part
+    return ImageData(np.round(values).astype(np.int16), step, image.lowest)
+
+
+def one_side(image: ImageData, middle: float, past: float = 15.0) -> ImageData:
+    """The head's left half, with a little of the right one, mm."""
+    return cropped(image, 0, low=middle - past)
+
+
+def with_beard(image: ImageData, landmarks: Mapping[str, np.ndarray]) -> ImageData:
+    """Hair of 10 mm round the chin: tufts of between air and water."""
+    values = np.asarray(image.values, dtype=np.float32)
+    x, y, z = image.axes()
+    body = ndimage.binary_fill_holes(values > -300.0)
+    out = ndimage.distance_transform_edt(~body, sampling=np.asarray(image.spacing))
+    below = 0.5 * (landmarks["supradentale"] + landmarks["mid_philtrum"])
+    low = (z < below[2]) & (z > landmarks["menton"][2] - 25.0) & (y < landmarks["gonion_L"][1])
+    bite = 0.5 * (landmarks["supradentale"] + landmarks["infradentale"])
+    lips = (np.abs(x - bite[0]) < 27.0) & (np.abs(z - bite[2]) < 8.0)
+    hair = np.random.default_rng(0).standard_normal(values.shape)
+    hair = ndimage.gaussian_filter(hair, (0.7, 0.7, 1.5))
+    hair = np.clip(-650.0 + 220.0 * hair / hair.std(), -1000.0, 0.0)
+    grown = low & ~lips & (out > 0.0) & (out < 10.0)
+    values = np.where(grown, np.maximum(values, hair), values)
+    return image.with_values(np.round(values).astype(np.int16))

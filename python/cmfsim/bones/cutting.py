@@ -233,6 +233,9 @@ def _make_cut(
     options: CutOptions,
 ) -> None:
     source, rest_name = _names_of_cut(procedure, cut, pieces)
+    if source == "skull" and cut.joined is not None:
+        findings.append(_jaws_joined(procedure.kind, cut.segment))
+    cut = cut.of(source)
     bone = pieces[source]
     limit = max(float(bone.max()), -float(bone.min()))
     # Where the bone's level is clipped, so are those of both pieces.
@@ -269,7 +272,8 @@ def _names_of_cut(procedure: Procedure, cut: Cut, pieces: Iterable[str]) -> tupl
     """The piece that is cut, and the name of what remains of it."""
     pieces = list(pieces)
     source = next((name for name in cut.sources if name in pieces), None)
-    if source is None or (source == "skull" and procedure.kind in PROCEDURES):
+    is_joined = source == "skull" and procedure.kind in PROCEDURES and cut.joined is None
+    if source is None or is_joined:
         have = ", ".join(repr(n) for n in pieces)
         raise CaseInputError(
             f"{procedure.kind} cuts {' or '.join(repr(s) for s in cut.sources if s != 'skull')}, "
@@ -282,6 +286,18 @@ def _names_of_cut(procedure: Procedure, cut: Cut, pieces: Iterable[str]) -> tupl
             f"{procedure.kind} makes {cut.segment!r}, but a segment of this name already exists"
         )
     return source, rest_name
+
+
+def _jaws_joined(kind: str, segment: str) -> Finding:
+    return Finding.warning(
+        "cut-of-joined-jaws",
+        f"{segment!r} is cut from a skull whose jaws are not separated; it ends at the edges of "
+        "the upper teeth, and all bone below stays where it is",
+        where=kind,
+        why="the lower jaw is not there as a bone of its own: teeth in contact may be divided some "
+        "millimetres off, and tissue over the lower jaw cannot follow a motion of it",
+        fix="place landmarks of both tooth rows, or give surfaces of both bones",
+    )
 
 
 def _fragment_findings(

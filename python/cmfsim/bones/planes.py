@@ -1,7 +1,7 @@
 """Cutting planes and the procedures made of them: frozen values, no bones yet."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import cast
 
@@ -84,12 +84,16 @@ class Cut:
         The piece is cut from the first of these bones or segments that exists.
     rest : str or None
         What the source is called afterwards; None leaves its name.
+    joined : CuttingPlane or None
+        Where the source is a "skull" whose jaws could not be separated, the piece also lies on the
+        positive side of this plane, so that the other jaw stays. None refuses such a source.
     """
 
     segment: str
     groups: tuple[tuple[CuttingPlane, ...], ...]
     sources: tuple[str, ...]
     rest: str | None = None
+    joined: CuttingPlane | None = None
 
     def __post_init__(self) -> None:
         as_text("segment", self.segment)
@@ -99,6 +103,12 @@ class Cut:
             raise CaseInputError(f"cut of {self.segment!r} has a group without planes")
         for plane in (p for group in self.groups for p in group):
             check_instance(f"plane of {self.segment!r}", plane, CuttingPlane)
+
+    def of(self, source: str) -> "Cut":
+        """The cut as it is made from a bone: from a "skull" the other jaw is left out."""
+        if source != "skull" or self.joined is None:
+            return self
+        return replace(self, groups=tuple((*group, self.joined) for group in self.groups))
 
     def region_on(self, image: ImageData) -> Floats:
         """How deep each voxel of a grid lies in the region: positive inside, in mm near planes."""

@@ -14,10 +14,12 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cmfsim.bones.needed_sites import with_missing_sites
 from cmfsim.bones.planes import Cut, CuttingPlane, Procedure
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 
 __all__ = ["PROCEDURES", "place_procedure", "procedure_options"]
 
@@ -27,6 +29,10 @@ __all__ = ["PROCEDURES", "place_procedure", "procedure_options"]
 UPPER_CANINE_REACH = 18.0
 UPPER_MOLAR_REACH = 11.0
 LOWER_CANINE_REACH = 18.0
+# The edges of the upper incisors and the cusps of the second molars below the landmarks of their
+# arch, mm: 12 to 13 and 11 to 20 in two skulls.
+UPPER_INCISOR_EDGE = 13.0
+UPPER_MOLAR_CUSP = 16.0
 # Crown of a lower central incisor, mm (Wheeler): infradentale lies this much under the bite.
 LOWER_INCISOR_CROWN = 9.0
 # A chin piece lower than this is hard to fix with a plate, mm; where the symphysis is short, the
@@ -82,36 +88,6 @@ _OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float]]] = MappingProxyT
     }
 )
 PROCEDURES = tuple(_OPTIONS)
-_LABELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "le_fort_1": ("nasion", "supradentale", "supra_m2_L", "supra_m2_R"),
-        "le_fort_3": (
-            "nasion",
-            "supradentale",
-            *(
-                f"{name}_{side}"
-                for name in (
-                    "supra_m2",
-                    "supraorbital",
-                    "suborbital",
-                    "lateral_orbit",
-                    "zygomatic_arch",
-                )
-                for side in "LR"
-            ),
-        ),
-        "bsso": (
-            "infradentale",
-            "menton",
-            *(f"{name}_{s}" for name in ("sub_m2", "occlusal_line", "gonion") for s in "LR"),
-        ),
-        "genioplasty": (
-            "infradentale",
-            "menton",
-            *(f"{name}_{s}" for name in ("sub_m2", "occlusal_line") for s in "LR"),
-        ),
-    }
-)
 _JAW = ("mandible_body", "mandible")
 _UPPER = ("midface", "cranium", "skull")
 
@@ -185,7 +161,8 @@ def place_procedure(
     CaseError
         (also `ValueError`) An unknown procedure or option, a value out of its range.
     LandmarkError
-        (also `ValueError`) A landmark missing or misplaced; names it and the procedure.
+        (also `ValueError`) Landmarks missing or misplaced; names the procedure and at most three
+        landmarks that suffice. Single missing ones are estimated, with a finding.
 
     Examples
     --------
@@ -193,14 +170,8 @@ def place_procedure(
     >>> cmfsim.place_procedure("le_fort_1", landmarks, {"height": 4.0})  # doctest: +SKIP
     """
     chosen = _chosen_options(kind, options or {})
-    missing = [name for name in _LABELS[kind] if name not in landmarks]
-    if missing:
-        raise LandmarkInputError(
-            f"{kind} needs the landmark {missing[0]!r}"
-            + (f" and {len(missing) - 1} more ({', '.join(missing[1:])})" if missing[1:] else "")
-            + ": place it, or give the planes of the cut"
-        )
-    points = {name: _point(kind, name, landmarks[name]) for name in _LABELS[kind]}
+    given = {n: _point(kind, n, place) for n, place in landmarks.items() if n in SKULL_LANDMARKS}
+    points, estimated = with_missing_sites(kind, given)
     place = {
         "le_fort_1": _le_fort_1,
         "le_fort_3": _le_fort_3,
@@ -208,7 +179,7 @@ def place_procedure(
         "genioplasty": _genioplasty,
     }[kind]
     cuts, findings = place(points, chosen)
-    return Procedure(kind, cuts, chosen, findings)
+    return Procedure(kind, cuts, chosen, (*estimated, *findings))
 
 
 def _chosen_options(kind: str, options: Mapping[str, float]) -> dict[str, float]:
@@ -263,13 +234,17 @@ def _frame(
 
 
 def _upper_frame(kind: str, points: Mapping[str, Floats]) -> _Frame:
+    left, right, tip = points["supra_m2_L"], points["supra_m2_R"], points["supradentale"]
+    # Towards the vertex, however the head nods: LPS is upright within 90°.
+    above = np.cross(left - tip, right - tip)
+    above = above * (np.sign(above[2]) or 1.0)
     return _frame(
         kind,
         points,
         ("supra_m2",),
-        tip=points["supradentale"],
+        tip=tip,
         back=_middle(points, "supra_m2"),
-        above=points["nasion"] - points["supradentale"],
+        above=above,
     )
 
 
@@ -314,7 +289,15 @@ def _le_fort_1(
             for side, out in (("L", frame.left), ("R", -frame.left))
         ),
     )
-    return (Cut("maxilla", (planes,), _UPPER),), ()
+    return (Cut("maxilla", (planes,), _UPPER, joined=_bite(points, frame)),), ()
+
+
+def _bite(points: Mapping[str, Floats], frame: _Frame) -> CuttingPlane:
+    """The plane through the edges of the upper teeth; what lies above it is of the upper jaw."""
+    tip = points["supradentale"] - UPPER_INCISOR_EDGE * frame.up
+    back = _middle(points, "supra_m2") - UPPER_MOLAR_CUSP * frame.up
+    normal = np.cross(frame.left, tip - back)
+    return CuttingPlane(tip, normal * np.sign(normal @ frame.up), "bite")
 
 
 def _junction(points: Mapping[str, Floats], frame: _Frame, posterior: float) -> CuttingPlane:
@@ -347,7 +330,8 @@ def _le_fort_3(
         cut = rim + options["arch"] * (arch - rim)
         lateral = CuttingPlane(rim, outward, f"beside the orbit {side}")
         groups.append((below, lateral, CuttingPlane(cut, frame.front, f"arch {side}")))
-    return (Cut("midface", tuple(groups), ("cranium", "skull")),), ()
+    bite = _bite(points, frame)
+    return (Cut("midface", tuple(groups), ("cranium", "skull"), joined=bite),), ()
 
 
 def _bsso(

@@ -11,7 +11,8 @@ __all__ = ["check_automatic"]
 def check_automatic(evidence: Evidence) -> Iterator[Finding]:
     """A note for a case without landmarks, with the checks that are left to the build."""
     case = evidence.case
-    if not case.landmarks.proposed:
+    count = len(evidence.skull_landmarks)
+    if not (case.landmarks.proposed or case.landmarks.is_completed(count)):
         return
     left = [
         *(f"the cut {cut.procedure}" for cut in case.osteotomies if cut.procedure),
@@ -20,7 +21,12 @@ def check_automatic(evidence: Evidence) -> Iterator[Finding]:
     ]
     yield Finding.note(
         "landmarks-automatic",
-        "the case names no landmarks, so the build will find them; the doctor does not check "
+        (
+            f"the case names {count} landmarks of the skull, so the build will find the others"
+            if count
+            else "the case names no landmarks, so the build will find them"
+        )
+        + "; the doctor does not check "
         + ", ".join(left),
         where=case.where("landmarks"),
         why="items placed from landmarks can be checked only when the landmarks are known; the "

@@ -233,7 +233,7 @@ def _motions(
 def _check_region(case: Case, skull: Mapping[str, Floats], findings: list[Finding]) -> None:
     """Whether the landmarks place the plane behind the face."""
     try:
-        if not case.landmarks.proposed:
+        if not (case.landmarks.proposed or case.landmarks.is_completed(len(skull))):
             case.region.plane(skull, 0.0, 0.0)
     except CaseError as error:
         findings.append(

@@ -9,7 +9,7 @@ from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
 from cmfsim.muscles.mixing import moduli_findings
 from cmfsim.muscles.template import MuscleTemplate
-from cmfsim.muscles.template.morphing import missing_landmarks
+from cmfsim.muscles.template.morphing import missing_landmarks, too_few
 from cmfsim.registration import match_landmarks
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding
@@ -39,17 +39,13 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
         )
         return
     yield from _moduli(evidence, given, template)
-    if evidence.case.landmarks.proposed:
+    landmarks = evidence.case.landmarks
+    if landmarks.proposed or landmarks.is_completed(len(evidence.skull_landmarks)):
         # They are found when the case is built.
         return
-    if not evidence.skull_landmarks:
-        yield Finding.error(
-            "muscles-without-landmarks",
-            "the case has [muscles], but no skull landmarks could be read",
-            where=where,
-            why="skull landmarks fit the template to the patient",
-            fix="add [landmarks] skull, or remove [muscles]",
-        )
+    few = too_few(template, evidence.skull_landmarks)
+    if few is not None:
+        yield replace(few, where=where)
         return
     try:
         matched = match_landmarks(template.landmarks, evidence.skull_landmarks, required=())

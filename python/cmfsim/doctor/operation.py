@@ -90,7 +90,8 @@ def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iter
     """Whether a standard procedure can be placed from the landmarks that are there."""
     if cut.procedure is None:
         return
-    if evidence.case.landmarks.proposed:
+    landmarks = evidence.case.landmarks
+    if landmarks.proposed or landmarks.is_completed(len(evidence.skull_landmarks)):
         # Placed from landmarks that are found when the case is built.
         return
     try:

@@ -31,6 +31,7 @@ __all__ = ["Jaws", "part_jaws"]
 
 # Landmarks (Phillips & Smuts 1996) that lie on each bone.
 ON_MANDIBLE = (
+    "infradentale",
     "menton",
     "pogonion",
     "supramentale",
@@ -45,6 +46,7 @@ ON_CRANIUM = (
     "nasion",
     "rhinion",
     "mid_philtrum",
+    "supradentale",
     "frontal_eminence_L",
     "frontal_eminence_R",
     "supraorbital_L",
@@ -69,6 +71,17 @@ SEED_RADIUS = 3.0
 ABOVE_JOINT = 20.0
 # Crowns and alveolar bone between these distances from the occlusal plane are seeds, mm.
 CROWN = (2.0, 16.0)
+# The occlusal plane lies this far from the sites of one row at incisors and molars, mm: 9 to 13 and
+# 11 to 20 in two skulls.
+TO_EDGES, TO_CUSPS = 10.0, 16.0
+# Where only one row's sites are known, bone farther beyond its edges than this is the other jaw's,
+# however far the mouth is open, mm: crowns and their necks end before.
+OTHER_JAW = (22.0, 60.0)
+# All three are those of an arch this wide at its second molars, and a child's are smaller; mm, and
+# parts of it.
+ARCH_WIDTH, LEAST_ARCH = 68.0, 0.6
+# Bone of a lower jaw that is shown reaches farther than this into the range, mm.
+INTO_OTHER_JAW = 5.0
 # The mandible's front edge of the ramus ends the tooth row, mm in front of the occlusal landmark.
 BEFORE_RAMUS = 5.0
 # The middle of the condyle from the supraglenoid landmark: towards the midline, back, up, mm;
@@ -108,17 +121,27 @@ class Jaws:
 def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None) -> Jaws:
     """The mandible by a flood from seeds, which stops where bones touch most narrowly."""
     findings: list[Finding] = []
-    if landmarks is None or _occlusal_points(landmarks) is None:
+    given = dict(landmarks or {})
+    landmarks = given
+    if _occlusal_points(given) is None and _one_row(given) is None:
         guess = guessed_landmarks(work, bone)
         if guess is None:
             return Jaws(None, None, None, (_not_parted("no tooth row or chin was recognised"),))
-        landmarks = guess | dict(landmarks or {})
+        against = _against(guess, given)
+        if against:
+            elsewhere = (
+                f"the image seems to show the tooth rows elsewhere than {', '.join(against)}"
+            )
+            return Jaws(None, None, None, (_not_parted(elsewhere),))
+        landmarks = guess | given
+    if _occlusal_points(given) is None:
         findings.append(_guessed())
-    landmarks = dict(landmarks)
     box = _box(work, bone, landmarks)
     domain = np.asfortranarray(bone.mask[box])
     seeds = _seeds(work.part(box), bone, landmarks, box)
     if not ((seeds == 1).any() and (seeds == 2).any()):
+        if (on_other := _on_other_jaw(work, given)) is not None:
+            return Jaws(None, None, None, (on_other,))
         return Jaws(None, None, None, (_not_parted("the landmarks are far from bone"),))
     deep = depth(domain, work.spacing) / np.float32(FLOOD_DEPTH)
     dense = np.clip(smoothed(bone.hu[box], 0.7, work.spacing) / np.float32(FLOOD_HU), 0.0, 2.0)
@@ -138,7 +161,8 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
     rest = bone.mask[box] & ~mandible[box]
     mandible[box] |= _touching(rest & ~_largest_piece(rest), mandible[box])
     side = _side(mandible, bone.mask)
-    height = 0.5 * float(landmarks["supradentale"][2] + landmarks["infradentale"][2])
+    rows = _occlusal_points(landmarks) or _one_row(landmarks)
+    height = None if rows is None else float(rows[0][2])
     return Jaws(side, mandible, height, tuple(findings))
 
 
@@ -181,10 +205,35 @@ def _not_parted(reason: str) -> Finding:
     )
 
 
+def _on_other_jaw(work: Working, given: Mapping[str, Floats]) -> Finding | None:
+    """An error where the image goes on far below the upper row that was placed, without any bone.
+
+    A lower jaw has bone there, however worn it is: the row is the lower one.
+    """
+    row = _one_row(given)
+    if row is None or "supradentale" not in given or _occlusal_points(given) is not None:
+        return None
+    size = _arch_size(row[1], row[2])
+    room = float(row[0][2] - work.origin[2])
+    if room < size * OTHER_JAW[0] + INTO_OTHER_JAW:
+        return None
+    return Finding.error(
+        "sites-on-other-jaw",
+        f"no bone lies more than {size * (OTHER_JAW[0] + TO_EDGES):.0f} mm below the landmarks "
+        f"supradentale and supra_m2, although the image goes on for {room:.0f} mm below the "
+        "upper teeth",
+        where="landmarks.skull",
+        why="these landmarks of the upper jaw seem to lie on the lower one: the plan would move "
+        "that",
+        fix="place supradentale, supra_m2_L and supra_m2_R on the upper jaw",
+    )
+
+
 def _guessed() -> Finding:
     return Finding.note(
         "jaws-parted-by-shape",
-        "the mandible was separated from the skull by shape alone, without landmarks",
+        "the mandible was separated from the skull by shape: the landmarks of both tooth rows are "
+        "not given",
         where="bone",
         why="the cut between the tooth rows may be some millimetres off",
         fix="give skull landmarks",
@@ -221,8 +270,10 @@ def _joint_height(landmarks: Mapping[str, Floats]) -> float:
     names = names or [n for n in ("zygomatic_arch_L", "zygomatic_arch_R") if n in landmarks]
     if names:
         return float(np.mean([landmarks[n][2] for n in names]))
-    # The joints lie some 30 mm above the upper incisors' necks.
-    return float(landmarks["supradentale"][2]) + 30.0
+    # The joints lie some 30 mm above the upper incisors' necks, and 50 above the lower ones'.
+    if "supradentale" in landmarks:
+        return float(landmarks["supradentale"][2]) + 30.0
+    return float(landmarks["infradentale"][2]) + 50.0
 
 
 def _seeds(
@@ -266,7 +317,7 @@ def _tooth_rows(
     seeds: NDArray[np.int32], landmarks: Mapping[str, Floats], x: Any, y: Any, z: Any
 ) -> None:
     """Seeds above and below the occlusal plane, in front of the rami."""
-    plane = _occlusal_points(landmarks)
+    plane = _occlusal_points(landmarks) or _one_row(landmarks)
     if plane is None:
         return
     incisal, left, right = plane
@@ -281,9 +332,15 @@ def _tooth_rows(
     x, y, part = x[row[0]], y[:, row[1]], seeds[row]
     height = normal[0] * (x - incisal[0]) + normal[1] * (y - incisal[1])
     height = height + normal[2] * (z - incisal[2])
-    near, far = CROWN
-    part[(height > near) & (height < far)] = 2
-    part[(height < -near) & (height > -far)] = 1
+    upper = lower = CROWN
+    if _occlusal_points(landmarks) is None:
+        # The row whose sites are known, and the other wherever the mouth's opening has it.
+        is_upper = "supradentale" in landmarks
+        size = _arch_size(left, right)
+        other = (size * OTHER_JAW[0], OTHER_JAW[1])
+        upper, lower = (CROWN, other) if is_upper else (other, CROWN)
+    part[(height > upper[0]) & (height < upper[1])] = 2
+    part[(height < -lower[0]) & (height > -lower[1])] = 1
 
 
 def _occlusal_points(landmarks: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats] | None:
@@ -302,6 +359,44 @@ def _occlusal_points(landmarks: Mapping[str, Floats]) -> tuple[Floats, Floats, F
         else:
             return None
     return points[0], points[1], points[2]
+
+
+def _one_row(landmarks: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats] | None:
+    """The edges of one jaw's teeth at the incisors, left and right, from the sites of its row."""
+    for front, molar, sign in (("supradentale", "supra_m2", -1.0), ("infradentale", "sub_m2", 1.0)):
+        names = (front, f"{molar}_L", f"{molar}_R")
+        if not set(names) <= set(landmarks):
+            continue
+        tip, left, right = (landmarks[name] for name in names)
+        normal = np.cross(left - tip, right - tip)
+        up = normal * (np.sign(normal[2]) / np.linalg.norm(normal))
+        ahead = np.array([0.0, BEFORE_RAMUS, 0.0])
+        away = sign * _arch_size(left, right) * up
+        behind = TO_CUSPS * away + ahead
+        return tip + TO_EDGES * away, left + behind, right + behind
+    return None
+
+
+def _arch_size(left: Floats, right: Floats) -> float:
+    """The width of an arch in parts of that of an adult."""
+    return float(np.clip(np.linalg.norm(left - right) / ARCH_WIDTH, LEAST_ARCH, 1.0))
+
+
+def _against(guess: Mapping[str, Floats], given: Mapping[str, Floats]) -> list[str]:
+    """The given sites that a guess of the tooth rows puts on the other jaw."""
+    plane = _occlusal_points(guess)
+    if plane is None:
+        return []
+    incisal, left, right = plane
+    behind = 0.5 * float(left[1] + right[1])
+    found = []
+    for names, sign in ((ON_CRANIUM, 1.0), (ON_MANDIBLE, -1.0)):
+        for name in names:
+            # Behind the rows the mandible rises beside the cranium.
+            if name in given and given[name][1] < behind:
+                height = sign * float(given[name][2] - incisal[2])
+                found += [name] if height < -CROWN[0] else []
+    return found
 
 
 def _balls(

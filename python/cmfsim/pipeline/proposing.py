@@ -16,6 +16,7 @@ from cmfsim.registration.proposed import TemplateHead, landmarks_from
 from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.surface_data import SurfaceData
@@ -149,6 +150,7 @@ def proposed_head(
     templates: Sequence[Path] = (),
     *,
     is_read: bool = True,
+    placed: Mapping[str, Floats] | None = None,
 ) -> ProposedHead:
     """The landmarks of a case's head, with its jaws separated by them where shape alone did it.
 
@@ -167,7 +169,10 @@ def proposed_head(
         Folders of template heads besides those that the case names.
     is_read : bool
         Whether the anatomy is what `read_anatomy` makes of the case: any other keeps its jaws.
+    placed : mapping of str to (3,) float64, mm, optional
+        Sites of the skull that a person placed, which separate the jaws wherever they contradict.
     """
+    placed = placed or {}
     heads = [read_template_head(folder) for folder in (*case.landmarks.templates, *templates)]
     first = _proposed(anatomy, heads)
     found = first.landmarks
@@ -175,12 +180,12 @@ def proposed_head(
     is_doubtful = bool(found.doubtful_jaw or found.impossible_jaw)
     if case.image is None or not (is_read and by_shape and is_doubtful and found.separation):
         return first
-    second = _separated_by(first, case, stage, heads)
+    second = _separated_by(first, case, stage, heads, placed)
     if second is None:
         return replace(first, findings=(_not_separated_again(),))
     if found.is_rough:
         # Teeth are known now, and separate the jaws less roughly.
-        third = _separated_by(second, case, stage, heads)
+        third = _separated_by(second, case, stage, heads, placed)
         first, second = (first, second) if third is None else (second, third)
     apart = _apart(first.landmarks.skull, second.landmarks.skull)
     moved = replace(second.landmarks, skull=_with_moves(second.landmarks.skull, apart))
@@ -192,10 +197,11 @@ def _separated_by(
     case: Case,
     stage: Callable[[str], None],
     heads: Sequence[TemplateHead],
+    placed: Mapping[str, Floats],
 ) -> ProposedHead | None:
     """The head with its jaws separated by its landmarks; None where that makes them worse."""
     stage("separating the jaws by the landmarks found")
-    again, _ = read_anatomy(case, first.landmarks.separation, stage)
+    again, _ = read_anatomy(case, {**first.landmarks.separation, **placed}, stage)
     stage("finding the landmarks again")
     second = _proposed(again, heads)
     if "mandible" not in again.bones or _is_worse(second.landmarks, first.landmarks):

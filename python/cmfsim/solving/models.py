@@ -53,7 +53,8 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     >>> scene = cmfsim.model_scene(patient, "H+S")  # doctest: +SKIP
     """
     check_one_of("model", model, MODELS)
-    if model.startswith("M") and patient.muscles is None:
+    left_out = any(finding.code == "muscles-left-out" for finding in patient.findings)
+    if model.startswith("M") and patient.muscles is None and not left_out:
         raise CaseInputError(
             f"model {model} needs muscles, but {patient.name!r} was built without them: add "
             "[muscles] to the case and skull landmarks"

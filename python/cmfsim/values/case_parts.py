@@ -130,6 +130,10 @@ class CaseSurfaces:
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
 
 
+# With fewer landmarks of the skull than this, the others are found where the case needs them.
+FEW_SITES = 12
+
+
 @dataclass(frozen=True)
 class CaseLandmarks:
     """Files of landmarks, 3D Slicer's `.mrk.json` or `.fcsv`.
@@ -140,7 +144,8 @@ class CaseLandmarks:
     frame : str or None
         The frame of files that do not state theirs.
     automatic : bool
-        Whether landmarks are found automatically where neither file is given.
+        Whether landmarks are found automatically where neither file is given, and the others
+        where the one of the skull has fewer than twelve.
     templates : tuple of Path
         Folders of heads whose landmarks are known, for finding them; see docs/landmarks.md.
     """
@@ -155,6 +160,10 @@ class CaseLandmarks:
     def proposed(self) -> bool:
         """Whether landmarks are to be found automatically: none are given."""
         return self.automatic and self.skull is None and self.skin is None
+
+    def is_completed(self, count: int) -> bool:
+        """Whether others are found automatically for want of sites, `count` of the skull placed."""
+        return self.automatic and 0 < count < FEW_SITES
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["SKIN_LANDMARKS", "SKULL_LANDMARKS", "label_key"]
+__all__ = ["SKIN_LANDMARKS", "SKULL_LANDMARKS", "is_lower_site", "label_key"]
 
 # The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
 # in its text, so the choice is ours.
@@ -62,6 +62,23 @@ def _definitions() -> dict[str, str]:
 # 10 in the midline and 11 on either side, after the sites at which Rhine & Campbell (1980) and
 # Phillips & Smuts (1996) measured the soft tissue; left and right are the patient's.
 SKULL_LANDMARKS: Mapping[str, str] = MappingProxyType(_definitions())
+
+
+# Sites of the lower jaw begin with these.
+LOWER_SITES = (
+    "infradentale",
+    "supramentale",
+    "pogonion",
+    "menton",
+    "gonion",
+    "occlusal_line",
+    "sub_m2",
+)
+
+
+def is_lower_site(name: str) -> bool:
+    """Whether a site of the skull lies on the lower jaw."""
+    return name.startswith(LOWER_SITES)
 
 
 def label_key(label: str) -> str:

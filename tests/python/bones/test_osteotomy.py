@@ -9,7 +9,7 @@ import pytest
 import cmfsim
 import real_heads
 from angles import angle_between
-from cmfsim.bones import PROCEDURES, CutOptions, procedures
+from cmfsim.bones import PROCEDURES, CutOptions, needed_sites
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 
 pytest.importorskip("skimage")
@@ -231,14 +231,37 @@ def ideal_landmarks(*, mirror=1.0):
 
 
 @pytest.mark.parametrize("kind", PROCEDURES)
-def test_a_missing_landmark_is_named_with_its_procedure(kind):
+def test_at_most_three_landmarks_are_asked_for_and_suffice(kind):
     points = ideal_landmarks()
-    for name in procedures._LABELS[kind]:
+    with pytest.raises(cmfsim.LandmarkError, match=f"^{kind} needs the landmark") as refused:
+        cmfsim.place_procedure(kind, {"pogonion": [0, -80, -40], "rhinion": [0, -90, 40]})
+    asked = [name for name in points if re.search(rf"\b{name}\b", str(refused.value))]
+    assert 1 <= len(asked) <= 3
+    placed = cmfsim.place_procedure(kind, {name: points[name] for name in asked})
+    whole = cmfsim.place_procedure(kind, points)
+    for cut, other in zip(placed.cuts, whole.cuts, strict=True):
+        assert cut.segment == other.segment
+    estimated = [f for f in placed.findings if f.code == "cut-site-estimated"]
+    assert len(estimated) == (kind != "le_fort_1")
+    if kind == "le_fort_1":
+        ours, theirs = (p.cuts[0].groups[0][0] for p in (placed, whole))
+        assert np.allclose([ours.point, ours.normal], [theirs.point, theirs.normal])
+
+
+@pytest.mark.parametrize("kind", PROCEDURES)
+@pytest.mark.parametrize("head", real_heads.HEADS)
+def test_a_missing_landmark_is_estimated_from_the_others_and_reported(kind, head):
+    """Within 7 mm of where a person placed it, where the other side shows its partner 5 mm."""
+    points = real_heads.landmarks(head)
+    for name in needed_sites.NEEDED[kind]:
         less = {n: p for n, p in points.items() if n != name}
-        with pytest.raises(cmfsim.LandmarkError, match=f"^{kind} needs the landmark '{name}'"):
-            cmfsim.place_procedure(kind, less)
-    with pytest.raises(ValueError, match=r"and \d+ more"):
-        cmfsim.place_procedure(kind, {})
+        found, (finding,) = needed_sites.with_missing_sites(kind, less)
+        assert finding.code == "cut-site-estimated"
+        assert f"with {name} estimated" in finding.what
+        partner = name[:-1] + {"L": "R", "R": "L"}.get(name[-1], "")
+        limit = 5.0 if partner != name and partner in points else 7.0
+        assert np.linalg.norm(found[name] - points[name]) < limit, name
+        assert finding in cmfsim.place_procedure(kind, less).findings
 
 
 @pytest.mark.parametrize("kind", PROCEDURES)
@@ -438,12 +461,30 @@ def test_le_fort_1_inside_le_fort_3_makes_three_pieces():
     assert [s.name for s in found.segments] == ["cranium", "midface", "maxilla"]
 
 
-@pytest.mark.parametrize("kind", PROCEDURES)
-def test_jaws_that_were_not_parted_are_refused(box, kind):
+@pytest.mark.parametrize("kind", ["bsso", "genioplasty"])
+def test_jaws_that_were_not_parted_are_refused_where_the_lower_one_is_cut(box, kind):
     with pytest.raises(
         cmfsim.CaseError, match=f"{kind} cuts .*'skull': separate the jaws .*landmarks"
     ):
         cmfsim.cut_bones({"skull": box}, {kind: {}}, landmarks=ideal_landmarks())
+
+
+@pytest.mark.parametrize("head", real_heads.HEADS)
+def test_the_lower_jaw_stays_where_the_maxilla_is_cut_from_joined_jaws(head):
+    anatomy, points = real_heads.anatomy(head), real_heads.landmarks(head)
+    cranium, mandible = anatomy.bones["cranium"], anatomy.bones["mandible"]
+    joined = cranium.with_values(np.maximum(cranium.values, mandible.values))
+    options = CutOptions(surface=UNDECIMATED)
+    found, parted = (
+        cmfsim.cut_bones(bones, {"le_fort_1": {}}, landmarks=points, options=options)
+        for bones in ({"skull": joined}, {"cranium": cranium})
+    )
+    assert "cut-of-joined-jaws" in {finding.code for finding in found.findings}
+    assert "cut-of-joined-jaws" not in {finding.code for finding in parted.findings}
+    piece, whole = (cut["maxilla"].level.values > 0.0 for cut in (found, parted))
+    lower = mandible.values > 0.0
+    assert np.count_nonzero(piece & lower) < 0.03 * np.count_nonzero(lower)
+    assert np.count_nonzero(piece & whole) > 0.9 * np.count_nonzero(whole)
 
 
 def test_the_same_head_is_cut_to_the_same_bits(cut_head):

@@ -38,7 +38,7 @@ def test_files_say_that_a_person_did_not_place_them(case, capsys):
     assert places["menton"].tolist() == report["skull"]["menton"]["point"]
 
 
-def test_doctor_accepts_muscles_without_landmarks_unless_finding_them_is_off(case, capsys):
+def test_doctor_reports_that_muscles_are_left_out_where_finding_landmarks_is_off(case, capsys):
     text = (case / "case.toml").read_text(encoding="utf-8")
     for name, more, refused in (
         ("with.toml", "", False),
@@ -48,4 +48,4 @@ def test_doctor_accepts_muscles_without_landmarks_unless_finding_them_is_off(cas
         main(["doctor", str(case / name), "--json", "-q"])
         report = json.loads(capsys.readouterr().out)
         codes = {finding["code"] for finding in report["findings"]}
-        assert ("muscles-without-landmarks" in codes) is refused
+        assert ("muscles-left-out" in codes) is refused

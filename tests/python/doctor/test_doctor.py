@@ -478,11 +478,15 @@ def with_cut(head, table):
 
 
 def test_a_procedure_without_its_landmarks_or_with_a_wrong_option_is_said(tmp_path):
-    """Le Fort I needs the second molars' points."""
+    """Le Fort I needs the second molars' points; one missing is estimated, both are asked for."""
     head = HeadCase()
     with_cut(head, 'procedure = "le_fort_1"')
+    head.replace("[landmarks]", "[landmarks]\nautomatic = false")
     assert serious(tmp_path, head) == []
     del head.skull["supra_m2_L"]
+    ((severity, code),) = serious(tmp_path, head)
+    assert (severity, code) == ("warning", "cut-site-estimated")
+    head.skull = {name: head.skull[name] for name in ("menton", "pogonion")}
     (finding,) = (f for f in diagnosis(tmp_path, head) if f.severity == "error")
     assert finding.code == "landmark-missing"
     assert "supra_m2_L" in finding.what
@@ -520,6 +524,7 @@ def test_a_transform_file_is_read_for_its_motion(tmp_path):
 def with_muscles(head, kept=None):
     """The case with muscles, and the landmarks of an average head that are kept."""
     head.toml += "\n[muscles]\n"
+    head.replace("[landmarks]", "[landmarks]\nautomatic = false")
     places = REFERENCE_PLACES["skull"]
     # On no surface of the ellipsoids: what is asked for here is names alone.
     head.skull = {name: places[name] + [3.0, -100.0, 1500.0] for name in kept or places}
@@ -529,7 +534,7 @@ def with_muscles(head, kept=None):
 def muscle_findings(folder, head):
     """Severity, code and text of findings about muscles."""
     case = cmfsim.Case.load(head.write(folder))
-    codes = ("muscles-landmarks", "muscles-without-landmarks", "template-landmarks-missing")
+    codes = ("muscles-landmarks", "muscles-left-out", "template-landmarks-missing")
     return [(f.severity, f.code, f.what) for f in check_muscles(gather(case)) if f.code in codes]
 
 
@@ -547,17 +552,18 @@ def test_missing_landmarks_are_a_warning_that_names_them(tmp_path):
     assert severity == "warning"
     assert "26 of" in what
     found = muscle_findings(tmp_path, with_muscles(HeadCase(), names[:3]))
-    assert [(s, c) for s, c, _ in found] == [("error", "muscles-landmarks")]
+    assert [(s, c) for s, c, _ in found] == [("warning", "muscles-left-out")]
 
 
 def test_muscles_are_checked_only_for_models_that_have_them(tmp_path):
-    """The landmarks lie in one plane: no muscle can be placed, a homogeneous model needs none."""
+    """Three landmarks place no muscle, and a homogeneous model needs none."""
     head = HeadCase()
     head.toml += "\n[muscles]\n"
+    head.replace("[landmarks]", "[landmarks]\nautomatic = false")
     head.skull = {n: head.skull[n] for n in ("nasion", "menton", "pogonion")}
     for models, count in ((["H"], 0), (["H", "H+S"], 0), (["M"], 1), (["H", "M+S"], 1), (None, 1)):
         case = cmfsim.Case.load(head.write(tmp_path))
-        found = [f for f in cmfsim.diagnose(case, models=models) if f.code == "muscles-landmarks"]
+        found = [f for f in cmfsim.diagnose(case, models=models) if f.code == "muscles-left-out"]
         assert len(found) == count, models
 
 

@@ -1,7 +1,7 @@
 """A template's muscles carried to a patient by landmarks, and what the landmarks say of it."""
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -21,16 +21,27 @@ from cmfsim.registration import (
 )
 from cmfsim.values.checks import Floats, as_number
 from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import is_lower_site
 from cmfsim.values.musculature import MuscleSurface, Musculature
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
-__all__ = ["MorphedMusculature", "missing_landmarks", "morph_template"]
+__all__ = [
+    "MorphedMusculature",
+    "missing_landmarks",
+    "morph_template",
+    "too_few",
+    "without_lost",
+]
 
 # How many landmarks a finding lists.
 MOST_NAMES = 6
 # Landmarks below which a map is little more than affine.
 FEW_LANDMARKS = 6
+# A map of space needs as many places.
+LEAST_LANDMARKS = 4
+# Landmarks that place a jaw, and the share of a muscle's vertices from which on it is at one.
+LEAST_OF_JAW, AT_JAW = 3, 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -185,6 +196,66 @@ def morph_template(
         leave_one_out=left_out,
         missing=tuple(name for name in template.landmarks if name not in matched.names),
         folds=MappingProxyType(folds),
+    )
+
+
+def without_lost(morphed: MorphedMusculature) -> MorphedMusculature:
+    """The musculature without muscles at a jaw that has too few landmarks to place them.
+
+    A muscle is at a jaw if enough of its vertices lie nearest to a landmark of that in the
+    template. Where no jaw is short of landmarks, the same object.
+    """
+    template = morphed.template
+    names = list(template.landmarks)
+    lower = np.array([is_lower_site(name) for name in names])
+    known = np.array([name in morphed.landmarks for name in names])
+    # A jaw turns and moves as a whole: three places of it say how.
+    short = []
+    for side, own in ((True, lower), (False, ~lower)):
+        all_of_it, there = int(np.count_nonzero(own)), int(np.count_nonzero(known & own))
+        if there < min(LEAST_OF_JAW, all_of_it):
+            short.append(side)
+    if not short:
+        return morphed
+    places = np.array(list(template.landmarks.values()))
+    lost = []
+    for muscle in template.muscles:
+        vertices = muscle.surface.vertices
+        away = np.linalg.norm(vertices[:, None] - places[None], axis=2)
+        at_lower = float(lower[np.argmin(away, axis=1)].mean())
+        if any((at_lower if side else 1.0 - at_lower) > AT_JAW for side in short):
+            lost.append(muscle.name)
+    if not lost:
+        return morphed
+    jaws = " and ".join("lower jaw" if side else "cranium" for side in short)
+    reason = f"fewer than {LEAST_OF_JAW} landmarks of the {jaws} are known"
+    return replace(
+        morphed,
+        muscles=tuple(muscle for muscle in morphed.muscles if muscle.name not in lost),
+        findings=(*morphed.findings, muscles_left_out(lost, reason)),
+    )
+
+
+def too_few(template: TemplateData, known: Collection[str]) -> Finding | None:
+    """The warning that all muscles are left out, where too few of the landmarks are known."""
+    common = [label for label in template.landmarks if label in known]
+    if len(common) >= LEAST_LANDMARKS:
+        return None
+    reason = f"{len(common)} of its landmarks are known, and {LEAST_LANDMARKS} are needed"
+    return muscles_left_out([muscle.name for muscle in template.muscles], reason)
+
+
+def muscles_left_out(names: Sequence[str], reason: str) -> Finding:
+    """The warning that muscles are left out."""
+    listed = ", ".join(names[:MOST_NAMES])
+    listed += f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return Finding.warning(
+        "muscles-left-out",
+        f"{len(names)} muscles are left out: {listed}: {reason}",
+        where="landmarks",
+        why="their place in this head is unknown; the tissue there is that of fat",
+        fix="place menton, gonion_L and gonion_R for muscles of the lower jaw, nasion, "
+        "zygomatic_arch_L and zygomatic_arch_R for those of the cranium",
     )
 
 

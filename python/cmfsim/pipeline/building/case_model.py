@@ -28,12 +28,13 @@ from cmfsim.pipeline.building.assembly import assembled
 from cmfsim.pipeline.building.case_checks import jaws, misplaced, plan_sizes
 from cmfsim.pipeline.building.contacts import mean_edge
 from cmfsim.pipeline.building.inputs import check_output, read_anatomy, read_case_landmarks
-from cmfsim.pipeline.building.landmarks import found_landmarks
+from cmfsim.pipeline.building.landmarks import found_landmarks, is_to_be_found
 from cmfsim.pipeline.building.lips import find_seam
 from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.nodes import made_contacts, nodes_of
 from cmfsim.pipeline.building.parts import Head, MeshedTissue, Tissue
 from cmfsim.pipeline.building.postoperative import Postoperative
+from cmfsim.pipeline.building.site_checks import check_bones_of_sites, check_pieces
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.building.tissue_mesh import region_of, tissue_mesh
 from cmfsim.values.anatomy import Anatomy
@@ -166,8 +167,11 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     if anatomy is None:
         anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
         stages.add(noticed)
-    if case.landmarks.proposed and not landmarks:
-        head = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
+    check_bones_of_sites(case, landmarks.get("skull", {}), anatomy, by_hand=True)
+    if is_to_be_found(case, landmarks):
+        is_read = options.anatomy is None
+        head = found_landmarks(case, anatomy, stages, landmarks, is_read=is_read)
+        check_bones_of_sites(case, head.skull, head.anatomy, by_hand=bool(landmarks))
     else:
         head = Head(case, landmarks, anatomy)
     # Tissue and muscles are placed by the anatomy and its landmarks, whatever becomes of the bones.
@@ -176,13 +180,19 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         if case.muscles is None:
             return _without_muscles(head, stages, kinds, options, tissue)[0]
         # A case without muscles loads nothing of them.
-        from cmfsim.pipeline.building.muscles import placed_muscles, with_muscles  # noqa: PLC0415
+        from cmfsim.pipeline.building.muscles import (  # noqa: PLC0415
+            NoMuscles,
+            placed_muscles,
+            with_muscles,
+        )
 
-        placing = beside.submit(placed_muscles, case.name, case.muscles, head.skull, head.anatomy)
+        placing = beside.submit(placed_muscles, case.muscles, head.skull, head.anatomy)
 
         def show(bones: PlannedBones) -> None:
             if options.on_muscles is not None and placing.done():
-                options.on_muscles(placing.result().muscles, bones.segments)
+                placed = placing.result()
+                if not isinstance(placed, NoMuscles):
+                    options.on_muscles(placed.muscles, bones.segments)
 
         patient, mesh = _without_muscles(head, stages, kinds, options, tissue, show=show)
         stages.begin("placing and sampling the muscles")
@@ -214,6 +224,8 @@ def _bones(
     stages.begin("cutting the bones")
     cut = cut_bones(head.anatomy.bones, _procedures(case, head.skull))
     stages.add(cut.findings)
+    by_hand = not case.landmarks.proposed
+    check_pieces(case, head.skull, cut.segments, cut.procedures, by_hand=by_hand)
     if case.achieved:
         stages.begin("reading the achieved plan")
     bones = planned_bones(case, cut.segments, after)

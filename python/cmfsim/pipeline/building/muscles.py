@@ -5,20 +5,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 
 from cmfsim._core import TetMesh
-from cmfsim.errors import LandmarkInputError
 from cmfsim.muscles.blurring import blurred
 from cmfsim.muscles.equivalent import PreparedMuscles, equivalent_material, prepared_muscles
 from cmfsim.muscles.fitting import MuscleFit, fit_muscles
 from cmfsim.muscles.mixing import MODULI_CODES
 from cmfsim.muscles.template import MuscleTemplate
-from cmfsim.muscles.template.morphing import MorphedMusculature
+from cmfsim.muscles.template.morphing import MorphedMusculature, too_few, without_lost
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.checks import Floats
+from cmfsim.values.finding import Finding
 from cmfsim.values.moduli import FatModuli
 from cmfsim.values.patient_model import PatientModel
 
-__all__ = ["PlacedMuscles", "placed_muscles", "with_muscles"]
+__all__ = ["NoMuscles", "PlacedMuscles", "placed_muscles", "with_muscles"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,25 +42,35 @@ class PlacedMuscles:
     seconds: Mapping[str, float]
 
 
+@dataclass(frozen=True)
+class NoMuscles:
+    """Why no muscle of a template can be placed in a head."""
+
+    findings: tuple[Finding, ...]
+
+
 def placed_muscles(
-    name: str, given: CaseMuscles, skull: Mapping[str, Floats], anatomy: Anatomy
-) -> PlacedMuscles:
+    given: CaseMuscles, skull: Mapping[str, Floats], anatomy: Anatomy
+) -> PlacedMuscles | NoMuscles:
     """The muscles of a case in a head, from its skull landmarks.
+
+    Those that the landmarks do not place are left out with a finding.
 
     Raises
     ------
     LandmarkError
-        (also `ValueError`) There are no skull landmarks, or they do not fit the template's.
+        (also `ValueError`) The landmarks do not fit the template's.
     CaseError
         (also `ValueError`) There is no such template.
     """
-    if not skull:
-        raise LandmarkInputError(
-            f"{name}: muscles are placed from skull landmarks, and the case has none: add "
-            "[landmarks] skull, or use a homogeneous model"
-        )
     begun = time.perf_counter()
-    muscles = MuscleTemplate.load(given.template).morph(skull, smoothing=given.smoothing)
+    template = MuscleTemplate.load(given.template)
+    few = too_few(template, skull)
+    if few is not None:
+        return NoMuscles((few,))
+    muscles = without_lost(template.morph(skull, smoothing=given.smoothing))
+    if not muscles.muscles:
+        return NoMuscles(muscles.findings)
     seconds = {"placing the muscles": time.perf_counter() - begun}
     fit = None
     if given.fit:
@@ -80,7 +90,7 @@ def with_muscles(
     *,
     landmarks: Mapping[str, Floats] | None = None,
     mesh: TetMesh | None = None,
-    placed: Callable[[], PlacedMuscles] | None = None,
+    placed: Callable[[], PlacedMuscles | NoMuscles] | None = None,
 ) -> PatientModel:
     """The patient with a template's muscles and their equivalent material (paper 2.2, 2.3).
 
@@ -117,10 +127,14 @@ def with_muscles(
     begun = time.perf_counter()
     if placed is None:
         skull = patient.landmarks.get("skull", {}) if landmarks is None else landmarks
-        found = placed_muscles(patient.name, given, skull, patient.anatomy)
+        found = placed_muscles(given, skull, patient.anatomy)
+        if isinstance(found, NoMuscles):
+            return _without(patient, found)
         timings = dict(found.seconds)
     else:
         found = placed()
+        if isinstance(found, NoMuscles):
+            return _without(patient, found)
         step = "placing" if found.fit is None else "fitting"
         timings = {f"{step} the muscles": time.perf_counter() - begun}
     muscles, fit = found.muscles, found.fit
@@ -161,3 +175,10 @@ def with_muscles(
         findings=findings,
         summary=summary,
     )
+
+
+def _without(patient: PatientModel, found: NoMuscles) -> PatientModel:
+    """The patient without muscles, and the findings that say so."""
+    findings = tuple(dict.fromkeys([*patient.findings, *found.findings]))
+    summary = {**patient.summary, "findings": [asdict(finding) for finding in findings]}
+    return replace(patient, findings=findings, summary=summary)

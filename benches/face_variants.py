@@ -1,0 +1,286 @@
+"""The predicted face of a CT as other clinics would send it, against that of the unmodified one, mm.
+
+Le Fort I moves the maxilla 4 mm forwards, without any landmarks, on the CT and on each variant of it.
+Where the face of the unmodified CT moves by more than 0.5 mm, displacements are compared: mean and
+95 % of the differences. A variant off by more than 0.3 mm on average (0.5 with open mouth) has to
+be reported by a finding that the unmodified CT does not have, or refused by an error; otherwise its
+verdict is "SILENT".
+
+    python benches/face_variants.py --markdown docs/real_scans.md [--only NAME ...] [--cache FOLDER]
+
+Needs the real CT (the folder named by CMFSIM_DATA, else ../shared/data). Each row takes a minute or
+two; with a cache, rows that were computed before by the same version are read back.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+import cmfsim
+import ct_variants as variants
+import scan_variants
+from cmfsim import ImageData
+from marked import publish
+
+ROOT = Path(__file__).parents[1]
+NAME = "benches/face_variants.py"
+FORWARDS = np.array([0.0, -4.0, 0.0])
+# Points of the face that move by more than this are compared, and matched up to this distance, mm.
+MOVES, NEAR = 0.5, 4.0
+TOLERANCE, OPEN_TOLERANCE = 0.3, 0.5
+# Findings that are about landmarks found on any head: they do not report a variant.
+USUAL = {"landmark-doubtful", "landmarks-proposed", "jaws-parted-by-shape", "jaws-separated-again"}
+
+CASE = """format = "cmfsim-case"
+version = 1
+name = "head"
+
+[image]
+file = "ct.nii.gz"
+
+[mesh]
+edge_length = {edge}
+
+[[osteotomies]]
+procedure = "le_fort_1"
+
+[plan.maxilla]
+translation = [{motion}]
+
+[muscles]
+"""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A CT made harder.
+
+    Attributes
+    ----------
+    make : callable
+        The image of the clean one.
+    to_variant : callable
+        The (4, 4) motion and scale from the clean head to that of the variant, of the clean image.
+    tolerance : float, mm
+    """
+
+    make: Callable[[ImageData], ImageData]
+    to_variant: Callable[[ImageData], np.ndarray] = field(default=lambda _: np.eye(4))
+    tolerance: float = TOLERANCE
+
+
+def _landmarks() -> dict[str, np.ndarray]:
+    path = data_folder() / "ct_phantom" / "skull_landmarks.mrk.json"
+    return dict(cmfsim.read_landmarks(path))
+
+
+def data_folder() -> Path:
+    """The folder of real data."""
+    return Path(os.environ.get("CMFSIM_DATA", ROOT.parent / "shared" / "data"))
+
+
+def _turned(*angles: float) -> Variant:
+    return Variant(
+        lambda image: variants.turned(image, angles)[0],
+        lambda image: variants.turned(image, angles)[1],
+    )
+
+
+def _below(image: ImageData, name: str, by: float) -> ImageData:
+    return variants.cropped(image, 2, low=float(_landmarks()[name][2]) + by)
+
+
+def _pads(image: ImageData) -> ImageData:
+    for name in ("inferior_malar_L", "inferior_malar_R"):
+        place = _landmarks()[name] + [0.0, 15.0, -10.0]
+        image = variants.with_pad(image, tuple(place), 50.0, 12.0, -60.0)
+    return image
+
+
+def _fine(image: ImageData) -> ImageData:
+    face = variants.cropped(image, 1, high=float(_landmarks()["supraglenoid_L"][1]) + 40.0)
+    return variants.resampled(face, (0.3, 0.3, 0.3))
+
+
+def _offset(image: ImageData) -> ImageData:
+    values = np.clip(image.values, -1024, None).astype(np.int32) + 1024
+    return image.with_values(values.astype(np.uint16))
+
+
+VARIANTS: Mapping[str, Variant] = {
+    "mouth open by 15°": Variant(
+        lambda i: variants.with_mouth_open(i, _landmarks()), tolerance=OPEN_TOLERANCE
+    ),
+    "nodding forwards by 25°": _turned(25.0, 0.0, 0.0),
+    "nodding backwards by 25°": _turned(-25.0, 0.0, 0.0),
+    "round field of view, 16 cm": scan_variants.VARIANTS["cone beam, 160 mm of the head"],
+    "cut above the brow": Variant(
+        lambda i: variants.cropped(i, 2, high=float(_landmarks()["glabella"][2]) + 6.0)
+    ),
+    "cut below the chin": Variant(lambda i: _below(i, "menton", -6.0)),
+    "chin cut off": Variant(lambda i: _below(i, "menton", 25.0)),
+    "one side": Variant(lambda i: variants.one_side(i, float(_landmarks()["nasion"][0]))),
+    "no teeth": Variant(lambda i: variants.without_teeth(i, _landmarks())),
+    "brackets": scan_variants.VARIANTS["brackets and wire of steel"],
+    "head holder": Variant(
+        lambda i: variants.with_holder(variants.with_pillow(variants.without_couch(i, -107.0)))
+    ),
+    "beard": Variant(lambda i: variants.with_beard(i, _landmarks())),
+    "pads on the cheeks": Variant(_pads),
+    "slices of 3 mm": Variant(
+        lambda i: variants.resampled(i, (i.spacing[0], i.spacing[1], 3.0))
+    ),
+    "voxels of 0.3 mm": Variant(_fine),
+    "a child's size, 0.8": Variant(
+        lambda i: variants.scaled(i, 0.8), lambda _: np.diag([0.8, 0.8, 0.8, 1.0])
+    ),
+    "1024 too high": Variant(_offset),
+}  # fmt: skip
+
+
+def predicted(image: ImageData, motion: np.ndarray, edge: float) -> dict[str, Any]:
+    """Points and displacements of the face, the codes of findings, or the error."""
+    import SimpleITK  # noqa: PLC0415
+
+    begun = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder)
+        written = SimpleITK.GetImageFromArray(np.ascontiguousarray(np.asarray(image.values).T))
+        written.SetSpacing(np.asarray(image.spacing, dtype=float).tolist())
+        written.SetOrigin(np.asarray(image.lowest, dtype=float).tolist())
+        SimpleITK.WriteImage(written, str(path / "ct.nii.gz"))
+        text = CASE.format(edge=edge, motion=", ".join(f"{v:.6f}" for v in motion))
+        (path / "case.toml").write_text(text, encoding="utf-8")
+        try:
+            found = cmfsim.predict(cmfsim.Case.load(path / "case.toml"), model="M+S")
+        except cmfsim.CmfsimError as error:
+            return {"error": str(error), "seconds": time.process_time() - begun}
+        before, after = found.face_before, found.face
+    codes = sorted({f.code for f in found.findings if f.severity != "note"})
+    return {
+        "points": before.vertices,
+        "displacements": after.vertices - before.vertices,
+        "codes": codes,
+        "error": "",
+        "seconds": time.process_time() - begun,
+    }
+
+
+def compared(
+    row: Mapping[str, Any], clean: Mapping[str, Any], to_variant: np.ndarray
+) -> dict[str, float]:
+    """Mean and 95 % of the differences where the clean face moves, and the part that is there."""
+    back = np.linalg.inv(to_variant)
+    points = row["points"] @ back[:3, :3].T + back[:3, 3]
+    moved = row["displacements"] @ back[:3, :3].T
+    moves = np.linalg.norm(clean["displacements"], axis=1) > MOVES
+    away, nearest = cKDTree(points).query(clean["points"][moves])
+    near = away < NEAR
+    apart = np.linalg.norm(moved[nearest] - clean["displacements"][moves], axis=1)[near]
+    if not len(apart):
+        return {"mean": np.inf, "p95": np.inf, "covered": 0.0}
+    return {
+        "mean": float(apart.mean()),
+        "p95": float(np.percentile(apart, 95.0)),
+        "covered": float(near.mean()),
+    }
+
+
+def verdict(name: str, row: Mapping[str, Any], usual: set[str]) -> str:
+    """Within tolerance, reported, refused or silent."""
+    if row["error"]:
+        return f"refused: {row['error'][:160]}"
+    codes = [code for code in row["codes"] if code not in usual | USUAL]
+    told = ", ".join(f"`{code}`" for code in codes)
+    if row["mean"] <= getattr(VARIANTS[name], "tolerance", TOLERANCE):
+        return f"within tolerance{f'; {told}' if told else ''}"
+    return f"reported: {told}" if told else "**SILENT**"
+
+
+def _line(name: str, row: Mapping[str, Any], usual: set[str]) -> str:
+    figures = "– | – | –"
+    if not row["error"]:
+        figures = f"{row['mean']:.2f} | {row['p95']:.2f} | {100 * row['covered']:.0f}"
+    return f"| {name} | {figures} | {row['seconds']:.0f} | {verdict(name, row, usual)} |"
+
+
+def _kept(cache: Path | None, name: str, edge: float, make: Callable[[], dict[str, Any]]) -> Any:
+    """What `make` returns, read back where the same sources have computed it before."""
+    if cache is None:
+        return make()
+    sources = sorted((ROOT / "python/cmfsim").rglob("*.py")) + [Path(__file__)]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources))
+    digest.update(f"{name} {edge}".encode())
+    path = cache / f"GATES_face_{digest.hexdigest()[:16]}.npz"
+    if path.exists():
+        with np.load(path) as stored:
+            plain = json.loads(str(stored["plain"]))
+            return {**plain, **{k: stored[k] for k in stored.files if k != "plain"}}
+    found = make()
+    arrays = {k: v for k, v in found.items() if isinstance(v, np.ndarray)}
+    plain = {k: v for k, v in found.items() if k not in arrays}
+    np.savez_compressed(path, plain=json.dumps(plain), **arrays)
+    return found
+
+
+def main() -> None:
+    """Prints the table, or puts it into a page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--markdown", type=Path)
+    parser.add_argument("--only", nargs="+", choices=[*VARIANTS])
+    parser.add_argument("--edge", type=float, default=6.0, help="of the tets, mm")
+    parser.add_argument("--cache", type=Path, help="folder for rows")
+    options = parser.parse_args()
+    image = cmfsim.read_image(data_folder() / "ct_phantom" / "ct.nii.gz")
+    clean = _kept(
+        options.cache, "clean", options.edge, lambda: predicted(image, FORWARDS, options.edge)
+    )
+    if clean["error"]:
+        raise SystemExit(f"the unmodified CT: {clean['error']}")
+    usual = set(clean["codes"])
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"],  # noqa: S607
+        cwd=ROOT, check=True, capture_output=True, text=True,
+    ).stdout.strip()  # fmt: skip
+    made = (
+        f"cmfsim {cmfsim.__version__} after commit {commit}, {platform.machine()}, edges of "
+        f"{options.edge:g} mm; `python {NAME}`. Differences of the face in mm, part of it that the "
+        "variant shows in %, processor time in s."
+    )
+    lines = [
+        made,
+        "",
+        "| variant | mean | 95 % | shown | time | verdict |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in options.only or VARIANTS:
+        variant = VARIANTS[name]
+        to_variant = getattr(variant, "to_variant", lambda _: np.eye(4))(image)
+        motion = to_variant[:3, :3] @ FORWARDS
+
+        def make(variant: Any = variant, motion: np.ndarray = motion) -> dict[str, Any]:
+            return predicted(variant.make(image), motion, options.edge)
+
+        row = _kept(options.cache, name, options.edge, make)
+        if not row["error"]:
+            row |= compared(row, clean, to_variant)
+        lines.append(_line(name, row, usual))
+        print(lines[-1], file=sys.stderr, flush=True)
+    publish(options.markdown, NAME, "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

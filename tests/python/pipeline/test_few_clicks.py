@@ -1,0 +1,151 @@
+"""Few landmarks placed by hand decide what is what; none is believed that lies on another bone."""
+
+import json
+
+import numpy as np
+import pytest
+
+import cmfsim
+import ct_variants as variants
+from cmfsim.bones import cut_bones, place_procedure
+from cmfsim.cli import main
+from cmfsim.pipeline.building.site_checks import check_bones_of_sites, check_pieces
+from cmfsim.values.landmark_sites import is_lower_site
+from real_heads import data_folder, landmarks
+
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
+pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
+
+UPPER_ROW = ("supradentale", "supra_m2_L", "supra_m2_R")
+LOWER_ROW = ("infradentale", "sub_m2_L", "sub_m2_R")
+CHILD = 0.8
+CASE = """format = "cmfsim-case"
+version = 1
+name = "child"
+
+[image]
+file = "ct.nrrd"
+
+[mesh]
+edge_length = 10.0
+
+[landmarks]
+skull = "skull.mrk.json"
+
+[[osteotomies]]
+procedure = "le_fort_1"
+
+[plan.maxilla]
+translation = [0, -4, 0]
+"""
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """The phantom's CT at about 4 mm."""
+    image = cmfsim.read_image(data_folder() / "ct_phantom" / "ct.nii.gz")
+    return variants.coarser(image, (4, 4, 2))
+
+
+@pytest.fixture(scope="module")
+def child(coarse):
+    """A child's head with open mouth, in voxels of 3 mm."""
+    return variants.scaled(variants.with_mouth_open(coarse, landmarks("ct_phantom")), CHILD)
+
+
+def clicks(*names, size=CHILD):
+    return {name: size * landmarks("ct_phantom")[name] for name in names}
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """A case, for the places that messages name."""
+    folder = tmp_path_factory.mktemp("case")
+    (folder / "case.toml").write_text(CASE, encoding="utf-8")
+    return cmfsim.Case.load(folder / "case.toml")
+
+
+def parted(anatomy):
+    return set(anatomy.bones) == {"cranium", "mandible"}
+
+
+def test_three_clicks_on_the_upper_teeth_separate_the_jaws_of_an_open_mouth(child):
+    sites = clicks(*UPPER_ROW)
+    anatomy = cmfsim.segment_head(child, landmarks=sites)
+    assert parted(anatomy)
+    cranium, mandible = (anatomy.bones[name] for name in ("cranium", "mandible"))
+    for name, point in sites.items():
+        assert cranium.sample(point[None])[0] > mandible.sample(point[None])[0], name
+    # The chin turned down and back with the mandible, and all of it lies below the upper row.
+    z = mandible.axes()[2].ravel()[np.flatnonzero((mandible.values > 0.0).any(axis=(0, 1)))]
+    assert z[0] < CHILD * landmarks("ct_phantom")["menton"][2] - 8.0
+    volume = np.count_nonzero(mandible.values > 0.0) * np.prod(mandible.spacing) / 1000.0
+    assert 25.0 < volume < 50.0
+
+
+def test_clicks_on_the_teeth_of_the_other_jaw_are_refused_by_name(coarse):
+    """As if upper and lower were confused: no lower jaw is left below the clicked row."""
+    image = variants.scaled(coarse, CHILD)
+    lower = clicks(*LOWER_ROW)
+    wrong = dict(zip(UPPER_ROW, lower.values(), strict=True))
+    (finding,) = (
+        f for f in cmfsim.segment_head(image, landmarks=wrong).findings if f.severity == "error"
+    )
+    assert finding.code == "sites-on-other-jaw"
+    assert all(name in finding.fix for name in UPPER_ROW)
+
+
+def exchanged(anatomy):
+    """The anatomy with its bones under one another's names."""
+    bones = {"cranium": anatomy.bones["mandible"], "mandible": anatomy.bones["cranium"]}
+    return cmfsim.Anatomy(anatomy.skin, bones, anatomy.air, anatomy.teeth, anatomy.findings)
+
+
+def test_sites_on_the_bone_of_the_other_jaw_are_refused_with_their_distances(child, case):
+    sites = clicks("nasion", *UPPER_ROW)
+    anatomy = cmfsim.segment_head(child, landmarks=sites)
+    check_bones_of_sites(case, sites, anatomy, by_hand=True)
+    with pytest.raises(cmfsim.LandmarkError, match=r"supradentale .* mm from the upper .* mm from"):
+        check_bones_of_sites(case, sites, exchanged(anatomy), by_hand=True)
+
+
+def test_the_sites_of_real_heads_lie_on_their_own_bones(coarse, case):
+    sites = landmarks("ct_phantom")
+    anatomy = cmfsim.segment_head(coarse, landmarks=sites)
+    check_bones_of_sites(case, sites, anatomy, by_hand=True)
+    lower = {name for name in sites if is_lower_site(name)}
+    assert len(lower) == 10
+
+
+def test_a_piece_without_its_sites_or_with_the_lower_jaw_is_refused(coarse, case):
+    sites = landmarks("ct_phantom")
+    anatomy = cmfsim.segment_head(coarse, landmarks=sites)
+    procedure = place_procedure("le_fort_1", sites)
+    right = cut_bones(anatomy.bones, [procedure])
+    check_pieces(case, sites, right.segments, right.procedures, by_hand=True)
+    elsewhere = {**sites, "supradentale": sites["glabella"]}
+    with pytest.raises(cmfsim.LandmarkError, match=r"'maxilla' does not hold .*supradentale"):
+        check_pieces(case, elsewhere, right.segments, right.procedures, by_hand=True)
+    # Jaws that were not separated and passed for a cranium.
+    whole = np.maximum(anatomy.bones["cranium"].values, anatomy.bones["mandible"].values)
+    joined = {"cranium": anatomy.skin.with_values(whole)}
+    both = cut_bones(joined, [procedure])
+    with pytest.raises(cmfsim.LandmarkError, match="holds part of the lower jaw"):
+        check_pieces(case, sites, both.segments, both.procedures, by_hand=True)
+
+
+@pytest.mark.slow
+def test_three_clicks_suffice_for_a_face(child, tmp_path, capsys):
+    """The others are found; muscles and lips are placed by all of them."""
+    from cmfsim.io import write_landmarks  # noqa: PLC0415
+
+    sitk = pytest.importorskip("SimpleITK")
+    image = sitk.GetImageFromArray(np.ascontiguousarray(child.values.T))
+    image.SetSpacing(np.asarray(child.spacing).tolist())
+    image.SetOrigin(np.asarray(child.lowest).tolist())
+    sitk.WriteImage(image, str(tmp_path / "ct.nrrd"))
+    write_landmarks(tmp_path / "skull.mrk.json", clicks(*UPPER_ROW))
+    (tmp_path / "case.toml").write_text(CASE, encoding="utf-8")
+    assert main(["predict", str(tmp_path), "--model", "M+S", "--json", "-q"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report
