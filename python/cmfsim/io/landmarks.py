@@ -9,7 +9,7 @@ import logging
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -63,6 +63,8 @@ class LandmarkFile:
         An unstated frame, points that were never placed.
     unset : tuple of str
         The labels of the points that were never placed.
+    descriptions : mapping of str to str
+        Of the points that have one, by label.
     """
 
     points: Mapping[str, Floats]
@@ -70,6 +72,7 @@ class LandmarkFile:
     stated: bool
     findings: tuple[Finding, ...] = ()
     unset: tuple[str, ...] = ()
+    descriptions: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ class _Point:
     number: int
     label: str
     position: Floats
+    description: str = ""
 
 
 def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) -> dict[str, Floats]:
@@ -125,14 +129,19 @@ def read_landmark_file(path: str | os.PathLike[str], *, frame: str | None = None
     a case uses it.
     """
     found = _read(path, frame)
-    points, findings = _known_labels(found.points, Path(path).name)
-    return replace(found, points=points, findings=(*found.findings, *findings))
+    names, findings = _known_labels(found.points, Path(path).name)
+    return replace(
+        found,
+        points=MappingProxyType({names[label]: point for label, point in found.points.items()}),
+        descriptions={names[label]: text for label, text in found.descriptions.items()},
+        findings=(*found.findings, *findings),
+    )
 
 
 def _known_labels(
     points: Mapping[str, Floats], where: str
-) -> tuple[Mapping[str, Floats], list[Finding]]:
-    """The landmarks with the labels by which the package knows them."""
+) -> tuple[Mapping[str, str], list[Finding]]:
+    """The label by which the package knows each landmark, by that of the file."""
     known = {label_key(name): name for name in (*SKULL_LANDMARKS, *SKIN_LANDMARKS)}
     labels = {label: known.get(label_key(label), label) for label in points}
     for label, name in labels.items():
@@ -148,7 +157,7 @@ def _known_labels(
             "or rename one"
         )
     if not renamed:
-        return points, []
+        return labels, []
     more = f" and {len(renamed) - 4} more" if len(renamed) > 4 else ""
     finding = Finding.note(
         "landmark-spelling",
@@ -157,7 +166,7 @@ def _known_labels(
         why="the second spelling is used",
         fix="nothing needs to be done, but a single spelling is easier to find",
     )
-    return MappingProxyType({labels[label]: point for label, point in points.items()}), [finding]
+    return labels, [finding]
 
 
 def _read(path: str | os.PathLike[str], frame: str | None) -> LandmarkFile:
@@ -229,7 +238,8 @@ def _from_json(text: str, path: Path, frame: str | None) -> LandmarkFile:
             if entry.position is None:
                 unset.append(str(number if entry.label is None else entry.label))
             else:
-                points.append(_Point(number, _label(number, entry.label), entry.position))
+                label = _label(number, entry.label)
+                points.append(_Point(number, label, entry.position, entry.description))
     stated = None not in frames
     chosen = next(iter(sorted(f for f in frames if f)), frame or UNSTATED[".json"])
     return _landmark_file(points, unset, chosen, frame, path, stated=stated)
@@ -274,9 +284,8 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
         for name in ("x", "y", "z"):
             cell = row[name].strip()
             numbers.append(float(cell) if NUMBER.fullmatch(cell) else cell)
-        points.append(
-            _Point(number, _label(number, row["label"]), sign * as_position(number, numbers))
-        )
+        label, place = _label(number, row["label"]), sign * as_position(number, numbers)
+        points.append(_Point(number, label, place, row.get("desc", "").strip()))
     chosen = its_frame or frame or UNSTATED[".fcsv"]
     return _landmark_file(points, unset, chosen, frame, path, stated=its_frame is not None)
 
@@ -317,7 +326,8 @@ def _landmark_file(
             )
         )
     placed = MappingProxyType(_by_label(points))
-    return LandmarkFile(placed, chosen, stated, tuple(findings), tuple(unset))
+    said = {_label(p.number, p.label): p.description for p in points if p.description}
+    return LandmarkFile(placed, chosen, stated, tuple(findings), tuple(unset), said)
 
 
 def _by_label(points: list[_Point]) -> dict[str, Floats]:

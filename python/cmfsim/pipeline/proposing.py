@@ -17,6 +17,7 @@ from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.surface_data import SurfaceData
 
@@ -27,6 +28,7 @@ __all__ = [
     "propose_landmarks",
     "proposed_head",
     "read_template_head",
+    "unproposed_head",
 ]
 
 # Surfaces that are made at a time.
@@ -201,6 +203,15 @@ def _separated_by(
     if "mandible" not in again.bones or _is_worse(second.landmarks, first.landmarks):
         return None
     return second
+
+
+def unproposed_head(anatomy: Anatomy, why: str) -> ProposedHead:
+    """The head without landmarks: all are missing, for this reason."""
+    bones, skin = head_surfaces(anatomy)
+    nothing = ProposedLandmarks(
+        {}, {}, dict.fromkeys(SKULL_LANDMARKS, why), dict.fromkeys(SKIN_LANDMARKS, why)
+    )
+    return ProposedHead(anatomy, bones, skin, nothing)
 
 
 def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:

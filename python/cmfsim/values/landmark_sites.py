@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["SKIN_LANDMARKS", "SKULL_LANDMARKS", "label_key"]
+__all__ = ["JAW_SITES", "SKIN_LANDMARKS", "SKULL_LANDMARKS", "label_key", "site_part"]
 
 # The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
 # in its text, so the choice is ours.
@@ -62,6 +62,25 @@ def _definitions() -> dict[str, str]:
 # 10 in the midline and 11 on either side, after the sites at which Rhine & Campbell (1980) and
 # Phillips & Smuts (1996) measured the soft tissue; left and right are the patient's.
 SKULL_LANDMARKS: Mapping[str, str] = MappingProxyType(_definitions())
+
+
+# Sites of the lower jaw, without their side.
+JAW_SITES = (
+    "infradentale",
+    "supramentale",
+    "pogonion",
+    "menton",
+    "gonion",
+    "occlusal_line",
+    "sub_m2",
+)
+
+
+def site_part(kind: str, name: str) -> str:
+    """The part that a site lies on: "cranium", "mandible" or "skin"."""
+    if kind == "skin":
+        return "skin"
+    return "mandible" if name.startswith(JAW_SITES) else "cranium"
 
 
 def label_key(label: str) -> str:

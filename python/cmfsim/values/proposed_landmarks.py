@@ -83,15 +83,16 @@ class ProposedLandmarks:
     def _findings(self) -> Iterator[Finding]:
         count = len(self.skull) + len(self.skin)
         typical = sorted(s.error for s in (*self.skull.values(), *self.skin.values()))
-        yield Finding.note(
-            "landmarks-proposed",
-            f"{count} landmarks were found automatically; none was placed by hand; expected error "
-            f"{typical[len(typical) // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
-            where="landmarks",
-            why="cuts, muscles, the region and the lips are placed from them",
-            fix='"cmfsim landmarks case.toml" writes them with a picture: check them in 3D Slicer '
-            "and name the files under [landmarks]",
-        )
+        if count:
+            yield Finding.note(
+                "landmarks-proposed",
+                f"{count} landmarks were found automatically; none was placed by hand; expected "
+                f"error {typical[count // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
+                where="landmarks",
+                why="cuts, muscles, the region and the lips are placed from them",
+                fix='"cmfsim landmarks case.toml" writes them with a picture: check them in 3D '
+                "Slicer and name the files under [landmarks]",
+            )
         if self.doubtful_jaw:
             verdict = "is none" if self.impossible_jaw else "is doubtful"
             yield Finding.warning(

@@ -33,6 +33,7 @@ from cmfsim.values.case_parts import CaseMesh, CaseMotion
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.progress import Progress
+from cmfsim.values.site_states import SiteState, site_state
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ __all__ = [
     "read_anatomy",
     "read_case_landmarks",
     "read_motion",
+    "read_placed_sites",
     "segment_options",
 ]
 
@@ -69,6 +71,20 @@ def read_case_landmarks(case: Case) -> tuple[dict[str, Mapping[str, Floats]], tu
             landmarks[name] = found.points
             findings.extend(found.findings)
     return landmarks, tuple(findings)
+
+
+def read_placed_sites(
+    case: Case,
+) -> dict[str, tuple[Mapping[str, Floats], Mapping[str, SiteState]]]:
+    """The landmarks of a case by kind, and who placed each, as the files describe it."""
+    found = {}
+    for kind in ("skull", "skin"):
+        path = getattr(case.landmarks, kind)
+        if path is not None:
+            read = read_landmark_file(path, frame=case.landmarks.frame)
+            states = {name: site_state(read.descriptions.get(name, "")) for name in read.points}
+            found[kind] = (read.points, states)
+    return found
 
 
 def read_anatomy(
