@@ -24,14 +24,15 @@ from cmfsim.pipeline.building.inputs import (
     read_case_landmarks,
     read_placed_sites,
 )
+from cmfsim.pipeline.filling import filled_landmarks
 from cmfsim.pipeline.landmark_page import PAGE_FILE, head_content, write_landmark_page
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.pipeline.proposing import BY_SHAPE, ProposedHead, proposed_head, unproposed_head
 from cmfsim.planning.landmark_page import LandmarkContent
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import short_name
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
-from cmfsim.values.site_states import SiteState
 
 __all__ = ["landmarks"]
 
@@ -53,8 +54,10 @@ def landmarks(options: argparse.Namespace) -> int:
         found = head.landmarks
         if head.anatomy is not anatomy:
             noticed = tuple(finding for finding in noticed if finding.code != BY_SHAPE)
+        if case.landmarks.fills and (given := read_placed_sites(case)):
+            found = filled_landmarks(head, given)
         progress.stage("writing the landmarks")
-        written, unwritten = _write(case.output, head)
+        written, unwritten = _write(case.output, replace(head, landmarks=found), options.names)
         if options.page:
             progress.stage("making the page")
             size = write_landmark_page(case.output / PAGE_FILE, _page(case, head))
@@ -95,27 +98,21 @@ def _head(
 
 def _page(case: Case, head: ProposedHead) -> LandmarkContent:
     """The content of the page, with what a person has placed in the case's files."""
-    placed = {
-        (kind, name): (point, state)
-        for kind, (points, states) in read_placed_sites(case).items()
-        for name, point in points.items()
-        if (state := states[name]).by_person
-    }
+    given = read_placed_sites(case)
+    placed = {key: (point, state) for key, (point, state) in given.items() if state.by_person}
     return head_content(case.name, head, placed)
 
 
-def _write(folder: Path, head: ProposedHead) -> tuple[list[str], tuple[Finding, ...]]:
+def _write(folder: Path, head: ProposedHead, labels: str) -> tuple[list[str], tuple[Finding, ...]]:
     """The names of the files written, and the findings."""
     found = head.landmarks
     folder.mkdir(parents=True, exist_ok=True)
     names, findings = [], []
     for kind, sites in (("skull", found.skull), ("skin", found.skin)):
         if sites:
-            texts = {
-                name: SiteState("proposed", site.error, site.doubt).description
-                for name, site in sites.items()
-            }
-            points = {name: site.point for name, site in sites.items()}
+            label = {n: n if labels == "cmfsim" else short_name(kind, n) for n in sites}
+            texts = {label[name]: site.state.description for name, site in sites.items()}
+            points = {label[name]: site.point for name, site in sites.items()}
             write_landmarks(folder / FILES[kind], points, descriptions=texts)
             names.append(FILES[kind])
     doubtful = {

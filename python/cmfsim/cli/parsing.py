@@ -388,6 +388,12 @@ def _add_landmarks(commands: Any, named: argparse.ArgumentParser) -> None:
         "may be repeated",
     )
     landmarks.add_argument(
+        "--names",
+        choices=("cmfsim", "ali"),
+        default="cmfsim",
+        help="labels of the files: gonion_L (default), or LGo as in cephalometry and ALI_CBCT",
+    )
+    landmarks.add_argument(
         "--page",
         action="store_true",
         help="also write landmarks.html, a page in which the landmarks are checked and placed",

@@ -191,9 +191,16 @@ def landmarks_of(table: Table, folder: Path) -> CaseLandmarks:
         file_or_none(table, "skull", folder),
         file_or_none(table, "skin", folder),
         stated_frame(table),
-        table.flag("automatic", default=True),
+        _automatic(table),
         _template_folders(table, folder),
     )
+
+
+def _automatic(table: Table) -> bool | str:
+    """Whether landmarks are found: true, false, or those that the files lack."""
+    if "automatic" in table and (given := table.plain("automatic")) == "missing":
+        return str(given)
+    return table.flag("automatic", default=True)
 
 
 def _template_folders(table: Table, folder: Path) -> tuple[Path, ...]:

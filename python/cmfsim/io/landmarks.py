@@ -28,7 +28,12 @@ from cmfsim.io.markups import (
 )
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.finding import Finding
-from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key
+from cmfsim.values.landmark_sites import (
+    SKIN_LANDMARKS,
+    SKULL_LANDMARKS,
+    label_key,
+    named_site,
+)
 
 __all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landmarks"]
 
@@ -121,15 +126,18 @@ def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) ->
     return dict(found.points)
 
 
-def read_landmark_file(path: str | os.PathLike[str], *, frame: str | None = None) -> LandmarkFile:
+def read_landmark_file(
+    path: str | os.PathLike[str], *, frame: str | None = None, kind: str | None = None
+) -> LandmarkFile:
     """The landmarks of a file with its frame and findings; see `read_landmarks`.
 
     Labels that differ from those of `SKULL_LANDMARKS` and `SKIN_LANDMARKS` in spelling alone
     (capitals, spaces, hyphens) get theirs, and a finding reports it: `Nasion` is `nasion` wherever
-    a case uses it.
+    a case uses it. With a kind, "skull" or "skin", abbreviations of `CEPHALOMETRY` are read as
+    well: `LGo` is `gonion_L`.
     """
     found = _read(path, frame)
-    names, findings = _known_labels(found.points, Path(path).name)
+    names, findings = _known_labels(found.points, Path(path).name, kind)
     return replace(
         found,
         points=MappingProxyType({names[label]: point for label, point in found.points.items()}),
@@ -139,21 +147,25 @@ def read_landmark_file(path: str | os.PathLike[str], *, frame: str | None = None
 
 
 def _known_labels(
-    points: Mapping[str, Floats], where: str
+    points: Mapping[str, Floats], where: str, kind: str | None
 ) -> tuple[Mapping[str, str], list[Finding]]:
     """The label by which the package knows each landmark, by that of the file."""
     known = {label_key(name): name for name in (*SKULL_LANDMARKS, *SKIN_LANDMARKS)}
     labels = {label: known.get(label_key(label), label) for label in points}
+    if kind is not None:
+        try:
+            labels = {label: named_site(label, kind) or labels[label] for label in points}
+        except LandmarkInputError as error:
+            raise LandmarkInputError(f"{where}: {error}") from error
     for label, name in labels.items():
         if label != name and name in points:
             raise LandmarkInputError(
-                f"{where}: has {name!r} and {label!r}, which differ only in spelling: remove or "
-                "rename one"
+                f"{where}: has {name!r} and {label!r}, which are one landmark: remove or rename one"
             )
     renamed = [f"{label!r} is {name!r}" for label, name in labels.items() if label != name]
     if len(set(labels.values())) < len(labels):
         raise LandmarkInputError(
-            f"{where}: has a landmark twice, in two spellings ({', '.join(renamed[:4])}): remove "
+            f"{where}: has a landmark twice, under two names ({', '.join(renamed[:4])}): remove "
             "or rename one"
         )
     if not renamed:

@@ -1,11 +1,9 @@
 """The page of landmarks of a head: what was proposed, what a person has placed, what follows."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from cmfsim.io import replacing
+from cmfsim.pipeline.filling import GivenSites, head_distribution
 from cmfsim.pipeline.proposing import ProposedHead
 from cmfsim.planning.landmark_page import (
     LandmarkContent,
@@ -14,13 +12,7 @@ from cmfsim.planning.landmark_page import (
     landmark_page_text,
 )
 from cmfsim.registration.proposed.average_head import average_head
-from cmfsim.registration.site_covariance import (
-    PLACED_STD,
-    SiteDistribution,
-    SiteKey,
-    site_covariance,
-)
-from cmfsim.values.checks import Floats
+from cmfsim.registration.site_covariance import PLACED_STD, SiteDistribution
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.site_states import SiteState
 
@@ -32,7 +24,7 @@ PAGE_FILE = "landmarks.html"
 def head_content(
     name: str,
     head: ProposedHead,
-    placed: Mapping[SiteKey, tuple[Floats, SiteState]] | None = None,
+    placed: GivenSites | None = None,
     *,
     built_for: str = "",
 ) -> LandmarkContent:
@@ -48,8 +40,7 @@ def head_content(
     built_for : str
         The state of the case.
     """
-    bone = np.concatenate([surface.vertices for surface in head.bones.values()])
-    distribution = site_covariance(head.landmarks, bone)
+    distribution = head_distribution(head)
     average = average_head()
     surfaces = {**head.bones, **({} if head.skin is None else {"skin": head.skin})}
     sites = [
@@ -73,7 +64,7 @@ def head_content(
 def _sites(
     found: ProposedLandmarks,
     distribution: SiteDistribution,
-    placed: Mapping[SiteKey, tuple[Floats, SiteState]],
+    placed: GivenSites,
 ) -> list[PageSite]:
     errors = distribution.errors
     proposed = {"skull": found.skull, "skin": found.skin}

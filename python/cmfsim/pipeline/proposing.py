@@ -292,7 +292,7 @@ def read_template_head(folder: Path) -> TemplateHead:
         if (path := _file_of(folder, name)) is not None
     }
     points = {
-        kind: read_landmark_file(path).points
+        kind: read_landmark_file(path, kind=kind).points
         for kind in ("skull", "skin")
         if (path := folder / f"{kind}_landmarks.mrk.json").is_file()
     }

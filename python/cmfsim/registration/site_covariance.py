@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, site_part
@@ -24,8 +25,10 @@ KEPT_VARIANCE = 0.999
 # 2 mm at most sites (docs/landmarks.md).
 PLACED_STD = 1.0
 # Shapes that the family of synthetic heads lacks: smooth deviations with their length, as Lüthi et
-# al. (2018) add them to models of few heads, and each site's own; mm of the average head.
-SMOOTH_STD, SMOOTH_LENGTH, OWN_STD = 2.5, 40.0, 1.0
+# al. (2018) add them to models of few heads, and each site's own; mm of the average head. Together
+# 3.4 mm along each axis, which is rather too much than too little: expected errors must not be
+# smaller than errors (docs/landmarks.md).
+SMOOTH_STD, SMOOTH_LENGTH, OWN_STD = 3.0, 40.0, 1.5
 # Uncertainty of the pose before any site is seen: shift in mm, turn in radians, relative size.
 SHIFT_STD, TURN_STD, SIZE_STD = 15.0, 0.2, 0.08
 # Of the lower jaw against the cranium: it opens about the axis through its joints, radians, and
@@ -178,7 +181,8 @@ def _guessed_shift(mean: Floats, bone: Floats) -> Floats:
     """What brings an average head to where the bone is foremost, in its middle, mm."""
     front = bone[bone[:, 1] <= np.percentile(bone[:, 1], FOREMOST)]
     ahead = mean[mean[:, 1] <= np.percentile(mean[:, 1], 50.0)]
-    return front.mean(axis=0) - ahead.mean(axis=0)
+    shift: Floats = front.mean(axis=0) - ahead.mean(axis=0)
+    return shift
 
 
 def _smooth(mean: Floats) -> Floats:
@@ -213,7 +217,7 @@ def _measured(found: Floats, known: list[int], stds: Floats) -> Floats:
 
 
 def _conditional(
-    covariance: Floats, rows: Floats, away: Floats, noise: Floats
+    covariance: Floats, rows: NDArray[np.intp], away: Floats, noise: Floats
 ) -> tuple[Floats, Floats]:
     """Shift of the mean, and covariance, if `rows` were measured to be `away` with this noise."""
     across = covariance[:, rows]

@@ -139,8 +139,9 @@ class CaseLandmarks:
     skull, skin : Path or None
     frame : str or None
         The frame of files that do not state theirs.
-    automatic : bool
-        Whether landmarks are found automatically where neither file is given.
+    automatic : bool or "missing"
+        Whether landmarks are found automatically where neither file is given; "missing": also those
+        that the files lack.
     templates : tuple of Path
         Folders of heads whose landmarks are known, for finding them; see docs/landmarks.md.
     """
@@ -148,13 +149,19 @@ class CaseLandmarks:
     skull: Path | None = None
     skin: Path | None = None
     frame: str | None = None
-    automatic: bool = True
+    automatic: bool | str = True
     templates: tuple[Path, ...] = ()
 
     @property
     def proposed(self) -> bool:
-        """Whether landmarks are to be found automatically: none are given."""
-        return self.automatic and self.skull is None and self.skin is None
+        """Whether landmarks are to be found automatically: none are given, or not all."""
+        none = self.skull is None and self.skin is None
+        return self.fills or (bool(self.automatic) and none)
+
+    @property
+    def fills(self) -> bool:
+        """Whether landmarks that the files lack are filled in."""
+        return self.automatic == "missing"
 
 
 @dataclass(frozen=True)

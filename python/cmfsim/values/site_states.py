@@ -3,8 +3,14 @@
 import re
 from dataclasses import dataclass
 
-__all__ = ["PLACED", "SiteState", "site_state"]
+__all__ = ["GOOD_ERROR", "MOST_ERROR", "ORIGINS", "SURFACE_REACH", "SiteState", "site_state"]
 
+# A missing or doubtful site whose expected error has fallen to this, mm, need not be placed.
+GOOD_ERROR = 4.0
+# A missing site is filled in up to this expected error, mm; above `GOOD_ERROR` it is doubtful.
+MOST_ERROR = 8.0
+# A site that follows others is brought onto its surface if that is as near as this, mm.
+SURFACE_REACH = 12.0
 # What the description of every point that no person has placed or accepted contains.
 UNPLACED = "not placed by a person"
 ERROR = re.compile(r"expected error (\d+(?:\.\d+)?) mm")

@@ -166,8 +166,10 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     if anatomy is None:
         anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
         stages.add(noticed)
-    if case.landmarks.proposed and not landmarks:
-        head = found_landmarks(case, anatomy, stages, is_read=options.anatomy is None)
+    if case.landmarks.proposed:
+        head = found_landmarks(
+            case, anatomy, stages, is_read=options.anatomy is None, given=bool(landmarks)
+        )
     else:
         head = Head(case, landmarks, anatomy)
     # Tissue and muscles are placed by the anatomy and its landmarks, whatever becomes of the bones.

@@ -67,23 +67,21 @@ def read_case_landmarks(case: Case) -> tuple[dict[str, Mapping[str, Floats]], tu
     for name in ("skull", "skin"):
         path = getattr(case.landmarks, name)
         if path is not None:
-            found = read_landmark_file(path, frame=case.landmarks.frame)
+            found = read_landmark_file(path, frame=case.landmarks.frame, kind=name)
             landmarks[name] = found.points
             findings.extend(found.findings)
     return landmarks, tuple(findings)
 
 
-def read_placed_sites(
-    case: Case,
-) -> dict[str, tuple[Mapping[str, Floats], Mapping[str, SiteState]]]:
-    """The landmarks of a case by kind, and who placed each, as the files describe it."""
+def read_placed_sites(case: Case) -> dict[tuple[str, str], tuple[Floats, SiteState]]:
+    """The landmarks of a case by kind and label, and who placed each, as the files describe it."""
     found = {}
     for kind in ("skull", "skin"):
         path = getattr(case.landmarks, kind)
         if path is not None:
-            read = read_landmark_file(path, frame=case.landmarks.frame)
-            states = {name: site_state(read.descriptions.get(name, "")) for name in read.points}
-            found[kind] = (read.points, states)
+            read = read_landmark_file(path, frame=case.landmarks.frame, kind=kind)
+            for name, point in read.points.items():
+                found[kind, name] = (point, site_state(read.descriptions.get(name, "")))
     return found
 
 

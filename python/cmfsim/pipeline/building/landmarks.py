@@ -4,6 +4,7 @@ from typing import Any
 
 from cmfsim.errors import LandmarkError, LandmarkInputError
 from cmfsim.io import Case
+from cmfsim.pipeline.building.inputs import read_placed_sites
 from cmfsim.pipeline.building.parts import Head
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.values.anatomy import Anatomy
@@ -13,7 +14,9 @@ from cmfsim.values.proposed_landmarks import ProposedLandmarks
 __all__ = ["found_landmarks", "landmark_summary"]
 
 
-def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bool) -> Head:
+def found_landmarks(
+    case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bool, given: bool = False
+) -> Head:
     """A head with the landmarks found on it, by which its jaws may be separated.
 
     Without any, with a warning, where it shows no face: what cannot do without landmarks (muscles,
@@ -26,6 +29,8 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bo
     stages : Stages
     is_read : bool
         Whether the anatomy was made of the case's own files: the jaws of another one stay.
+    given : bool
+        Whether the case gives some landmarks, which the others then follow.
 
     Raises
     ------
@@ -33,12 +38,22 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bo
         (also `ValueError`) What was taken for the mandible in the image cannot be one.
     """
     # A case with landmarks loads nothing of the synthetic heads that others are compared with.
-    from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head  # noqa: PLC0415
+    from cmfsim.pipeline.filling import filled_landmarks  # noqa: PLC0415
+    from cmfsim.pipeline.proposing import (  # noqa: PLC0415
+        BY_SHAPE,
+        proposed_head,
+        unproposed_head,
+    )
 
     stages.begin("finding the landmarks")
     try:
-        head = proposed_head(case, anatomy, stages.begin, is_read=is_read)
+        head = proposed_head(case, anatomy, stages.begin, is_read=is_read and not given)
     except LandmarkError as error:
+        if given:
+            head = unproposed_head(anatomy, str(error))
+            found = filled_landmarks(head, read_placed_sites(case))
+            stages.add(found.findings)
+            return Head(case, found.points, anatomy, found, head.skin)
         stages.add(
             [
                 Finding.warning(
@@ -53,6 +68,8 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bo
         )
         return Head(case, {}, anatomy)
     found = head.landmarks
+    if given:
+        found = filled_landmarks(head, read_placed_sites(case))
     if found.impossible_jaw and case.image is not None:
         raise LandmarkInputError(
             f"{case.where('image.file')}: the jaws in the image could not be separated, because "
@@ -70,8 +87,10 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bo
 
 def landmark_summary(found: ProposedLandmarks) -> dict[str, Any]:
     """Where landmarks come from, for the summary of a model."""
+    sites = (*found.skull.values(), *found.skin.values())
+    is_all = not any(site.state.by_person for site in sites)
     return {
-        "source": "found automatically",
+        "source": "found automatically" if is_all else "placed by hand and filled in",
         **{
             kind: {
                 name: {"error": round(site.error, 2), "doubt": site.doubt}

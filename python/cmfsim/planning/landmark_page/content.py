@@ -11,8 +11,14 @@ from cmfsim._core import Surface, __version__
 from cmfsim.planning.landmark_page.views import site_view
 from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.checks import Floats
-from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, site_part
-from cmfsim.values.site_states import SiteState
+from cmfsim.values.landmark_sites import (
+    SKIN_SITES,
+    SKULL_LANDMARKS,
+    short_name,
+    site_labels,
+    site_part,
+)
+from cmfsim.values.site_states import GOOD_ERROR, SURFACE_REACH, SiteState
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["LandmarkContent", "PageSite", "landmark_content"]
@@ -21,8 +27,6 @@ __all__ = ["LandmarkContent", "PageSite", "landmark_content"]
 MOST_TRIANGLES: Mapping[str, int] = {"cranium": 60_000, "mandible": 24_000, "skin": 40_000}
 # And of the average head that shows where a site is.
 SMALL_TRIANGLES: Mapping[str, int] = {"cranium": 5_000, "mandible": 2_500, "skin": 3_500}
-# A missing or doubtful site whose expected error has fallen to this, mm, need not be placed.
-GOOD_ERROR = 4.0
 # How much of the height of the head a picture shows.
 SPAN_SHARE = 1.1
 
@@ -129,6 +133,7 @@ def landmark_content(
         "sites": [_values(site) for site in sites],
         "placed_std": placed_std,
         "good_error": GOOD_ERROR,
+        "surface_reach": SURFACE_REACH,
         **_framing(surfaces),
     }
     return LandmarkContent(values, arrays)
@@ -136,12 +141,15 @@ def landmark_content(
 
 def _values(site: PageSite) -> dict[str, Any]:
     state = site.state
-    definitions = SKULL_LANDMARKS if site.kind == "skull" else dict.fromkeys(SKIN_LANDMARKS, "")
+    definitions = SKULL_LANDMARKS if site.kind == "skull" else SKIN_SITES
+    short = short_name(site.kind, site.name)
     return {
         "kind": site.kind,
         "name": site.name,
         "part": site_part(site.kind, site.name),
         "where": definitions[site.name],
+        "short": "" if short == site.name else short,
+        "labels": list(site_labels(site.kind, site.name)),
         "origin": state.origin,
         "error": round(state.error, 2),
         "doubt": state.doubt,

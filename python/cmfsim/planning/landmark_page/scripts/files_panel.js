@@ -16,7 +16,7 @@ export class FilesPanel {
     this.app = app;
     this.file = element("input", { type: "file", accept: ".json", multiple: true, id: "landmark-files", onchange: () => this.loadAll([...this.file.files]) });
     const kinds = KINDS.filter((kind) => app.page.sites.some((s) => s.kind === kind));
-    this.lines = ["[landmarks]", ...kinds.map((kind) => `${kind} = "${fileOf(kind)}"`)].join("\n");
+    this.lines = ["[landmarks]", ...kinds.map((kind) => `${kind} = "${fileOf(kind)}"`), 'automatic = "missing"'].join("\n");
     this.root = element("div", {},
       element("h2", { textContent: "Save" }),
       element("div", { className: "row" }, ...kinds.map((kind) =>

@@ -13,15 +13,12 @@ import { connectKeys, connectPointing } from "./pointing.js";
 import { STAYS } from "./rigid.js";
 import { SiteModel } from "./site_model.js";
 import { SitePanel } from "./site_panel.js";
-import { labelKey } from "./loading.js";
 import { unpack } from "./unpacking.js";
 import { addViews, slider } from "./view_buttons.js";
 
 const BACKGROUND = [0.933, 0.945, 0.961];
 const JAW = [0.80, 0.84, 0.87];
 const MESSAGE_MS = 8000;
-// A site that follows is brought onto its surface if that is as near as this, mm.
-const REACH = 12;
 // How near to a ball a press takes hold of it, pixels; how far in front of a ball hides it, mm.
 const GRAB = 12, HIDES = 3;
 // A part shown fainter than SEEN cannot be clicked on. The skin over a chosen site of the bone.
@@ -35,7 +32,6 @@ class App {
     this.arrays = arrays;
     page.sites.forEach((site) => {
       site.label = labelOf(site.name) + (site.kind === "skin" ? " (skin)" : "");
-      site.keys = [site.name, ...(site.aliases ?? [])].map(labelKey);
     });
     this.points = page.sites.map((_, i) => [...arrays.site_points.values.slice(3 * i, 3 * i + 3)]);
     this.model = new SiteModel(this.points.flat(), arrays.site_covariance.values, page.placed_std);
@@ -96,7 +92,7 @@ class App {
       const free = this.points[i].map((v, k) => v + shift[k]);
       const follows = site.origin === "filled" || Math.hypot(...shift) > 0.05;
       const near = follows ? this.closest(site.part, free) : { point: free, distance: 0 };
-      const onSurface = near.distance <= REACH;
+      const onSurface = near.distance <= this.page.surface_reach;
       const point = onSurface ? near.point : free;
       const moved = Math.hypot(...point.map((v, k) => v - this.points[i][k]));
       const state = site.origin === "filled" ? (good(i) && onSurface ? "filled" : "missing")
@@ -173,7 +169,7 @@ class App {
     if (other === null || !this.decided.has(this.chosen)) return;
     const image = mirrored(this.decided.get(this.chosen).point, this.midplane());
     const near = this.closest(this.site.part, image);
-    if (near.distance > REACH) {
+    if (near.distance > this.page.surface_reach) {
       this.report(`There is no ${this.site.part} at the mirror image.`);
       return;
     }

@@ -20,7 +20,7 @@ export const labelKey = (label) => label.toLowerCase().split(/[\s_-]+/).filter(B
  */
 export function sitesOf(points, sites, away, name) {
   const kind = kindOf(points, sites, name);
-  const known = new Map(sites.flatMap((s, i) => (s.kind === kind ? s.keys.map((key) => [key, i]) : [])));
+  const known = new Map(sites.flatMap((s, i) => (s.kind === kind ? s.labels.map((key) => [key, i]) : [])));
   const found = [], unknown = [];
   for (const entry of points) {
     const site = known.get(labelKey(entry.label));
@@ -42,7 +42,7 @@ export function sitesOf(points, sites, away, name) {
 function kindOf(points, sites, name) {
   const counts = { skull: 0, skin: 0 };
   for (const { label } of points) {
-    const kinds = new Set(sites.filter((s) => s.keys.includes(labelKey(label))).map((s) => s.kind));
+    const kinds = new Set(sites.filter((s) => s.labels.includes(labelKey(label))).map((s) => s.kind));
     if (kinds.size === 1) counts[[...kinds][0]]++;
   }
   if (counts.skull && counts.skin) throw new Error("it has sites of both skull and skin: save them in two files");
