@@ -45,8 +45,8 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
     """The landmarks of a head of which a person has placed some.
 
     Given sites stay; the others move by the conditional mean of their distribution, and onto their
-    surface. A missing site is doubtful if its expected error is above `GOOD_ERROR`, and stays missing
-    if it is above `MOST_ERROR`.
+    surface. A missing site is doubtful if its expected error is above `GOOD_ERROR`, and stays
+    missing above `MOST_ERROR`.
 
     Parameters
     ----------

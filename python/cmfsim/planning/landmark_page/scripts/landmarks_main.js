@@ -443,7 +443,7 @@ class App {
 /** "gonion_L" as "Gonion, left". */
 function labelOf(name) {
   const side = { L: ", left", R: ", right" }[/_([LR])$/.exec(name)?.[1]] ?? "";
-  const plain = name.replace(/_[LR]$/, "").replaceAll("_", " ");
+  const plain = name.replace(/_[LR]$/, "").replaceAll("_", " ").replace(/\bm2$/, "M2");
   return plain[0].toUpperCase() + plain.slice(1) + side;
 }
 

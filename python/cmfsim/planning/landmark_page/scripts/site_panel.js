@@ -60,7 +60,7 @@ export class SitePanel {
     this.state.className = `status ${shown.state}`;
     this.state.textContent = stateText(site, shown);
     this.where.replaceChildren(
-      element("span", { textContent: site.where }),
+      element("span", { textContent: site.where[0].toUpperCase() + site.where.slice(1) + "." }),
       element("span", { className: "note", textContent: `Lies on the ${site.part === "skin" ? "skin" : site.part}${site.short ? `; also called ${site.short}` : ""}.` }));
     this.accepting.disabled = shown.state === "placed" || shown.state === "accepted" || !shown.onSurface;
     this.removing.disabled = !app.decided.has(app.chosen);
