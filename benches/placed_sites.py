@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from marked import publish
 
 import cmfsim
 from cmfsim.io import read_landmark_file, read_surface
@@ -22,6 +21,7 @@ from cmfsim.pipeline.proposing import ProposedHead
 from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.site_states import SiteState
+from marked import publish
 
 NAME = "benches/placed_sites.py"
 HEADS = {"ct_phantom": "CT phantom", "atlas_head": "atlas head"}

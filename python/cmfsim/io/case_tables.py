@@ -198,9 +198,10 @@ def landmarks_of(table: Table, folder: Path) -> CaseLandmarks:
 
 def _automatic(table: Table) -> bool | str:
     """Whether landmarks are found: true, false, or those that the files lack."""
-    if "automatic" in table and (given := table.plain("automatic")) == "missing":
-        return str(given)
-    return table.flag("automatic", default=True)
+    given = table.plain("automatic") if "automatic" in table else True
+    if not isinstance(given, bool) and given != "missing":
+        table.fail("automatic", f'is {given!r}: true, false or "missing" is needed')
+    return given if isinstance(given, bool) else "missing"
 
 
 def _template_folders(table: Table, folder: Path) -> tuple[Path, ...]:

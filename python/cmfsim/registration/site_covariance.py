@@ -34,7 +34,7 @@ SHIFT_STD, TURN_STD, SIZE_STD = 15.0, 0.2, 0.08
 # Of the lower jaw against the cranium: it opens about the axis through its joints, radians, and
 # glides, mm.
 OPENING_STD, GLIDE_STD = 0.12, 3.0
-# Errors of proposed sites are alike on a part, because what is wrong (a pose, a cut between the jaws)
+# Errors of proposed sites are alike on a part, because a wrong pose or a wrong cut between the jaws
 # is wrong for all of them: the share of the variance that they have in common, and its reach, mm.
 ALIKE_SHARE, ALIKE_LENGTH = 0.8, 60.0
 # The distance at which a proposed site counts half when the average head is brought onto them, mm.
