@@ -2,17 +2,15 @@
 
 import argparse
 import json
-import os
 import sys
 import time
-import webbrowser
 from collections.abc import Iterable
 from pathlib import Path
 
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.notices import Notices
+from cmfsim.cli.opening import open_page
 from cmfsim.cli.terminal import StageProgress, escaped
-from cmfsim.pictures import has_screen
 from cmfsim.pipeline.evaluating import evaluate
 from cmfsim.pipeline.outputs import WrittenResults, write_results
 from cmfsim.pipeline.predicting import predict_models
@@ -57,8 +55,7 @@ def demo(options: argparse.Namespace) -> int:
     print(f"report  {escaped(str(page))}")
     print(f"time    {seconds:.0f} s")
     notices.summarise(str(page))
-    if not options.no_open and _someone_looks():
-        webbrowser.open(page.resolve().as_uri())
+    open_page(page, wanted=not options.no_open)
     return DONE
 
 
@@ -96,8 +93,3 @@ def _work(
         # The report shows the pictures of the last model alone.
         pictures=lambda model: model == models[-1],
     )
-
-
-def _someone_looks() -> bool:
-    """Whether the session is interactive: not in a pipe, in CI or without a display."""
-    return sys.stdout.isatty() and not os.environ.get("CI") and has_screen()

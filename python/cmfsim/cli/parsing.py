@@ -387,6 +387,20 @@ def _add_landmarks(commands: Any, named: argparse.ArgumentParser) -> None:
         help="a head whose landmarks are known (cranium, mandible, skull_landmarks.mrk.json); "
         "may be repeated",
     )
+    landmarks.add_argument(
+        "--names",
+        choices=("cmfsim", "ali"),
+        default="cmfsim",
+        help="labels of the files: gonion_L (default), or LGo as in cephalometry and ALI_CBCT",
+    )
+    landmarks.add_argument(
+        "--page",
+        action="store_true",
+        help="also write landmarks.html, a page in which the landmarks are checked and placed",
+    )
+    landmarks.add_argument(
+        "--no-open", action="store_true", help="do not open the page in the browser"
+    )
     landmarks.set_defaults(run=landmarks_command.landmarks)
 
 

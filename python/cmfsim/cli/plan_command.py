@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import socket
 import sys
 import time
@@ -18,10 +17,10 @@ from cmfsim.cli.case_commands import case_of, checked
 from cmfsim.cli.desired_faces import TARGET_STD, read_targets
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.notices import Notices
+from cmfsim.cli.opening import can_open, open_page
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_plan
-from cmfsim.pictures import has_screen
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.planning_page import PAGE_FILE, write_planning_page
 from cmfsim.pipeline.predicting import build_patient
@@ -104,8 +103,7 @@ def plan(options: argparse.Namespace) -> int:
     print(f"time   {seconds:.0f} s")
     # The page lists no findings.
     notices.summarise(None)
-    if not options.no_open and sys.stdout.isatty() and not os.environ.get("CI") and has_screen():
-        webbrowser.open(path.resolve().as_uri())
+    open_page(path, wanted=not options.no_open)
     return DONE
 
 
@@ -161,7 +159,7 @@ def _serve(
             print(json.dumps({"url": url}), flush=True)
         else:
             print(f"page   {url}\nOnly this machine can open it; stop with Ctrl-C.", flush=True)
-        if not options.no_open and has_screen() and sys.stdout.isatty():
+        if not options.no_open and can_open():
             webbrowser.open(url)
 
     serve_planning(

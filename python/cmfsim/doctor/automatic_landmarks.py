@@ -21,12 +21,7 @@ def check_automatic(evidence: Evidence) -> Iterator[Finding]:
     ]
     yield Finding.note(
         "landmarks-automatic",
-        (
-            f"the case names {count} landmarks of the skull, so the build will find the others"
-            if count
-            else "the case names no landmarks, so the build will find them"
-        )
-        + "; the doctor does not check "
+        "the build will find the landmarks that the case does not give; the doctor does not check "
         + ", ".join(left),
         where=case.where("landmarks"),
         why="items placed from landmarks can be checked only when the landmarks are known; the "

@@ -191,9 +191,17 @@ def landmarks_of(table: Table, folder: Path) -> CaseLandmarks:
         file_or_none(table, "skull", folder),
         file_or_none(table, "skin", folder),
         stated_frame(table),
-        table.flag("automatic", default=True),
+        _automatic(table),
         _template_folders(table, folder),
     )
+
+
+def _automatic(table: Table) -> bool | str:
+    """Whether landmarks are found: true, false, or those that the files lack."""
+    given = table.plain("automatic") if "automatic" in table else True
+    if not isinstance(given, bool) and given != "missing":
+        table.fail("automatic", f'is {given!r}: true, false or "missing" is needed')
+    return given if isinstance(given, bool) else "missing"
 
 
 def _template_folders(table: Table, folder: Path) -> tuple[Path, ...]:

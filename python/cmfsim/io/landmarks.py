@@ -9,7 +9,7 @@ import logging
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -28,7 +28,12 @@ from cmfsim.io.markups import (
 )
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.finding import Finding
-from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key
+from cmfsim.values.landmark_sites import (
+    SKIN_LANDMARKS,
+    SKULL_LANDMARKS,
+    label_key,
+    named_site,
+)
 
 __all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landmarks"]
 
@@ -63,6 +68,8 @@ class LandmarkFile:
         An unstated frame, points that were never placed.
     unset : tuple of str
         The labels of the points that were never placed.
+    descriptions : mapping of str to str
+        Of the points that have one, by label.
     """
 
     points: Mapping[str, Floats]
@@ -70,6 +77,7 @@ class LandmarkFile:
     stated: bool
     findings: tuple[Finding, ...] = ()
     unset: tuple[str, ...] = ()
+    descriptions: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,7 @@ class _Point:
     number: int
     label: str
     position: Floats
+    description: str = ""
 
 
 def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) -> dict[str, Floats]:
@@ -117,38 +126,50 @@ def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) ->
     return dict(found.points)
 
 
-def read_landmark_file(path: str | os.PathLike[str], *, frame: str | None = None) -> LandmarkFile:
+def read_landmark_file(
+    path: str | os.PathLike[str], *, frame: str | None = None, kind: str | None = None
+) -> LandmarkFile:
     """The landmarks of a file with its frame and findings; see `read_landmarks`.
 
     Labels that differ from those of `SKULL_LANDMARKS` and `SKIN_LANDMARKS` in spelling alone
     (capitals, spaces, hyphens) get theirs, and a finding reports it: `Nasion` is `nasion` wherever
-    a case uses it.
+    a case uses it. With a kind, "skull" or "skin", abbreviations of `CEPHALOMETRY` are read as
+    well: `LGo` is `gonion_L`.
     """
     found = _read(path, frame)
-    points, findings = _known_labels(found.points, Path(path).name)
-    return replace(found, points=points, findings=(*found.findings, *findings))
+    names, findings = _known_labels(found.points, Path(path).name, kind)
+    return replace(
+        found,
+        points=MappingProxyType({names[label]: point for label, point in found.points.items()}),
+        descriptions={names[label]: text for label, text in found.descriptions.items()},
+        findings=(*found.findings, *findings),
+    )
 
 
 def _known_labels(
-    points: Mapping[str, Floats], where: str
-) -> tuple[Mapping[str, Floats], list[Finding]]:
-    """The landmarks with the labels by which the package knows them."""
+    points: Mapping[str, Floats], where: str, kind: str | None
+) -> tuple[Mapping[str, str], list[Finding]]:
+    """The label by which the package knows each landmark, by that of the file."""
     known = {label_key(name): name for name in (*SKULL_LANDMARKS, *SKIN_LANDMARKS)}
     labels = {label: known.get(label_key(label), label) for label in points}
+    if kind is not None:
+        try:
+            labels = {label: named_site(label, kind) or labels[label] for label in points}
+        except LandmarkInputError as error:
+            raise LandmarkInputError(f"{where}: {error}") from error
     for label, name in labels.items():
         if label != name and name in points:
             raise LandmarkInputError(
-                f"{where}: has {name!r} and {label!r}, which differ only in spelling: remove or "
-                "rename one"
+                f"{where}: has {name!r} and {label!r}, which are one landmark: remove or rename one"
             )
     renamed = [f"{label!r} is {name!r}" for label, name in labels.items() if label != name]
     if len(set(labels.values())) < len(labels):
         raise LandmarkInputError(
-            f"{where}: has a landmark twice, in two spellings ({', '.join(renamed[:4])}): remove "
+            f"{where}: has a landmark twice, under two names ({', '.join(renamed[:4])}): remove "
             "or rename one"
         )
     if not renamed:
-        return points, []
+        return labels, []
     more = f" and {len(renamed) - 4} more" if len(renamed) > 4 else ""
     finding = Finding.note(
         "landmark-spelling",
@@ -157,7 +178,7 @@ def _known_labels(
         why="the second spelling is used",
         fix="nothing needs to be done, but a single spelling is easier to find",
     )
-    return MappingProxyType({labels[label]: point for label, point in points.items()}), [finding]
+    return labels, [finding]
 
 
 def _read(path: str | os.PathLike[str], frame: str | None) -> LandmarkFile:
@@ -229,7 +250,8 @@ def _from_json(text: str, path: Path, frame: str | None) -> LandmarkFile:
             if entry.position is None:
                 unset.append(str(number if entry.label is None else entry.label))
             else:
-                points.append(_Point(number, _label(number, entry.label), entry.position))
+                label = _label(number, entry.label)
+                points.append(_Point(number, label, entry.position, entry.description))
     stated = None not in frames
     chosen = next(iter(sorted(f for f in frames if f)), frame or UNSTATED[".json"])
     return _landmark_file(points, unset, chosen, frame, path, stated=stated)
@@ -274,9 +296,8 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
         for name in ("x", "y", "z"):
             cell = row[name].strip()
             numbers.append(float(cell) if NUMBER.fullmatch(cell) else cell)
-        points.append(
-            _Point(number, _label(number, row["label"]), sign * as_position(number, numbers))
-        )
+        label, place = _label(number, row["label"]), sign * as_position(number, numbers)
+        points.append(_Point(number, label, place, row.get("desc", "").strip()))
     chosen = its_frame or frame or UNSTATED[".fcsv"]
     return _landmark_file(points, unset, chosen, frame, path, stated=its_frame is not None)
 
@@ -317,7 +338,8 @@ def _landmark_file(
             )
         )
     placed = MappingProxyType(_by_label(points))
-    return LandmarkFile(placed, chosen, stated, tuple(findings), tuple(unset))
+    said = {_label(p.number, p.label): p.description for p in points if p.description}
+    return LandmarkFile(placed, chosen, stated, tuple(findings), tuple(unset), said)
 
 
 def _by_label(points: list[_Point]) -> dict[str, Floats]:

@@ -44,10 +44,11 @@ SCHEMA = (
 
 @dataclass(frozen=True, eq=False)
 class MarkupPoint:
-    """A point of a markup: its label, and its place in LPS mm; None if it was never placed."""
+    """A point of a markup: label, place in LPS mm (None if never placed), description."""
 
     label: object
     position: Floats | None
+    description: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +106,10 @@ def markups_of(text: str, unstated: str) -> list[Markup]:
                 raise LandmarkInputError(f"point {number} is not a table of names and values")
             placed = entry.get("positionStatus", "defined") == "defined"
             place = scale * as_position(number, entry.get("position")) if placed else None
-            points.append(MarkupPoint(entry.get("label"), place))
+            said = entry.get("description")
+            points.append(
+                MarkupPoint(entry.get("label"), place, said if isinstance(said, str) else "")
+            )
         found.append(Markup(str(markup.get("type", "")), frame, tuple(points)))
     return found
 

@@ -18,6 +18,7 @@ from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.surface_data import SurfaceData
 
@@ -28,6 +29,7 @@ __all__ = [
     "propose_landmarks",
     "proposed_head",
     "read_template_head",
+    "unproposed_head",
 ]
 
 # Surfaces that are made at a time.
@@ -209,6 +211,15 @@ def _separated_by(
     return second
 
 
+def unproposed_head(anatomy: Anatomy, why: str) -> ProposedHead:
+    """The head without landmarks: all are missing, for this reason."""
+    bones, skin = head_surfaces(anatomy)
+    nothing = ProposedLandmarks(
+        {}, {}, dict.fromkeys(SKULL_LANDMARKS, why), dict.fromkeys(SKIN_LANDMARKS, why)
+    )
+    return ProposedHead(anatomy, bones, skin, nothing)
+
+
 def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:
     bones, skin = head_surfaces(anatomy)
     return ProposedHead(anatomy, bones, skin, propose_landmarks(bones, skin, templates=heads))
@@ -287,7 +298,7 @@ def read_template_head(folder: Path) -> TemplateHead:
         if (path := _file_of(folder, name)) is not None
     }
     points = {
-        kind: read_landmark_file(path).points
+        kind: read_landmark_file(path, kind=kind).points
         for kind in ("skull", "skin")
         if (path := folder / f"{kind}_landmarks.mrk.json").is_file()
     }

@@ -143,9 +143,9 @@ class CaseLandmarks:
     skull, skin : Path or None
     frame : str or None
         The frame of files that do not state theirs.
-    automatic : bool
-        Whether landmarks are found automatically where neither file is given, and the others
-        where the one of the skull has fewer than twelve.
+    automatic : bool or "missing"
+        Whether landmarks are found automatically where neither file is given, and the others where
+        the one of the skull has fewer than twelve; "missing": whatever the files lack.
     templates : tuple of Path
         Folders of heads whose landmarks are known, for finding them; see docs/landmarks.md.
     """
@@ -153,17 +153,23 @@ class CaseLandmarks:
     skull: Path | None = None
     skin: Path | None = None
     frame: str | None = None
-    automatic: bool = True
+    automatic: bool | str = True
     templates: tuple[Path, ...] = ()
 
     @property
     def proposed(self) -> bool:
-        """Whether landmarks are to be found automatically: none are given."""
-        return self.automatic and self.skull is None and self.skin is None
+        """Whether landmarks are to be found automatically: none are given, or not all."""
+        none = self.skull is None and self.skin is None
+        return self.fills or (bool(self.automatic) and none)
+
+    @property
+    def fills(self) -> bool:
+        """Whether landmarks that the files lack are filled in."""
+        return self.automatic == "missing"
 
     def is_completed(self, count: int) -> bool:
         """Whether others are found automatically for want of sites, `count` of the skull placed."""
-        return self.automatic and 0 < count < FEW_SITES
+        return bool(self.automatic) and 0 < count < FEW_SITES
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,26 @@
 """The landmarks of skull and skin: their names, and where the bone sites of a template lie."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
 from types import MappingProxyType
 
-__all__ = ["SKIN_LANDMARKS", "SKULL_LANDMARKS", "is_lower_site", "label_key"]
+from cmfsim.errors import LandmarkInputError
+
+__all__ = [
+    "CEPHALOMETRY",
+    "JAW_SITES",
+    "SKIN_LANDMARKS",
+    "SKIN_SITES",
+    "SKULL_LANDMARKS",
+    "CephalometricSite",
+    "is_lower_site",
+    "label_key",
+    "named_site",
+    "short_name",
+    "site_labels",
+    "site_part",
+]
 
 # The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
 # in its text, so the choice is ours.
@@ -23,6 +40,19 @@ SKIN_LANDMARKS = (
     "cheilion_L",
     "cheilion_R",
 )
+
+_SKIN_PLACES: Mapping[str, str] = {
+    "nasion": "root of the nose, at the height of the nasofrontal suture",
+    "pronasale": "most protruded point of the nose",
+    "subnasale": "where nasal septum and upper lip meet",
+    "labiale_superius": "upper border of the red of the upper lip",
+    "labiale_inferius": "lower border of the red of the lower lip",
+    "pogonion": "foremost point of the soft chin",
+    "exocanthion": "outer corner of the eye",
+    "endocanthion": "inner corner of the eye",
+    "alare": "most lateral point of the wing of the nose",
+    "cheilion": "corner of the mouth",
+}
 
 _MIDLINE: Mapping[str, str] = {
     "supraglabella": "frontal bone above the glabella, where the forehead begins to rise upright",
@@ -51,6 +81,14 @@ _PAIRED: Mapping[str, str] = {
 }
 
 
+_SIDES: Mapping[str, str] = {"_L": "left", "_R": "right"}
+
+
+def _plain(name: str) -> str:
+    """A name without its side."""
+    return name[:-2] if name[-2:] in _SIDES else name
+
+
 def _definitions() -> dict[str, str]:
     found = {name: f"midline: {where}" for name, where in _MIDLINE.items()}
     for name, where in _PAIRED.items():
@@ -64,8 +102,16 @@ def _definitions() -> dict[str, str]:
 SKULL_LANDMARKS: Mapping[str, str] = MappingProxyType(_definitions())
 
 
-# Sites of the lower jaw begin with these.
-LOWER_SITES = (
+# The same of the skin.
+SKIN_SITES: Mapping[str, str] = MappingProxyType(
+    {
+        name: f"{_SIDES.get(name[-2:], 'midline')}: {_SKIN_PLACES[_plain(name)]}"
+        for name in SKIN_LANDMARKS
+    }
+)
+
+# Sites of the lower jaw, without their side.
+JAW_SITES = (
     "infradentale",
     "supramentale",
     "pogonion",
@@ -78,9 +124,219 @@ LOWER_SITES = (
 
 def is_lower_site(name: str) -> bool:
     """Whether a site of the skull lies on the lower jaw."""
-    return name.startswith(LOWER_SITES)
+    return name.startswith(JAW_SITES)
+
+
+def site_part(kind: str, name: str) -> str:
+    """The part that a site lies on: "cranium", "mandible" or "skin"."""
+    if kind == "skin":
+        return "skin"
+    return "mandible" if is_lower_site(name) else "cranium"
 
 
 def label_key(label: str) -> str:
     """What two spellings of a label have in common: neither capitals nor what parts the words."""
     return "_".join(label.casefold().replace("-", " ").replace("_", " ").split())
+
+
+@dataclass(frozen=True)
+class CephalometricSite:
+    """A landmark under the names of cephalometry and of Slicer's automatic tools.
+
+    Attributes
+    ----------
+    short : tuple of str
+        Its abbreviations without a side ("LGo" and "Go_L" are the left gonion); the first is
+        written.
+    kind : str
+        "skull" or "skin".
+    name : str
+        In words.
+    site : str
+        Of `SKULL_LANDMARKS` or `SKIN_LANDMARKS` without its side; empty if cmfsim does not use it.
+    where : str
+        Its definition in cephalometry.
+    """
+
+    short: tuple[str, ...]
+    kind: str
+    name: str
+    site: str
+    where: str
+
+
+# Abbreviations as in cephalometry, with those of ALI_CBCT (Gillot et al. 2023) where they differ.
+CEPHALOMETRY: tuple[CephalometricSite, ...] = (
+    CephalometricSite(("N", "Na"), "skull", "nasion", "nasion", "front of the frontonasal suture"),
+    CephalometricSite(("G",), "skull", "glabella", "glabella", "foremost point between the brows"),
+    CephalometricSite(("Rhi", "Rh"), "skull", "rhinion", "rhinion", "tip of the nasal bones"),
+    CephalometricSite(
+        ("A", "SS"),
+        "skull",
+        "A point, subspinale",
+        "mid_philtrum",
+        "deepest point of the maxilla between anterior nasal spine and prosthion",
+    ),
+    CephalometricSite(
+        ("Pr", "SPr"),
+        "skull",
+        "prosthion",
+        "supradentale",
+        "edge of the bone between the upper central incisors",
+    ),
+    CephalometricSite(
+        ("Id",),
+        "skull",
+        "infradentale",
+        "infradentale",
+        "edge of the bone between the lower central incisors",
+    ),
+    CephalometricSite(
+        ("B",),
+        "skull",
+        "B point",
+        "supramentale",
+        "deepest point of the mandible between infradentale and pogonion",
+    ),
+    CephalometricSite(
+        ("Pog", "Pg"), "skull", "pogonion", "pogonion", "foremost point of the bony chin"
+    ),
+    CephalometricSite(("Me",), "skull", "menton", "menton", "lowest point of the chin"),
+    CephalometricSite(
+        ("Or",), "skull", "orbitale", "suborbital", "lowest point of the rim of the orbit"
+    ),
+    CephalometricSite(
+        ("Zy",), "skull", "zygion", "zygomatic_arch", "outermost point of the zygomatic arch"
+    ),
+    CephalometricSite(("Go",), "skull", "gonion", "gonion", "point of the angle of the mandible"),
+    CephalometricSite(("N'", "Na'"), "skin", "soft nasion", "nasion", "root of the nose"),
+    CephalometricSite(("Prn", "Pn"), "skin", "pronasale", "pronasale", "tip of the nose"),
+    CephalometricSite(("Sn",), "skin", "subnasale", "subnasale", "where septum and upper lip meet"),
+    CephalometricSite(
+        ("Ls",), "skin", "labiale superius", "labiale_superius", "border of the upper vermilion"
+    ),
+    CephalometricSite(
+        ("Li",), "skin", "labiale inferius", "labiale_inferius", "border of the lower vermilion"
+    ),
+    CephalometricSite(
+        ("Pog'", "Pg'"), "skin", "soft pogonion", "pogonion", "foremost point of the soft chin"
+    ),
+    CephalometricSite(("Ex",), "skin", "exocanthion", "exocanthion", "outer corner of the eye"),
+    CephalometricSite(("En",), "skin", "endocanthion", "endocanthion", "inner corner of the eye"),
+    CephalometricSite(("Al",), "skin", "alare", "alare", "outermost point of the nose"),
+    CephalometricSite(("Ch",), "skin", "cheilion", "cheilion", "corner of the mouth"),
+    CephalometricSite(("S",), "skull", "sella", "", "middle of the sella turcica"),
+    CephalometricSite(("Ba",), "skull", "basion", "", "front edge of the foramen magnum"),
+    CephalometricSite(("ANS",), "skull", "anterior nasal spine", "", "tip of the spine"),
+    CephalometricSite(("PNS",), "skull", "posterior nasal spine", "", "tip of the spine"),
+    CephalometricSite(
+        ("Po",),
+        "skull",
+        "porion",
+        "",
+        "highest point of the opening of the ear canal, on each side",
+    ),
+    CephalometricSite(("Co",), "skull", "condylion", "", "highest point of each condyle"),
+    CephalometricSite(
+        ("Gn",), "skull", "gnathion", "", "point of the chin between pogonion and menton"
+    ),
+    CephalometricSite(
+        ("U1", "UR1O", "UL1O"), "skull", "upper incisor", "", "edge of the upper central incisor"
+    ),
+    CephalometricSite(
+        ("L1", "LR1O", "LL1O"), "skull", "lower incisor", "", "edge of the lower central incisor"
+    ),
+    CephalometricSite(
+        ("U6", "UR6O", "UL6O", "UR6MB", "UL6MB"),
+        "skull",
+        "upper first molar",
+        "",
+        "crown of the upper first molar: middle (O), mesiobuccal cusp (MB)",
+    ),
+    CephalometricSite(
+        ("L6", "LR6O", "LL6O", "LR6MB", "LL6MB"),
+        "skull",
+        "lower first molar",
+        "",
+        "crown of the lower first molar: middle (O), mesiobuccal cusp (MB)",
+    ),
+)
+
+
+def named_site(label: str, kind: str) -> str | None:
+    """The site of a kind that a label stands for, in any spelling or by an abbreviation.
+
+    Returns
+    -------
+    str or None
+        None if it is none of cmfsim's.
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) A paired site without its side.
+    """
+    key = label_key(label)
+    found = _labels(kind).get(key)
+    if found is None and key in _sideless(kind):
+        raise LandmarkInputError(
+            f"{label!r} does not state its side: use {label}_L for the patient's left and "
+            f"{label}_R for the right"
+        )
+    return found
+
+
+def short_name(kind: str, site: str) -> str:
+    """The abbreviation of a site as ALI_CBCT writes it, such as "LGo"; its label without one."""
+    side = site[-1] if site[-2:] in _SIDES else ""
+    for entry in CEPHALOMETRY:
+        if entry.kind == kind and entry.site == _plain(site):
+            return side + entry.short[0]
+    return site
+
+
+def site_labels(kind: str, site: str) -> tuple[str, ...]:
+    """All labels that stand for a site, as `label_key` spells them."""
+    return tuple(key for key, name in _labels(kind).items() if name == site)
+
+
+@cache
+def _labels(kind: str) -> Mapping[str, str]:
+    """The site of each label of a kind, as `label_key` spells it."""
+    found: dict[str, str] = {}
+    for name in SKULL_LANDMARKS if kind == "skull" else SKIN_LANDMARKS:
+        side = name[-2:] if name[-2:] in _SIDES else ""
+        for word in (_plain(name), *_abbreviations(kind, _plain(name))):
+            for label in _sided(word, side):
+                key = label_key(label)
+                if found.setdefault(key, name) != name:
+                    raise AssertionError((label, name, found[key]))
+    return MappingProxyType(found)
+
+
+@cache
+def _sideless(kind: str) -> frozenset[str]:
+    """Labels of paired sites that lack the side."""
+    names = {
+        _plain(name)
+        for name in (SKULL_LANDMARKS if kind == "skull" else SKIN_LANDMARKS)
+        if name[-2:] in _SIDES
+    }
+    return frozenset(
+        label_key(word) for name in names for word in (name, *_abbreviations(kind, name))
+    )
+
+
+def _abbreviations(kind: str, site: str) -> Iterator[str]:
+    for entry in CEPHALOMETRY:
+        if entry.kind == kind and entry.site == site:
+            yield from entry.short
+
+
+def _sided(word: str, side: str) -> tuple[str, ...]:
+    """The ways to write a word with a side: Go_L, LGo, Go left, left Go."""
+    if not side:
+        return (word,)
+    full = _SIDES[side]
+    return (f"{word}{side}", f"{side[1]}{word}", f"{side[1]} {word}", f"{word} {full}",
+            f"{full} {word}")  # fmt: skip

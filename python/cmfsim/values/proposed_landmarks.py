@@ -6,6 +6,7 @@ from types import MappingProxyType
 
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
+from cmfsim.values.site_states import SiteState
 
 __all__ = ["ProposedLandmarks", "ProposedSite"]
 
@@ -22,11 +23,19 @@ class ProposedSite:
         Expected distance from where a person would place it.
     doubt : str
         The reason to check it; empty if there is none.
+    origin : str
+        A key of `ORIGINS`: "proposed", or who placed, moved or filled it in.
     """
 
     point: Floats
     error: float
     doubt: str = ""
+    origin: str = "proposed"
+
+    @property
+    def state(self) -> SiteState:
+        """Where it comes from."""
+        return SiteState(self.origin, self.error, self.doubt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,17 +90,23 @@ class ProposedLandmarks:
         return tuple(self._findings())
 
     def _findings(self) -> Iterator[Finding]:
-        count = len(self.skull) + len(self.skin)
-        typical = sorted(s.error for s in (*self.skull.values(), *self.skin.values()))
-        yield Finding.note(
-            "landmarks-proposed",
-            f"{count} landmarks were found automatically; none was placed by hand; expected error "
-            f"{typical[len(typical) // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
-            where="landmarks",
-            why="cuts, muscles, the region and the lips are placed from them",
-            fix='"cmfsim landmarks case.toml" writes them with a picture: check them in 3D Slicer '
-            "and name the files under [landmarks]",
-        )
+        sites = {
+            **self.skull,
+            **{f"{name} (skin)": site for name, site in self.skin.items()},
+        }
+        typical = sorted(s.error for s in sites.values() if s.origin == "proposed")
+        count = len(typical)
+        yield from _following(sites)
+        if count and count == len(sites):
+            yield Finding.note(
+                "landmarks-proposed",
+                f"{count} landmarks were found automatically; none was placed by hand; expected "
+                f"error {typical[count // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
+                where="landmarks",
+                why="cuts, muscles, the region and the lips are placed from them",
+                fix='"cmfsim landmarks case.toml" writes them with a picture: check them in 3D '
+                "Slicer and name the files under [landmarks]",
+            )
         if self.doubtful_jaw:
             verdict = "is none" if self.impossible_jaw else "is doubtful"
             yield Finding.warning(
@@ -124,3 +139,24 @@ class ProposedLandmarks:
                     why="they are omitted rather than guessed; anything that needs them is refused",
                     fix="place them by hand if the image shows them",
                 )
+
+
+def _following(sites: Mapping[str, ProposedSite]) -> Iterator[Finding]:
+    """Which sites follow those that a person placed, with their expected errors."""
+    placed = [name for name, site in sites.items() if site.state.by_person]
+    if not placed:
+        return
+    texts = []
+    for origin, words in (("filled", "filled in"), ("moved", "moved")):
+        names = [f"{n} ({s.error:.1f} mm)" for n, s in sites.items() if s.origin == origin]
+        if names:
+            texts.append(f"{len(names)} were {words} (expected error): {', '.join(names)}")
+    yield Finding.note(
+        "landmarks-filled",
+        f"{len(placed)} landmarks were placed by hand, and others follow them: "
+        + ("; ".join(texts) or "none had to be moved"),
+        where="landmarks",
+        why="cuts, muscles, the region and the lips are placed from all of them",
+        fix='check them on the page of "cmfsim landmarks case.toml --page", and place those that '
+        "are wrong",
+    )

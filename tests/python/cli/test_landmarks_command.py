@@ -49,3 +49,40 @@ def test_doctor_reports_that_muscles_are_left_out_where_finding_landmarks_is_off
         report = json.loads(capsys.readouterr().out)
         codes = {finding["code"] for finding in report["findings"]}
         assert ("muscles-left-out" in codes) is refused
+
+
+def test_a_page_is_written_and_missing_sites_are_filled_in_from_the_files(case, capsys):
+    """Menton is given by its abbreviation and off by 6 mm: it stays, and the others follow it."""
+    pytest.importorskip("fast_simplification")
+    place = average_head().skull["menton"] + [0.0, -6.0, 0.0]
+    cmfsim.write_landmarks(case / "few.mrk.json", {"Me": place})
+    text = (case / "case.toml").read_text(encoding="utf-8")
+    more = '[landmarks]\nskull = "few.mrk.json"\nautomatic = "missing"\n'
+    (case / "few.toml").write_text(text + more, encoding="utf-8")
+    options = ["-o", str(case / "few"), "--names", "ali", "--page", "--no-open", "--json", "-q"]
+    assert main(["landmarks", str(case / "few.toml"), *options]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert "landmarks.html" in report["files"]
+    (finding,) = (f for f in report["findings"] if f["code"] == "landmarks-filled")
+    assert "1 landmarks were placed by hand" in finding["what"]
+    assert "pogonion (" in finding["what"]
+    assert len(report["skull"]) == 32
+    read = cmfsim.read_landmarks(case / "few" / "skull_landmarks.mrk.json")
+    assert read["Me"].tolist() == place.tolist()
+    assert {"LGo", "RGo", "N", "A", "Pog", "supraglabella"} <= read.keys()
+    page = (case / "few" / "landmarks.html").read_text(encoding="utf-8")
+    values = json.loads(page.partition('id="page-values">')[2].partition("<")[0])
+    placed = {s["name"]: s["placed"] for s in values["sites"] if s["placed"]}
+    assert placed == {"menton": place.tolist()}
+
+
+@pytest.mark.parametrize("given", ['"missing"', "true", "false"])
+def test_automatic_landmarks_are_asked_for_in_three_ways(case, given):
+    text = (case / "case.toml").read_text(encoding="utf-8")
+    (case / "asked.toml").write_text(f"{text}[landmarks]\nautomatic = {given}\n", "utf-8")
+    found = cmfsim.Case.load(case / "asked.toml").landmarks
+    assert found.proposed == (given != "false")
+    assert found.fills == (given == '"missing"')
+    (case / "asked.toml").write_text(f'{text}[landmarks]\nautomatic = "all"\n', "utf-8")
+    with pytest.raises(cmfsim.CaseError, match='"missing" is needed'):
+        cmfsim.Case.load(case / "asked.toml")

@@ -25,7 +25,7 @@ import cmfsim
 import cmfsim.planning.page.content
 from cmfsim.cli import main
 from cmfsim.cli.plan_command import _correction_text
-from cmfsim.planning.page.page import joined_scripts
+from cmfsim.planning.page.document import joined_scripts
 from cmfsim.planning.replanning import plan_distance
 from cmfsim.planning.replanning.expected_error import plan_near
 from cmfsim.planning.server import PlanningServer, open_port

@@ -33,6 +33,7 @@ from cmfsim.values.case_parts import CaseMesh, CaseMotion
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.progress import Progress
+from cmfsim.values.site_states import SiteState, site_state
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ __all__ = [
     "read_anatomy",
     "read_case_landmarks",
     "read_motion",
+    "read_placed_sites",
     "segment_options",
 ]
 
@@ -65,10 +67,22 @@ def read_case_landmarks(case: Case) -> tuple[dict[str, Mapping[str, Floats]], tu
     for name in ("skull", "skin"):
         path = getattr(case.landmarks, name)
         if path is not None:
-            found = read_landmark_file(path, frame=case.landmarks.frame)
+            found = read_landmark_file(path, frame=case.landmarks.frame, kind=name)
             landmarks[name] = found.points
             findings.extend(found.findings)
     return landmarks, tuple(findings)
+
+
+def read_placed_sites(case: Case) -> dict[tuple[str, str], tuple[Floats, SiteState]]:
+    """The landmarks of a case by kind and label, and who placed each, as the files describe it."""
+    found = {}
+    for kind in ("skull", "skin"):
+        path = getattr(case.landmarks, kind)
+        if path is not None:
+            read = read_landmark_file(path, frame=case.landmarks.frame, kind=kind)
+            for name, point in read.points.items():
+                found[kind, name] = (point, site_state(read.descriptions.get(name, "")))
+    return found
 
 
 def read_anatomy(

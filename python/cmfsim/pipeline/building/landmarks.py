@@ -1,6 +1,6 @@
 """Landmarks of a case that gives none or few: found on its head; where they come from in words."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from cmfsim.doctor.bone_overlap import jaw_of
 from cmfsim.errors import LandmarkError, LandmarkInputError
 from cmfsim.io import Case
+from cmfsim.pipeline.building.inputs import read_placed_sites
 from cmfsim.pipeline.building.parts import Head
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.values.anatomy import Anatomy
@@ -34,6 +35,8 @@ OPPOSITE = (
 
 def is_to_be_found(case: Case, placed: Mapping[str, Mapping[str, Floats]]) -> bool:
     """Whether landmarks are found automatically: all, or those that a few placed ones leave."""
+    if case.landmarks.fills:
+        return True
     if case.landmarks.proposed:
         return not placed
     is_needed = case.muscles is not None or any(cut.procedure for cut in case.osteotomies)
@@ -50,8 +53,9 @@ def found_landmarks(
 ) -> Head:
     """A head with the landmarks found on it, by which its jaws may be separated.
 
-    Placed sites stay where they are. Without any landmarks, with a warning, where the head shows no
-    face: what cannot do without landmarks is refused where it is reached.
+    Placed sites stay where they are, and the others follow them. Without any landmarks, with a
+    warning, where the head shows no face: what cannot do without them is refused where it is
+    reached.
 
     Parameters
     ----------
@@ -70,27 +74,33 @@ def found_landmarks(
         needs it.
     """
     # A case with landmarks loads nothing of the synthetic heads that others are compared with.
-    from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head  # noqa: PLC0415
+    from cmfsim.pipeline.filling import filled_landmarks  # noqa: PLC0415
+    from cmfsim.pipeline.proposing import (  # noqa: PLC0415
+        BY_SHAPE,
+        proposed_head,
+        unproposed_head,
+    )
 
     stages.begin("finding the landmarks")
     skull = placed.get("skull", {})
     try:
         head = proposed_head(case, anatomy, stages.begin, is_read=is_read, placed=skull)
     except LandmarkError as error:
-        stages.add([_not_found(str(error), len(skull))])
-        return Head(case, placed, anatomy)
-    found = head.landmarks
-    apart = _apart(found, skull)
-    _check_jaw_of_placed(case, found, skull, apart)
+        if not case.landmarks.fills:
+            stages.add([_not_found(str(error), len(skull))])
+            return Head(case, placed, anatomy)
+        head = unproposed_head(anatomy, str(error))
+    apart = _apart(head.landmarks, skull)
+    _check_jaw_of_placed(case, head.landmarks, skull, apart)
     if any(size > DISAGREE for size in apart.values()):
         listed = ", ".join(f"{name} by {size:.0f} mm" for name, size in apart.items())
         reason = f"those found differ from those placed by hand: {listed}"
         stages.add([_not_found(reason, len(skull))])
         return Head(case, placed, anatomy)
-    points = {
-        kind: {**found.points.get(kind, {}), **placed.get(kind, {})} for kind in ("skull", "skin")
-    }
-    anatomy, read = head.anatomy, anatomy
+    found = filled_landmarks(head, read_placed_sites(case)) if placed else head.landmarks
+    points = dict(found.points)
+    findings = found.findings
+    read, anatomy = anatomy, head.anatomy
     if found.impossible_jaw and case.image is not None:
         if needs_lower_jaw(case):
             raise LandmarkInputError(
@@ -102,15 +112,11 @@ def found_landmarks(
         anatomy = _with_one_bone(anatomy)
         points["skull"] = {n: p for n, p in points["skull"].items() if not is_lower_site(n)}
         stages.add([_without_mandible(found.impossible_jaw)])
+        findings = tuple(f for f in findings if f.code != "jaw-impossible")
     elif anatomy is not read:
         stages.drop({BY_SHAPE})
     stages.add(head.findings)
-    if skull:
-        stages.add([_completed(found, skull)])
-        is_own = {f"{name} (skull)" for name in skull}
-        stages.add(f for f in found.findings if _is_about_others(f, is_own))
-        return Head(case, points, anatomy, None, head.skin)
-    stages.add(f for f in found.findings if anatomy is head.anatomy or f.code != "jaw-impossible")
+    stages.add(findings)
     return Head(case, points, anatomy, found, head.skin)
 
 
@@ -182,21 +188,6 @@ def _not_found(reason: str, count: int) -> Finding:
     )
 
 
-def _completed(found: ProposedLandmarks, skull: Mapping[str, Floats]) -> Finding:
-    apart = _apart(found, skull)
-    others = [name for name in found.skull if name not in skull]
-    return Finding.note(
-        "landmarks-completed",
-        f"{len(skull)} landmarks of the skull are placed by hand; {len(others)} others were found "
-        f"automatically; the placed ones lie up to {max(apart.values(), default=0.0):.1f} mm from "
-        "where they were found",
-        where="landmarks",
-        why="muscles, the region and the lips are placed from the others too",
-        fix='"cmfsim landmarks case.toml" writes all of them: check them in 3D Slicer and name the '
-        "files under [landmarks]",
-    )
-
-
 def _without_mandible(reason: str) -> Finding:
     return Finding.warning(
         "mandible-left-out",
@@ -210,17 +201,12 @@ def _without_mandible(reason: str) -> Finding:
     )
 
 
-def _is_about_others(finding: Finding, placed: Collection[str]) -> bool:
-    """Whether what was noticed on found sites is not about placed ones alone."""
-    if finding.code == "landmark-doubtful":
-        return not any(finding.what.startswith(name) for name in placed)
-    return finding.code not in {"landmarks-proposed", "jaw-impossible"}
-
-
 def landmark_summary(found: ProposedLandmarks) -> dict[str, Any]:
     """Where landmarks come from, for the summary of a model."""
+    sites = (*found.skull.values(), *found.skin.values())
+    is_all = not any(site.state.by_person for site in sites)
     return {
-        "source": "found automatically",
+        "source": "found automatically" if is_all else "placed by hand and filled in",
         **{
             kind: {
                 name: {"error": round(site.error, 2), "doubt": site.doubt}

@@ -6,19 +6,10 @@ import numpy as np
 
 from cmfsim.registration.reference import REFERENCE_PLACES
 from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import JAW_SITES
 
 __all__ = ["FAR_JAW", "JAW_SITES", "jaw_distance", "misfits"]
 
-# Sites of the lower jaw.
-JAW_SITES = (
-    "infradentale",
-    "supramentale",
-    "pogonion",
-    "menton",
-    "gonion",
-    "occlusal_line",
-    "sub_m2",
-)
 # The distance at which a site counts half in the fit, mm, and its rounds.
 HALF_DISTANCE, ROUNDS = 5.0, 30
 LEAST_SITES = 5

@@ -1,5 +1,7 @@
 // Least squares with bounds by Levenberg-Marquardt steps: as cmfsim.face_planning searches.
 
+import { factored, substituted } from "./cholesky.js";
+
 // Central differences, mm and degrees; a step below STILL ends the search.
 const DIFFERENCE = 1e-3;
 const STILL = 1e-6;
@@ -20,7 +22,7 @@ export function boundedLeastSquares(residuals, start, low, high, steps) {
     const largest = Math.max(...normal.map((row, i) => row[i]), 1e-30);
     for (;;) {
       const damped = normal.map((row, i) => row.map((v, j) => (i === j ? v + damping * Math.max(v, 1e-12 * largest) : v)));
-      const step = solved(damped, free.map((i) => -gradient[i]));
+      const step = substituted(factored(damped), free.map((i) => -gradient[i]));
       const next = [...x];
       free.forEach((i, k) => { next[i] += step[k]; });
       const there = inside(next);
@@ -46,26 +48,3 @@ function derivatives(residuals, x) {
 }
 
 const inner = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
-
-/** The solution of a symmetric positive definite system, by its Cholesky factor. */
-function solved(matrix, right) {
-  const n = right.length;
-  const factor = matrix.map((row) => [...row]);
-  for (let j = 0; j < n; j++) {
-    for (let i = j; i < n; i++) {
-      let sum = factor[i][j];
-      for (let k = 0; k < j; k++) sum -= factor[i][k] * factor[j][k];
-      factor[i][j] = i === j ? Math.sqrt(sum) : sum / factor[j][j];
-    }
-  }
-  const x = [...right];
-  for (let i = 0; i < n; i++) {
-    for (let k = 0; k < i; k++) x[i] -= factor[i][k] * x[k];
-    x[i] /= factor[i][i];
-  }
-  for (let i = n - 1; i >= 0; i--) {
-    for (let k = i + 1; k < n; k++) x[i] -= factor[k][i] * x[k];
-    x[i] /= factor[i][i];
-  }
-  return x;
-}

@@ -126,14 +126,28 @@ class App {
     this.solver.ask();
   }
 
-  grabbed() {
-    const { motion, place } = this.panel;
-    this.grabbedNumbers = clinicalNumbers(motion, place);
+  canGrab(at) {
+    return this.handles.at(...at) !== null;
   }
 
-  pull(key, amount) {
-    // To a tenth, as the fields show it.
-    this.panel.change(key, Math.round(10 * (this.grabbedNumbers[key] + amount)) / 10, false);
+  /** What a press at a place of the picture takes hold of: a handle, or a point of the skin. */
+  grab(at) {
+    const { handles, pulling } = this;
+    const shape = handles.at(...at);
+    if (shape) {
+      handles.grab(shape, ...at);
+      const { motion, place } = this.panel;
+      const numbers = clinicalNumbers(motion, place);
+      return {
+        // To a tenth, as the fields show it.
+        drag: (to) => this.panel.change(shape.key, Math.round(10 * (numbers[shape.key] + handles.pulled(...to))) / 10, false),
+        release: () => { handles.release(); this.commit(); },
+      };
+    }
+    if (!this.canPull) return null;
+    pulling.grab(at);
+    this.redraw();
+    return pulling.pull && { drag: (to) => pulling.drag(to), release: () => pulling.release() };
   }
 
   load(motions, warning) {

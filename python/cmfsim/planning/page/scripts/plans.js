@@ -1,31 +1,22 @@
-// The variants of a plan, with undo and redo: each value is whole, none is changed in place.
+// The variants of a plan, with undo and redo.
 
 import { clinicalNumbers } from "./clinical.js";
+import { History } from "./history.js";
 
 // Beyond these, mm and degrees, a number is a slip, not a plan.
 export const LIMITS = { mm: 30, "°": 30 };
-const MOST_STEPS = 200;
 const LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ";
 
-export class Plans {
+export class Plans extends History {
   /** reference: the motions of the case's own plan, in the order of the segments; more variants. */
   constructor(reference, more = []) {
-    this.reference = reference.map((m) => [...m]);
-    this.past = [];
-    this.future = [];
-    this.now = { active: 0, variants: [{ name: "A", motions: this.reference }, ...more] };
+    const own = reference.map((m) => [...m]);
+    super({ active: 0, variants: [{ name: "A", motions: own }, ...more] });
+    this.reference = own;
   }
 
   get active() {
     return this.now.variants[this.now.active];
-  }
-
-  /** Takes a new state; the one before can be had back by undo. */
-  take(state) {
-    this.past.push(this.now);
-    if (this.past.length > MOST_STEPS) this.past.shift();
-    this.future = [];
-    this.now = state;
   }
 
   /** The state in which the active variant has other motions. */
@@ -55,20 +46,6 @@ export class Plans {
     if (this.now.variants.length < 2) return;
     const variants = this.now.variants.filter((_, i) => i !== this.now.active);
     this.take({ active: Math.max(0, this.now.active - 1), variants });
-  }
-
-  undo() {
-    if (!this.past.length) return false;
-    this.future.push(this.now);
-    this.now = this.past.pop();
-    return true;
-  }
-
-  redo() {
-    if (!this.future.length) return false;
-    this.past.push(this.now);
-    this.now = this.future.pop();
-    return true;
   }
 
   freeName() {

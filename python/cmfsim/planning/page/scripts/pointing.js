@@ -1,53 +1,57 @@
-// Mouse, pen, touch and keys over the picture: handles first, else the camera.
+// Mouse, pen, touch and keys over the picture: what the page lets be grabbed first, else the camera.
+
+import { look } from "./view_buttons.js";
 
 const TURN_PER_PIXEL = 0.4;
 const KEY_TURN = 5;
 const KEY_ZOOM = 1.1;
+// A press that moves less than this, in pixels, is a click.
+const CLICK_REACH = 4;
 
-/** Connects the overlay with the app; `reset` forgets fingers that were lifted elsewhere. */
+/**
+ * Connects the overlay with the app.
+ *
+ * app gives: overlay, camera, redraw(); canGrab(place) for the cursor; grab(place), what a press
+ * takes hold of, as {drag(place), release()}, or null; and clicked(place), if it has clicks.
+ */
 export function connectPointing(app) {
-  const { overlay, camera, handles, pulling } = app;
+  const { overlay, camera } = app;
   const down = new Map();
+  let held = null;
+  let pressed = null;
   const place = (e) => {
     const box = overlay.getBoundingClientRect();
     return [e.clientX - box.left, e.clientY - box.top];
   };
   const released = () => {
-    if (pulling.pull) pulling.release();
-    if (!handles.held) return;
-    handles.release();
-    app.commit();
+    const was = held;
+    held = null;
+    was?.release();
   };
   overlay.addEventListener("pointerdown", (e) => {
     overlay.focus({ preventScroll: true });
     overlay.setPointerCapture(e.pointerId);
     down.set(e.pointerId, place(e));
-    const shape = down.size === 1 && e.button === 0 && !e.shiftKey ? handles.at(...place(e)) : null;
-    if (shape) {
-      handles.grab(shape, ...place(e));
-      app.grabbed();
-    } else if (handles.held || pulling.pull) {
+    pressed = null;
+    if (down.size > 1) {
       // A second finger: the first one no longer pulls.
       released();
-    } else if (down.size === 1 && e.button === 0 && !e.shiftKey && app.canPull) {
-      pulling.grab(place(e));
-      app.redraw();
+    } else if (e.button === 0 && !e.shiftKey) {
+      held = app.grab(place(e));
+      if (!held) pressed = place(e);
     }
   });
   overlay.addEventListener("pointermove", (e) => {
     if (!down.has(e.pointerId)) {
-      overlay.style.cursor = handles.at(...place(e)) ? "grab" : "default";
+      overlay.style.cursor = app.canGrab(place(e)) ? "grab" : "default";
       return;
     }
     const [x, y] = place(e);
-    if (handles.held) {
-      app.pull(handles.held.key, handles.pulled(x, y));
+    if (held) {
+      held.drag([x, y]);
       return;
     }
-    if (pulling.pull) {
-      pulling.drag([x, y]);
-      return;
-    }
+    if (pressed && Math.hypot(x - pressed[0], y - pressed[1]) > CLICK_REACH) pressed = null;
     const [ox, oy] = down.get(e.pointerId);
     const height = overlay.clientHeight;
     if (down.size === 2) {
@@ -65,6 +69,8 @@ export function connectPointing(app) {
   const lifted = (e) => {
     down.delete(e.pointerId);
     if (!down.size) released();
+    if (pressed && e.type === "pointerup") app.clicked?.(pressed);
+    pressed = null;
   };
   overlay.addEventListener("pointerup", lifted);
   overlay.addEventListener("pointercancel", lifted);
@@ -85,7 +91,7 @@ export function connectKeys(app) {
       ArrowUp: () => camera.turn(0, KEY_TURN), ArrowDown: () => camera.turn(0, -KEY_TURN),
       "+": () => camera.zoom(1 / KEY_ZOOM), "-": () => camera.zoom(KEY_ZOOM), 0: () => camera.recentre(),
     };
-    for (let i = 1; i <= 6; i++) actions[i] = () => app.view.look(i - 1);
+    for (let i = 1; i <= 6; i++) actions[i] = () => look(app, i - 1);
     if (!Object.hasOwn(actions, e.key)) return;
     actions[e.key]();
     e.preventDefault();

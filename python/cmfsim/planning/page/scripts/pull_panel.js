@@ -1,7 +1,8 @@
 // Pulling a point of the skin: in the picture, or by the movement that it should make.
 
 import { button, element, numberField, signed, typedNumber } from "./elements.js";
-import { Pull, PulledPoint, seenVertex } from "./pulling.js";
+import { seenPoint } from "./picking.js";
+import { Pull, PulledPoint } from "./pulling.js";
 import { STAYS } from "./rigid.js";
 
 const MOST_WISH = 30;
@@ -85,9 +86,9 @@ export class PullPanel {
   grab(at) {
     const { app } = this;
     const { face, camera, overlay } = app;
-    const vertex = seenVertex(camera, app.shownPlaces, face.triangles, at, overlay.clientWidth, overlay.clientHeight);
-    if (vertex < 0) return false;
-    this.vertex = vertex;
+    const seen = seenPoint(camera, app.shownPlaces, face.triangles, at, overlay.clientWidth, overlay.clientHeight);
+    if (!seen) return false;
+    this.vertex = seen.vertex;
     this.fill();
     this.choice.value = PICKED;
     this.point = this.chosen();

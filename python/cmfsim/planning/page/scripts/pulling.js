@@ -98,35 +98,3 @@ export class Pull {
     return this.motions(this.x);
   }
 }
-
-/**
- * The vertex of a surface that is seen at (x, y) of a picture of this size, in pixels; −1 for none.
- *
- * Of the nearest triangle there, the corner that is nearest in the picture.
- */
-export function seenVertex(camera, places, triangles, [x, y], width, height) {
-  const { right, up, towards } = camera.axes();
-  const scale = height / camera.span;
-  const count = places.length / 3;
-  const seen = new Float64Array(places.length);
-  for (let i = 0; i < count; i++) {
-    const [a, b, c] = [0, 1, 2].map((k) => places[3 * i + k] - camera.target[k]);
-    seen[3 * i] = width / 2 + scale * (right[0] * a + right[1] * b + right[2] * c) - x;
-    seen[3 * i + 1] = height / 2 - scale * (up[0] * a + up[1] * b + up[2] * c) - y;
-    seen[3 * i + 2] = towards[0] * a + towards[1] * b + towards[2] * c;
-  }
-  let best = -1, depth = -Infinity;
-  for (let t = 0; t < triangles.length; t += 3) {
-    const corners = [3 * triangles[t], 3 * triangles[t + 1], 3 * triangles[t + 2]];
-    const sides = corners.map((p, i) => {
-      const q = corners[(i + 1) % 3];
-      return seen[p] * seen[q + 1] - seen[p + 1] * seen[q];
-    });
-    if (!(sides.every((s) => s <= 0) || sides.every((s) => s >= 0))) continue;
-    const at = Math.max(...corners.map((p) => seen[p + 2]));
-    if (at <= depth) continue;
-    depth = at;
-    best = corners.reduce((a, b) => (Math.hypot(seen[a], seen[a + 1]) <= Math.hypot(seen[b], seen[b + 1]) ? a : b)) / 3;
-  }
-  return best;
-}

@@ -1,36 +1,25 @@
 // How the picture shows the face: opacity, before and after, side by side, colours of movement.
 
-import { VIEWS } from "./camera.js";
 import { MAP_COLOURS } from "./colours.js";
-import { button, element } from "./elements.js";
+import { element } from "./elements.js";
+import { addViews, slider } from "./view_buttons.js";
 
 export class ViewPanel {
   constructor(app) {
     this.app = app;
     this.values = { skin: 1, bones: 1, share: 1, side: false, map: false, band: false, handles: true, pull: false };
-    const views = document.getElementById("views");
-    views.append(
-      ...VIEWS.map((view, i) => button(view.name, () => this.look(i), { title: `key ${i + 1}` })),
-      button("Whole face", () => { app.camera.recentre(); app.redraw(); }, { title: "key 0" }));
-    const slider = (key, label) => element("label", {}, label, element("input", {
-      type: "range", min: 0, max: 1, step: 0.01, value: this.values[key], id: `show-${key}`,
-      oninput: (e) => this.set(key, Number(e.target.value)),
-    }));
+    addViews(app, "Whole face");
+    const share = (key, label) => slider(`show-${key}`, label, this.values[key], (value) => this.set(key, value));
     const box = (key, label) => element("label", {}, element("input", {
       type: "checkbox", checked: this.values[key], id: `show-${key}`,
       onchange: (e) => this.set(key, e.target.checked),
     }), label);
     document.getElementById("controls").append(
-      slider("share", "Before – after"), slider("skin", "Skin"), slider("bones", "Bones"),
+      share("share", "Before – after"), share("skin", "Skin"), share("bones", "Bones"),
       box("side", "Side by side"), box("map", "Colour by movement"),
       ...(app.face.band ? [box("band", "Colour by uncertainty")] : []), box("handles", "Handles"),
       box("pull", "Pull the skin"));
     this.legend = document.getElementById("legend");
-  }
-
-  look(index) {
-    this.app.camera.look(VIEWS[index]);
-    this.app.redraw();
   }
 
   set(key, value) {

@@ -1,0 +1,160 @@
+"""Landmarks that a person did not place, from those that one did and those that were proposed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from cmfsim._core import Surface
+from cmfsim.pipeline.proposing import ProposedHead
+from cmfsim.registration.site_covariance import (
+    PLACED_STD,
+    SiteDistribution,
+    SiteKey,
+    site_covariance,
+)
+from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, site_part
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
+from cmfsim.values.site_states import GOOD_ERROR, MOST_ERROR, SURFACE_REACH, SiteState
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["GivenSites", "filled_landmarks", "head_distribution"]
+
+# The landmarks of a person by kind and label, mm, with who placed each.
+GivenSites = Mapping[SiteKey, tuple[Floats, SiteState]]
+
+# A given site this near to its surface was placed on a coarser drawing of it, and is brought onto
+# it, mm: pages draw surfaces to within half of this.
+DRAWN = 1.0
+# A site that follows by less than this has not moved, mm.
+STILL = 0.05
+# Kinds with their labels.
+KINDS = {"skull": tuple(SKULL_LANDMARKS), "skin": SKIN_LANDMARKS}
+
+
+def head_distribution(head: ProposedHead) -> SiteDistribution:
+    """Where the landmarks of a head are expected before a person has placed any."""
+    bone = np.concatenate([surface.vertices for surface in head.bones.values()])
+    return site_covariance(head.landmarks, bone)
+
+
+def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks:
+    """The landmarks of a head of which a person has placed some.
+
+    Given sites stay; the others move by the conditional mean of their distribution, and onto their
+    surface. A missing site is doubtful if its expected error is above `GOOD_ERROR`, and stays
+    missing above `MOST_ERROR`.
+
+    Parameters
+    ----------
+    head : ProposedHead
+        With what was proposed, which may be nothing.
+    given : mapping of (kind, label) to point (mm) and state
+
+    Returns
+    -------
+    ProposedLandmarks
+        With the origin of each site.
+    """
+    before = head_distribution(head)
+    points = {key: point for key, (point, _) in given.items()}
+    stds = {key: _std(state) for key, (_, state) in given.items()}
+    after = before.given(points, stds)
+    surfaces = _surfaces(head)
+    sites: dict[str, dict[str, ProposedSite]] = {kind: {} for kind in KINDS}
+    missing = {
+        "skull": dict(head.landmarks.missing_skull),
+        "skin": dict(head.landmarks.missing_skin),
+    }
+    shifts = np.linalg.norm(after.mean - before.mean, axis=1)
+    rows = zip(after.names, after.mean, after.errors, shifts, strict=True)
+    for key, mean, error, shift in rows:
+        kind, name = key
+        if kind == "skin" and head.skin is None and key not in given:
+            continue
+        if key in given:
+            site = _given_site(*given[key], surfaces.get(site_part(*key)))
+        else:
+            site = _following(head.landmarks, key, mean, float(error), float(shift))
+            site = site and _on_surface(site, surfaces.get(site_part(*key)))
+        if site is not None:
+            sites[kind][name] = site
+            missing[kind].pop(name, None)
+        else:
+            missing[kind].setdefault(name, "the sites that were placed do not determine it")
+    return replace(
+        head.landmarks,
+        skull=_ordered(sites["skull"], SKULL_LANDMARKS),
+        skin=_ordered(sites["skin"], SKIN_LANDMARKS),
+        missing_skull=missing["skull"],
+        missing_skin=missing["skin"],
+    )
+
+
+def _std(state: SiteState) -> float:
+    """How far a given point may be off along each axis, mm."""
+    return PLACED_STD if state.by_person else max(PLACED_STD, state.error / np.sqrt(3.0))
+
+
+def _surfaces(head: ProposedHead) -> dict[str, list[Surface]]:
+    """The surfaces of each part, to find closest points on."""
+    found: dict[str, list[Surface]] = {}
+    skin: dict[str, SurfaceData] = {} if head.skin is None else {"skin": head.skin}
+    for name, surface in {**head.bones, **skin}.items():
+        part = name if name in {"mandible", "skin"} else "cranium"
+        found.setdefault(part, []).append(Surface(surface.vertices, surface.triangles))
+    return found
+
+
+def _given_site(point: Floats, state: SiteState, surfaces: list[Surface] | None) -> ProposedSite:
+    closest, distance = _closest(point, surfaces or [])
+    place = closest if distance <= DRAWN else point
+    return ProposedSite(place, state.error, state.doubt, state.origin)
+
+
+def _following(
+    found: ProposedLandmarks, key: SiteKey, mean: Floats, error: float, shift: float
+) -> ProposedSite | None:
+    """A site that nobody placed, moved with the others; None if it is missing and stays so."""
+    kind, name = key
+    site = (found.skull if kind == "skull" else found.skin).get(name)
+    if site is None:
+        return ProposedSite(mean, error, _unsure(error), "filled") if error <= MOST_ERROR else None
+    if shift <= STILL:
+        return site
+    doubt = "" if error <= GOOD_ERROR else site.doubt
+    return ProposedSite(mean, error if site.doubt else min(error, site.error), doubt, "moved")
+
+
+def _unsure(error: float) -> str:
+    """The doubt about a site that was filled in."""
+    return "" if error <= GOOD_ERROR else "the sites that were placed are too few or too far away"
+
+
+def _on_surface(site: ProposedSite, surfaces: list[Surface] | None) -> ProposedSite | None:
+    """The site on its surface; None if it was filled in where there is none."""
+    if site.origin == "proposed":
+        return site
+    closest, distance = _closest(site.point, surfaces or [])
+    if distance <= SURFACE_REACH:
+        return replace(site, point=closest)
+    return None if site.origin == "filled" else site
+
+
+def _closest(point: Floats, surfaces: list[Surface]) -> tuple[Floats, float]:
+    best, least = point, np.inf
+    for surface in surfaces:
+        (closest,), _, _ = surface.closest(point[None])
+        distance = float(np.linalg.norm(closest - point))
+        if distance < least:
+            best, least = closest, distance
+    return best, least
+
+
+def _ordered(
+    sites: Mapping[str, ProposedSite], names: Mapping[str, str] | tuple[str, ...]
+) -> dict[str, ProposedSite]:
+    return {name: sites[name] for name in names if name in sites}

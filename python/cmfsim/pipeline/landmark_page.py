@@ -1,0 +1,108 @@
+"""The page of landmarks of a head: what was proposed, what a person has placed, what follows."""
+
+from pathlib import Path
+
+from cmfsim.io import replacing
+from cmfsim.pipeline.filling import GivenSites, head_distribution
+from cmfsim.pipeline.proposing import ProposedHead
+from cmfsim.planning.landmark_page import (
+    LandmarkContent,
+    PageSite,
+    landmark_content,
+    landmark_page_text,
+)
+from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.site_covariance import PLACED_STD, SiteDistribution
+from cmfsim.values.proposed_landmarks import ProposedLandmarks
+from cmfsim.values.site_states import SiteState
+
+__all__ = ["PAGE_FILE", "head_content", "write_landmark_page"]
+
+PAGE_FILE = "landmarks.html"
+
+
+def head_content(
+    name: str,
+    head: ProposedHead,
+    placed: GivenSites | None = None,
+    *,
+    built_for: str = "",
+) -> LandmarkContent:
+    """The content of the page of a head.
+
+    Parameters
+    ----------
+    name : str
+        Of the case.
+    head : ProposedHead
+    placed : mapping of (kind, label) to point (mm) and state
+        Sites that a person has placed or accepted already.
+    built_for : str
+        The state of the case.
+    """
+    distribution = head_distribution(head)
+    average = average_head()
+    surfaces = {**head.bones, **({} if head.skin is None else {"skin": head.skin})}
+    sites = [
+        site
+        for site in _sites(head.landmarks, distribution, placed or {})
+        if site.kind == "skull" or head.skin is not None
+    ]
+    kept = 3 * len(sites)
+    skin = {} if average.skin is None else {"skin": average.skin}
+    return landmark_content(
+        name,
+        surfaces,
+        sites,
+        distribution.covariance[:kept, :kept],
+        ({**average.bones, **skin}, {"skull": average.skull, "skin": average.skin_landmarks}),
+        placed_std=PLACED_STD,
+        built_for=built_for,
+    )
+
+
+def _sites(
+    found: ProposedLandmarks,
+    distribution: SiteDistribution,
+    placed: GivenSites,
+) -> list[PageSite]:
+    errors = distribution.errors
+    proposed = {"skull": found.skull, "skin": found.skin}
+    missing = {"skull": found.missing_skull, "skin": found.missing_skin}
+    sites = []
+    for key, point, error in zip(distribution.names, distribution.mean, errors, strict=True):
+        kind, name = key
+        site = proposed[kind].get(name)
+        if site is None:
+            state = SiteState("filled", float(error))
+        else:
+            state = SiteState("proposed", site.error, site.doubt)
+        own = placed.get(key)
+        sites.append(
+            PageSite(
+                kind,
+                name,
+                point,
+                state,
+                "" if site else missing[kind].get(name, "it was not found"),
+                None if own is None else own[0],
+                "placed" if own is None else own[1].origin,
+            )
+        )
+    return sites
+
+
+def write_landmark_page(path: Path, content: LandmarkContent) -> int:
+    """The size in bytes of a page of landmarks, written to a file in one step.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Numbers that are not finite.
+    OSError
+        The folder cannot be written to.
+    """
+    data = landmark_page_text(content).encode()
+    with replacing(path) as file:
+        file.write(data)
+    return len(data)

@@ -1,0 +1,166 @@
+"""A page as one HTML file: scripts, style and numbers in it, nothing from elsewhere.
+
+The scripts are ES modules in their own files; they are joined in the order of their imports. The
+policy of the page allows these very scripts and this style, by their hashes, and no network.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+from numpy.typing import NDArray
+
+from cmfsim.errors import CaseInputError
+from cmfsim.planning.page.packing import packed_arrays
+
+__all__ = ["Document", "document_text", "joined_scripts"]
+
+MAIN = "main.js"
+# The folder of the template, of the style and of the scripts that all pages share.
+SHARED = "cmfsim.planning.page"
+DISCLAIMER = "Research software, not a medical device. Not for diagnosis or treatment decisions."
+IMPORT = re.compile(r'^import \{[^}]*\} from "\./([a-z_]+\.js)";\n', re.MULTILINE)
+EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const|class)\b)", re.MULTILINE)
+# A name that a module defines at its top.
+DEFINED = re.compile(r"^(?:export )?(?:async )?(?:function|const|let|class) (\w+)", re.MULTILINE)
+FIELD = re.compile(r"@([a-z]+)@")
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """The parts of a page.
+
+    Attributes
+    ----------
+    title, facts, footer : str
+    stage, panel, picture : str
+        What the drawing, the fields next to it and the picture itself are, for screen readers.
+    made_for : str
+        The state of the case.
+    values : mapping
+        Plain values, ready for JSON.
+    arrays : mapping of str to array
+        float32, float16 and uint32.
+    package : str
+        The package that has the first script, and a style of its own, besides the shared ones.
+    main : str
+        The first script.
+    is_served : bool
+        Whether the page asks the program that serves it; otherwise it makes no connection.
+    """
+
+    title: str
+    facts: str
+    footer: str
+    stage: str
+    panel: str
+    picture: str
+    made_for: str
+    values: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+    package: str = SHARED
+    main: str = MAIN
+    is_served: bool = False
+
+
+def document_text(document: Document) -> str:
+    """The text of a page.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Numbers that are not finite; scripts that cannot be joined.
+    """
+    numbers, table = packed_arrays(document.arrays)
+    packages = dict.fromkeys((SHARED, document.package))
+    style = "".join(
+        path.read_text(encoding="utf-8")
+        for package in packages
+        if (path := files(package).joinpath("page.css")).is_file()
+    )
+    script = joined_scripts(
+        {
+            entry.name: entry.read_text(encoding="utf-8")
+            for package in packages
+            for entry in files(package).joinpath("scripts").iterdir()
+            if entry.name.endswith(".js")
+        },
+        document.main,
+    )
+    texts = ("title", "facts", "footer", "stage", "panel", "picture")
+    fields = {
+        **{name: html.escape(getattr(document, name)) for name in texts},
+        "policy": _policy(script, style, is_served=document.is_served),
+        "state": html.escape(document.made_for),
+        "disclaimer": DISCLAIMER,
+        "style": style,
+        "script": script,
+        "values": _json_in_html({**document.values, "arrays": table}),
+        "numbers": numbers,
+    }
+    template = files(SHARED).joinpath("page.html").read_text(encoding="utf-8")
+    # In one pass, so that no text is searched for the fields of another.
+    return FIELD.sub(lambda match: fields[match[1]], template)
+
+
+def joined_scripts(modules: Mapping[str, str], main: str = MAIN) -> str:
+    """The first module and those that it imports as one script, each after those that it needs.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Modules import each other in a circle, or one that is not there; two
+        define the same name.
+    """
+    order: list[str] = []
+
+    def add(name: str, above: tuple[str, ...]) -> None:
+        if name in above:
+            raise CaseInputError(f"scripts import each other: {' → '.join((*above, name))}")
+        if name not in modules:
+            raise CaseInputError(f"{above[-1] if above else main}: there is no script {name!r}")
+        for needed in IMPORT.findall(modules[name]):
+            if needed not in order:
+                add(needed, (*above, name))
+        if name not in order:
+            order.append(name)
+
+    add(main, ())
+    homes: dict[str, str] = {}
+    for name in order:
+        for defined in DEFINED.findall(modules[name]):
+            if defined in homes:
+                raise CaseInputError(f"{homes[defined]} and {name} both define {defined!r}")
+            homes[defined] = name
+    return "\n".join(EXPORT.sub("", IMPORT.sub("", modules[name])) for name in order)
+
+
+def _policy(script: str, style: str, *, is_served: bool) -> str:
+    """What the page may do: run this script, apply this style, save files; ask its own server."""
+    allowed = {
+        "default-src": "'none'",
+        "script-src": f"'sha256-{_digest(script)}'",
+        "style-src": f"'sha256-{_digest(style)}'",
+        "img-src": "data: blob:",
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
+    if is_served:
+        allowed["connect-src"] = "'self'"
+    return "; ".join(f"{name} {value}" for name, value in allowed.items())
+
+
+def _digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _json_in_html(values: Mapping[str, object]) -> str:
+    """JSON in which nothing ends the element or opens a comment, whatever a case is called."""
+    text = json.dumps(values, allow_nan=False, ensure_ascii=True)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

@@ -1,0 +1,117 @@
+"""The distribution of landmarks, and how they follow those that are known."""
+
+import numpy as np
+import pytest
+
+from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.site_covariance import PLACED_STD, SiteDistribution, site_covariance
+from cmfsim.values.landmark_sites import site_part
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
+
+
+@pytest.fixture(scope="module")
+def bone():
+    return np.concatenate([s.vertices for s in average_head().bones.values()])
+
+
+def proposal(errors=None, gone=(), shift=None):
+    average = average_head()
+    errors, shift = errors or {}, shift or {}
+    skull = {
+        name: ProposedSite(point + shift.get(name, 0.0), errors.get(name, 2.0))
+        for name, point in average.skull.items()
+        if name not in gone
+    }
+    skin = {name: ProposedSite(point, 2.0) for name, point in average.skin_landmarks.items()}
+    return ProposedLandmarks(skull, skin)
+
+
+def test_the_conditional_mean_and_covariance_are_those_of_the_normal_distribution():
+    """Two sites by the textbook formula with blocks (Bishop 2006, equations 2.81 and 2.82)."""
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(6, 6))
+    covariance = root @ root.T
+    names = (("skull", "a"), ("skull", "b"))
+    mean = rng.normal(size=(2, 3))
+    place = np.array([1.0, 2.0, 3.0])
+    found = SiteDistribution(names, mean, covariance).given({names[0]: place}, {names[0]: 0.5})
+    aa, ba, bb = covariance[:3, :3], covariance[3:, :3], covariance[3:, 3:]
+    gain = ba @ np.linalg.inv(aa + 0.25 * np.eye(3))
+    np.testing.assert_allclose(found.mean[1], mean[1] + gain @ (place - mean[0]))
+    np.testing.assert_allclose(found.covariance[3:, 3:], bb - gain @ ba.T, atol=1e-12)
+    np.testing.assert_allclose(found.errors[1], np.sqrt(np.trace(bb - gain @ ba.T)), rtol=1e-12)
+
+
+def test_found_sites_are_their_own_mean_and_less_sure_ones_have_larger_errors(bone):
+    given = proposal({"menton": 10.0})
+    found = site_covariance(given, bone)
+    for key, point in zip(found.names, found.mean, strict=True):
+        kind, name = key
+        site = (given.skull if kind == "skull" else given.skin)[name]
+        np.testing.assert_array_equal(point, site.point)
+    errors = dict(zip(found.names, found.errors, strict=True))
+    assert errors["skull", "menton"] > 1.3 * errors["skull", "pogonion"]
+    # A measurement only makes it surer.
+    assert all(errors[key] < 2.0 * np.sqrt(1.0 + 1e-9) for key in errors if key[1] != "menton")
+    values = np.linalg.eigvalsh(found.covariance)
+    assert values.min() > -1e-9 * values.max()
+
+
+def test_a_missing_site_is_where_the_others_put_it(bone):
+    gone = ("gonion_L", "zygomatic_arch_R", "nasion")
+    found = site_covariance(proposal(gone=gone), bone)
+    for name in gone:
+        i = found.names.index(("skull", name))
+        away = np.linalg.norm(found.mean[i] - average_head().skull[name])
+        assert away < 2.0
+        assert away < found.errors[i]
+
+
+def test_a_head_in_another_pose_and_size_has_the_same_distribution(bone):
+    angle = np.deg2rad(20.0)
+    turn = np.array(
+        [
+            [1.0, 0.0, 0.0],
+            [0.0, np.cos(angle), -np.sin(angle)],
+            [0.0, np.sin(angle), np.cos(angle)],
+        ]
+    )
+    shift = np.array([10.0, 1500.0, -40.0])
+    plain = site_covariance(proposal(gone=("gonion_L",)), bone)
+    own = proposal(gone=("gonion_L",))
+    moved = ProposedLandmarks(
+        {n: ProposedSite(turn @ s.point + shift, s.error) for n, s in own.skull.items()},
+        {n: ProposedSite(turn @ s.point + shift, s.error) for n, s in own.skin.items()},
+    )
+    found = site_covariance(moved, bone)
+    np.testing.assert_allclose(found.mean, plain.mean @ turn.T + shift, atol=1e-6)
+    np.testing.assert_allclose(found.errors, plain.errors, atol=1e-6)
+
+
+def test_sites_of_a_doubtful_jaw_follow_one_that_is_placed_and_the_cranium_stays(bone):
+    average = average_head().skull
+    jaw = [n for n in average if site_part("skull", n) == "mandible"]
+    wrong = np.array([0.0, 4.0, 12.0])
+    given = proposal(dict.fromkeys(jaw, 10.0), shift=dict.fromkeys(jaw, wrong))
+    before = site_covariance(given, bone)
+    names = ("menton", "gonion_L", "infradentale")
+    after = before.given({("skull", n): average[n] for n in names})
+    errors = {True: [], False: []}
+    for (kind, name), point in zip(after.names, after.mean, strict=True):
+        if kind == "skull" and name not in names:
+            errors[name in jaw].append(np.linalg.norm(point - average[name]))
+    assert np.mean(errors[True]) < 3.0
+    assert np.mean(errors[False]) < 0.7
+
+
+def test_without_sites_the_head_is_guessed_from_the_bone_and_unsure(bone):
+    found = site_covariance(ProposedLandmarks({}, {}), bone + [0.0, 0.0, 1500.0])
+    truth = average_head().skull
+    away = [
+        np.linalg.norm(point - truth[name] - [0.0, 0.0, 1500.0])
+        for (kind, name), point in zip(found.names, found.mean, strict=True)
+        if kind == "skull"
+    ]
+    assert np.mean(away) < found.errors.mean()
+    assert found.errors.min() > 15.0
+    assert PLACED_STD == 1.0
