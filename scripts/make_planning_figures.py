@@ -123,12 +123,12 @@ def top(page: Any) -> None:
     page.evaluate("scrollTo(0, 0)")
 
 
-def save(data: bytes, path: Path) -> None:
+def save(data: bytes, path: Path, colours: int = COLOURS) -> None:
     """A picture of the width of a page, in few colours."""
     image = Image.open(io.BytesIO(data)).convert("RGB")
     height = round(image.height * WIDTH / image.width)
     small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
-    small.quantize(COLOURS, dither=Image.Dither.FLOYDSTEINBERG).save(path, optimize=True)
+    small.quantize(colours, dither=Image.Dither.FLOYDSTEINBERG).save(path, optimize=True)
     print(f"{path.name} {path.stat().st_size / 1e3:.0f} kB")
 
 

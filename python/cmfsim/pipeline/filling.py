@@ -75,6 +75,7 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
         kind, name = key
         if kind == "skin" and head.skin is None and key not in given:
             continue
+        site: ProposedSite | None
         if key in given:
             site = _given_site(*given[key], surfaces.get(site_part(*key)))
         else:

@@ -117,8 +117,8 @@ class ProposedLandmarks:
                 fix="place the landmarks of the skull by hand and name the file under [landmarks]: "
                 "the jaws are then separated by them",
             )
-        for kind, sites in (("skull", self.skull), ("skin", self.skin)):
-            for name, site in sites.items():
+        for kind, own in (("skull", self.skull), ("skin", self.skin)):
+            for name, site in own.items():
                 if site.doubt:
                     x, y, z = site.point
                     yield Finding.warning(

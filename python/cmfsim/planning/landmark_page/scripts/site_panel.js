@@ -13,7 +13,7 @@ const GROUPS = [
   { key: "done", title: "Placed or accepted", states: ["placed", "accepted"] },
 ];
 const SMALL_BALL = 2.6;
-const SMALL_SPAN = 1.45;
+const SMALL_SPAN = 1.25;
 
 export class SitePanel {
   constructor(app) {
