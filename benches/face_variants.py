@@ -1,6 +1,6 @@
-"""The predicted face of a CT as other clinics would send it, against that of the unmodified one, mm.
+"""The predicted face of a CT as other clinics would send it, against that of the unmodified one.
 
-Le Fort I moves the maxilla 4 mm forwards, without any landmarks, on the CT and on each variant of it.
+Le Fort I moves the maxilla 4 mm forwards, without any landmarks, on the CT and on each variant.
 Where the face of the unmodified CT moves by more than 0.5 mm, displacements are compared: mean and
 95 % of the differences. A variant off by more than 0.3 mm on average (0.5 with open mouth) has to
 be reported by a finding that the unmodified CT does not have, or refused by an error; otherwise its

@@ -48,6 +48,13 @@ HISTOGRAM_BINS = 400
 LEAST_PLATEAU = 8
 LEAST_SATURATED = 15.0
 BELOW_SATURATED = 100.0
+# Expected errors at the surface of bone, HU: of an offset that scanners use, and of one by the peak
+# of air, which differs by 30 between scanners; the former two are clear.
+OFFSET_ERROR, AIR_ERROR, CLEAR = 10.0, 30.0, 40.0
+# Fat (−110 HU) lies in this part of the way from air to muscle; where the image shows both peaks,
+# neither is taken for the other. Half of their distance is the error otherwise, carried to bone.
+FAT_PART = (0.82, 0.91)
+BOTH_ERROR, ONE_ERROR = 40.0, 110.0
 # With a stated scale, air lies within this of −1000 HU.
 STATED_TOLERANCE = 250.0
 # What to do where the histogram misleads.
@@ -64,11 +71,20 @@ BLOCK = 3
 
 @dataclass(frozen=True)
 class Calibration:
-    """The conversion to HU, `slope`·value + `offset`, with findings."""
+    """The conversion to HU, `slope`·value + `offset`, with findings.
+
+    `error` is that expected at the surface of bone, HU; 0 where the values are HU or stated.
+    """
 
     slope: float
     offset: float
     findings: tuple[Finding, ...] = ()
+    error: float = 0.0
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether nobody needs to be asked: bone's surface moves by a twentieth of a voxel."""
+        return self.error <= CLEAR
 
 
 def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None) -> Calibration:
@@ -96,7 +112,7 @@ def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None)
         if padded.any() and not padded.all() and (np.abs(sample - AIR) < AIR_TOLERANCE).any():
             sample = np.maximum(sample, AIR - 100.0)
             low, high = np.percentile(sample, (0.05, 99.95))
-    air, soft = _peaks(sample, low, high)
+    air, soft, is_both = _peaks(sample, low, high)
     if abs(air - AIR) <= AIR_TOLERANCE and abs(soft - SOFT) <= SOFT_TOLERANCE:
         result = Calibration(1.0, 0.0)
     elif UNIT_STEP[0] <= soft - air <= UNIT_STEP[1]:
@@ -104,11 +120,13 @@ def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None)
         usual = min(OFFSETS, key=lambda o: abs(o + offset))
         if abs(usual + offset) <= OFFSET_TOLERANCE:
             offset = -usual
-        result = Calibration(1.0, offset, (_not_hu(air, soft, 1.0, offset),))
+        error = OFFSET_ERROR if offset == -usual else AIR_ERROR
+        result = Calibration(1.0, offset, (_not_hu(air, soft, 1.0, offset, error),), error)
     else:
         slope = (SOFT - AIR) / (soft - air)
         offset = AIR - slope * air
-        result = Calibration(slope, offset, (_not_hu(air, soft, slope, offset),))
+        error = BOTH_ERROR if is_both else ONE_ERROR
+        result = Calibration(slope, offset, (_not_hu(air, soft, slope, offset, error),), error)
     _check_spread(sample * result.slope + result.offset, air, soft)
     return result
 
@@ -165,8 +183,8 @@ def saturation_of(values: NDArray[Any], voxel: float, scale: Calibration) -> flo
     return scale.slope * float(top) + scale.offset if count > near else np.inf
 
 
-def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float, float]:
-    """The values at the peaks of air and of soft tissue."""
+def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float, float, bool]:
+    """The values at the peaks of air and of soft tissue, and whether fat and muscle both show."""
     counts, edges = np.histogram(np.clip(sample, low, high), bins=HISTOGRAM_BINS)
     centres = 0.5 * (edges[1:] + edges[:-1])
     kernel = np.hanning(9)
@@ -192,14 +210,18 @@ def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float,
     # Fat has the larger peak in some heads; muscle and brain lie a tenth of the way above it.
     reach = centres[best] + 0.2 * (centres[best] - centres[air])
     near = above[(above > best) & (centres[above] <= reach) & (smooth[above] > 0.4 * smooth[best])]
-    return float(centres[air]), float(centres[near[-1] if len(near) else best])
+    soft = near[-1] if len(near) else best
+    part = (centres[above] - centres[air]) / (centres[soft] - centres[air])
+    is_fat = (part > FAT_PART[0]) & (part < FAT_PART[1]) & (smooth[above] > 0.2 * smooth[soft])
+    return float(centres[air]), float(centres[soft]), bool(is_fat.any())
 
 
-def _not_hu(air: float, soft: float, slope: float, offset: float) -> Finding:
+def _not_hu(air: float, soft: float, slope: float, offset: float, error: float) -> Finding:
     return Finding.warning(
         "ct-not-hu",
         f"the image is not in HU: air is at {air:.4g}, soft tissue at {soft:.4g}; converted as "
-        f"HU = {slope:.4g}·value {'+' if offset >= 0.0 else '−'} {abs(offset):.4g}",
+        f"HU = {slope:.4g}·value {'+' if offset >= 0.0 else '−'} {abs(offset):.4g}, to within "
+        f"{error:.0f} HU at the surface of bone",
         where="image",
         why="thresholds of skin and bone are in HU; an error in the guessed scale moves the "
         "surface of the bone",

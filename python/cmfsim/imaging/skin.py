@@ -1,12 +1,13 @@
 """The outer surface of the head: what lies with it taken away, what opens into it closed."""
 
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
+from cmfsim.imaging.intensity import AIR, SOFT
 from cmfsim.imaging.levels import level_of
 from cmfsim.imaging.metal import Metal, metal_within, without_streaks
 from cmfsim.imaging.morphology import (
@@ -33,6 +34,11 @@ __all__ = ["Skin", "find_skin"]
 
 # Full range of the skin's level, HU: half of the step from air to fat.
 SKIN_SCALE = 400.0
+# What is darker than this, such as foam or hair, is no tissue, HU.
+LEAST_TISSUE = -750.0
+# Tissue around a place within this distance, its noise smoothed, mm. What is lost at a fixed level
+# is thicker than twice the third, mm, and worth a finding from the fourth on, mm³.
+AROUND, AROUND_SIGMA, THICK, LEAST_WEAK = 6.0, 1.0, 2.6, 500.0
 # A ball of this radius fits into head and neck, but not into a couch's shell, a head-rest or an
 # ear, mm.
 CORE_RADIUS = 20.0
@@ -111,6 +117,13 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions, beside: Exec
         (also `ValueError`) Nothing as large as a head.
     """
     coarse, steps, shift = coarse_of(metal.hu, work.spacing)
+    weak = weak_tissue(coarse, steps, options.skin_threshold)
+    findings = []
+    if weak is not None:
+        findings.append(_weak(weak))
+        coarse = coarse + weak
+        raised = resampled_to(weak, steps, shift, work.hu.shape, work.spacing)
+        metal = replace(metal, hu=metal.hu + raised)
     tissue = np.asfortranarray(coarse > options.skin_threshold)
     if metal.mask is not None:
         # Dark streaks would cut the head in two.
@@ -133,11 +146,60 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions, beside: Exec
         raise ImageInputError("the image contains no head above the skin's threshold")
     mask, hollow = _with_hollows(solid, work)
     level = beside.submit(_level, metal.hu, options.skin_threshold, near, mask, hollow)
-    findings = []
     table = np.count_nonzero(removed | more) * float(np.prod(steps))
     if table > LARGEST_EAR / 5.0:
         findings.append(_rest_removed(table))
     return Skin(box, level, mask, hollow, tuple(findings))
+
+
+def weak_tissue(hu: Volume, spacing: NDArray[np.float64], threshold: float) -> Volume | None:
+    """What is to be added to HU where tissue of the face is too dark; None if none is.
+
+    Cone beams whose field of view ends near the nose show tissue there hundreds of HU below fat.
+    Where the fixed level loses tissue by that, the skin lies half-way between air and the densest
+    tissue around; everywhere else nothing is added.
+
+    Parameters
+    ----------
+    hu : (nx, ny, nz) float32
+        On voxels of some 2.5 mm.
+    spacing : (3,) float64, mm
+    threshold : float, HU
+    """
+    tissue = hu > threshold
+    if not tissue.any():
+        return None
+    rows = tissue.sum(axis=(0, 2))
+    middle = int(np.average(np.arange(len(rows)), weights=rows))
+    front = np.asfortranarray(hu[:, : middle + 1])
+    size = [2 * max(1, round(AROUND / s)) + 1 for s in spacing]
+    # Noise of voxels is not what the densest tissue is.
+    smooth = ndimage().gaussian_filter(front, AROUND_SIGMA / spacing)
+    top = np.minimum(ndimage().maximum_filter(smooth, size=size), SOFT)
+    half = 0.5 * (AIR + top)
+    # At an ordinary skin voxels between both levels are a shell, which no ball fits into; what is
+    # as dark on its own, such as foam, hangs on no brighter face.
+    gained = opened((front > half) & (front <= threshold) & (top > LEAST_TISSUE), THICK, spacing)
+    above = tissue[:, : middle + 1]
+    gained &= reached(gained | above, above)
+    if np.count_nonzero(gained) * float(np.prod(spacing)) < LEAST_WEAK:
+        return None
+    added = np.where(ndimage().maximum_filter(gained, size=size), threshold - half, 0.0)
+    added = np.clip(added, 0.0, threshold - AIR)
+    whole = np.zeros(hu.shape, dtype=np.float32, order="F")
+    whole[:, : middle + 1] = ndimage().gaussian_filter(added, 0.5 * AROUND / spacing)
+    return whole
+
+
+def _weak(added: Volume) -> Finding:
+    return Finding.warning(
+        "skin-weak",
+        f"tissue at the front of the face is up to {added.max():.0f} HU too dark for a fixed level "
+        "of the skin, which was lowered there",
+        where="image",
+        why="nose and lips would lose their surface; it is less accurate there than elsewhere",
+        fix="check nose and lips visually; use a reconstruction with a larger field of view",
+    )
 
 
 def _level(hu: Volume, threshold: float, near: Volume, mask: Mask, hollow: Mask) -> Volume:

@@ -16,6 +16,7 @@ from cmfsim.pipeline.drafting import init_case
 from cmfsim.pipeline.drafting.case_lines import quoted
 from cmfsim.pipeline.drafting.roles import name_role
 from dicom_series import axial, write_series
+from synthetic_head import made_head
 
 pytest.importorskip("SimpleITK")
 
@@ -270,10 +271,26 @@ def test_two_cts_are_a_question(tmp_path):
 
 
 def test_a_ct_that_is_not_in_hounsfield_units_is_a_question(tmp_path):
+    """Air and one tissue without any bone: no scale is clear."""
     image(tmp_path / "ct.nrrd", 0.0)
     init_case(tmp_path)
     assert "image.rescale" in refusal(tmp_path)
     assert "[1, -1024]" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(("slope", "asked"), [(1.0, False), (0.6, True)])
+def test_a_clear_scale_is_stated_with_its_error_and_not_asked(tmp_path, slope, asked):
+    """Of steps of 1 HU with a usual offset; one tissue peak leaves open whether it is fat."""
+    whole = made_head().image
+    values = np.round(slope * (whole.values.astype(float) + 1024.0)).astype(np.int16)
+    cmfsim.write_image(whole.with_values(values), tmp_path / "ct.nrrd")
+    init_case(tmp_path)
+    text = re.sub(r"\s*\n# +", " ", text_of(tmp_path))
+    assert ("which are not HU" in text) is not asked
+    assert ("How do they become HU?" in text) is asked
+    if not asked:
+        assert "1·value -1024, to within 10 HU at bone" in text
+        assert cmfsim.Case.load(tmp_path).image.rescale is None
 
 
 def test_without_landmarks_a_head_gets_those_that_are_found_and_muscles(head):

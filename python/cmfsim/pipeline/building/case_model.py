@@ -35,6 +35,7 @@ from cmfsim.pipeline.building.nodes import made_contacts, nodes_of
 from cmfsim.pipeline.building.parts import Head, MeshedTissue, Tissue
 from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.site_checks import check_bones_of_sites, check_pieces
+from cmfsim.pipeline.building.skin_check import check_skin
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.building.tissue_mesh import region_of, tissue_mesh
 from cmfsim.values.anatomy import Anatomy
@@ -174,6 +175,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         check_bones_of_sites(case, head.skull, head.anatomy, by_hand=bool(landmarks))
     else:
         head = Head(case, landmarks, anatomy)
+    stages.add(check_skin(head.anatomy, head.skull))
     # Tissue and muscles are placed by the anatomy and its landmarks, whatever becomes of the bones.
     with ThreadPoolExecutor(2) as beside:
         tissue = beside.submit(_meshed, head)

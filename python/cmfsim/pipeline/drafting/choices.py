@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cmfsim.pipeline.drafting.case_lines import Taken
-from cmfsim.pipeline.drafting.finds import ImageFind, LandmarkFind
+from cmfsim.pipeline.drafting.finds import HU_AIR, ImageFind, LandmarkFind
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
@@ -14,8 +14,6 @@ __all__ = ["Images", "Marks", "choose_images", "choose_landmarks"]
 
 # LPS to RAS, and back.
 TURN = np.array([-1.0, -1.0, 1.0])
-# A CT in HU has air, some -1000 HU.
-AIR = -500.0
 # What stored values are when an offset of 1024 was added to HU.
 OFFSET_RANGE = (1500.0, 5000.0)
 
@@ -30,7 +28,9 @@ class Images:
     question : tuple of (str, tuple of str) or None
         Which of several images is the CT, with the choices.
     rescale : tuple of (str, tuple of str) or None
-        What takes the values to HU.
+        The question what takes the values to HU.
+    scale : str
+        What does, where that is clear.
     taken : list of Taken
     """
 
@@ -38,6 +38,7 @@ class Images:
     after: ImageFind | None = None
     question: tuple[str, tuple[str, ...]] | None = None
     rescale: tuple[str, tuple[str, ...]] | None = None
+    scale: str = ""
     taken: list[Taken] = field(default_factory=list)
 
     @property
@@ -95,7 +96,14 @@ def _no_ct(find: ImageFind) -> str:
 def _check_values(images: Images, find: ImageFind) -> None:
     low, high = find.values
     why = _said(find)
-    asked = low > AIR
+    if find.to_hu is not None:
+        slope, offset, error = find.to_hu
+        images.scale = (
+            f"The values are {low:g} to {high:g}, which are not HU. By the peaks of air and tissue "
+            f"they become HU as {slope:.4g}·value {offset:+.4g}, to within {error:.0f} HU at bone; "
+            f"to state another scale: rescale = [slope, intercept]"
+        )
+    asked = low > HU_AIR and find.to_hu is None
     if asked:
         offset = OFFSET_RANGE[0] <= high <= OFFSET_RANGE[1]
         images.rescale = (

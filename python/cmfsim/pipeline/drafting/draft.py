@@ -256,6 +256,8 @@ def _write_image(draft: Draft) -> None:
             )
     if images.rescale is not None:
         text.ask("rescale", *images.rescale)
+    if images.scale:
+        text.comment(images.scale)
 
 
 def _write_surfaces(draft: Draft, lead: str = "") -> None:

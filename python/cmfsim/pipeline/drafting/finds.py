@@ -18,11 +18,13 @@ from cmfsim.pipeline.drafting.roles import NameRole, name_role
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = [
     "CASE_FILE",
     "EXTRACTED",
+    "HU_AIR",
     "ImageFind",
     "LandmarkFind",
     "Listing",
@@ -36,6 +38,8 @@ __all__ = [
 ]
 
 # How far into folders, and how many files: a case has some hundred, DICOM a thousand slices.
+# A CT in HU has air, some -1000 HU.
+HU_AIR = -500.0
 MAX_DEPTH, MAX_FILES = 6, 20_000
 SURFACES = (".stl", ".ply", ".obj", ".vtp", ".vtk")
 IMAGES = (".nrrd", ".nhdr", ".nii", ".nii.gz", ".mha", ".mhd")
@@ -148,6 +152,9 @@ class ImageFind:
         UID of the DICOM series that is meant, where the folder holds several.
     is_labels : bool
         Whether its values are labels of segments, and not those of a CT.
+    to_hu : tuple of float or None
+        Slope and offset to HU and the expected error at bone, HU, where the values are not HU and
+        their peaks clearly give the scale.
     """
 
     label: str
@@ -161,6 +168,7 @@ class ImageFind:
     series: str | None = None
     findings: tuple[Finding, ...] = ()
     is_labels: bool = False
+    to_hu: tuple[float, float, float] | None = None
     to_world: Floats = field(default_factory=lambda: np.eye(4))
     chain: tuple[str, ...] = ()
     in_scene: bool = False
@@ -372,6 +380,7 @@ def image_find(path: Path, label: str, series: str | None = None) -> ImageFind:
     steps = " × ".join(f"{s:.3g}" for s in spacing)
     low = image.lowest
     box = np.stack([low, low + spacing * (np.array(image.values.shape) - 1)])
+    is_labels = are_labels(image.values) or _are_turned_labels(path, read.findings)
     return ImageFind(
         label,
         role,
@@ -382,8 +391,25 @@ def image_find(path: Path, label: str, series: str | None = None) -> ImageFind:
         box,
         series=series,
         findings=read.findings,
-        is_labels=are_labels(image.values) or _are_turned_labels(path, read.findings),
+        is_labels=is_labels,
+        to_hu=None if is_labels else _scale(image),
     )
+
+
+def _scale(image: ImageData) -> tuple[float, float, float] | None:
+    """How values become HU where they are not, if that is clear."""
+    # A folder of surfaces loads nothing of imaging.
+    from cmfsim.imaging.intensity import calibration  # noqa: PLC0415
+
+    if float(image.values.min()) <= HU_AIR:
+        return None
+    try:
+        found = calibration(image.values)
+    except CmfsimError:
+        return None
+    if not found.findings or not found.is_clear:
+        return None
+    return found.slope, found.offset, found.error
 
 
 def _are_turned_labels(path: Path, findings: tuple[Finding, ...]) -> bool:
