@@ -1,6 +1,6 @@
 """The values of air, soft tissue and bone in a CT, and their conversion to HU."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -74,12 +74,14 @@ class Calibration:
     """The conversion to HU, `slope`·value + `offset`, with findings.
 
     `error` is that expected at the surface of bone, HU; 0 where the values are HU or stated.
+    `has_air` tells whether air lies at −1000 in the values as they are: no MR image has that.
     """
 
     slope: float
     offset: float
     findings: tuple[Finding, ...] = ()
     error: float = 0.0
+    has_air: bool = False
 
     @property
     def is_clear(self) -> bool:
@@ -127,8 +129,15 @@ def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None)
         offset = AIR - slope * air
         error = BOTH_ERROR if is_both else ONE_ERROR
         result = Calibration(slope, offset, (_not_hu(air, soft, slope, offset, error),), error)
-    _check_spread(sample * result.slope + result.offset, air, soft)
-    return result
+    odd = _odd_spread(sample * result.slope + result.offset, air, soft)
+    has_air = abs(air - AIR) <= AIR_TOLERANCE
+    if odd and not has_air:
+        raise ImageInputError(
+            f"the image does not look like a CT: {odd}. An MR image cannot be used: give the CT "
+            f"series. {STATE_IT}"
+        )
+    unusual = (_unusual(odd),) if odd else ()
+    return replace(result, findings=(*result.findings, *unusual), has_air=has_air)
 
 
 def _means(values: NDArray[Any]) -> NDArray[np.float64]:
@@ -230,18 +239,29 @@ def _not_hu(air: float, soft: float, slope: float, offset: float, error: float) 
     )
 
 
-def _check_spread(hu: NDArray[np.float64], air: float, soft: float) -> None:
+def _odd_spread(hu: NDArray[np.float64], air: float, soft: float) -> str:
+    """What is unlike a CT of a head in the values of its tissue; empty if nothing is."""
     tissue = hu[hu > 0.5 * (AIR + SOFT)]
     near = float(np.mean(np.abs(tissue - SOFT + 30.0) < SOFT_SPREAD))
     bright = float(np.mean(tissue > SOFT + 250.0))
-    if near < LEAST_SOFT_PART or not LEAST_BONE_PART <= bright <= MOST_BONE_PART:
-        raise ImageInputError(
-            f"the image does not look like a CT: with air at {air:.4g} and soft tissue at "
-            f"{soft:.4g}, {100 * near:.0f} % of the tissue is within {SOFT_SPREAD:g} HU of soft "
-            f"tissue (at least {100 * LEAST_SOFT_PART:.0f} % expected) and {100 * bright:.1f} % as "
-            f"bright as bone ({100 * LEAST_BONE_PART:.0f} to {100 * MOST_BONE_PART:.0f} %). An MR "
-            f"image cannot be used: give the CT series. {STATE_IT}"
-        )
+    if near >= LEAST_SOFT_PART and LEAST_BONE_PART <= bright <= MOST_BONE_PART:
+        return ""
+    return (
+        f"with air at {air:.4g} and soft tissue at {soft:.4g}, {100 * near:.0f} % of the tissue is "
+        f"within {SOFT_SPREAD:g} HU of soft tissue (at least {100 * LEAST_SOFT_PART:.0f} % "
+        f"expected) and {100 * bright:.1f} % as bright as bone ({100 * LEAST_BONE_PART:.0f} to "
+        f"{100 * MOST_BONE_PART:.0f} %)"
+    )
+
+
+def _unusual(odd: str) -> Finding:
+    return Finding.warning(
+        "ct-unusual",
+        f"the image has air as a CT does, but not the tissue of a living head: {odd}",
+        where="image",
+        why="phantoms and cadavers may have other densities: skin and bone may be placed wrongly",
+        fix="check skin and bone visually; set skin_threshold and bone_threshold in [image]",
+    )
 
 
 def noise_of(hu: Volume) -> float:

@@ -124,7 +124,7 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     hu += np.float32(scale.offset)
     with ThreadPoolExecutor(1) as beside:
         checked = None
-        if options.rescale is None:
+        if options.rescale is None and not scale.has_air:
             checked = beside.submit(check_is_ct, *coarse_of(hu, bins, MODALITY_STEP)[:2])
         hu, target, more = _on_target(hu, bins, options)
         if checked is not None:

@@ -140,6 +140,19 @@ def test_values_from_nought_to_one_are_recognised(head, anatomy):
     assert dice(found.skin.values > 0, anatomy.skin.values > 0) > 0.99
 
 
+def test_a_head_of_plastic_is_no_mr_image(head):
+    """Layers of water and of 100 to 700 HU for its soft tissue: as a skull phantom has them."""
+    hu = head.image.values.astype(float)
+    z = np.linspace(0.0, 1.0, hu.shape[2])
+    layers = np.where(z < 0.35, 20.0, 100.0 + 600.0 * z)
+    plastic = np.where((hu > -300) & (hu < 250), layers, hu)
+    found = intensity.calibration(plastic.astype(np.int16))
+    assert (found.slope, found.has_air) == (1.0, True)
+    assert "ct-unusual" in {finding.code for finding in found.findings}
+    with pytest.raises(ImageError, match="An MR image cannot be used"):
+        intensity.calibration(np.clip(1.7 * (plastic + 1000.0), 0.0, None).astype(np.int16))
+
+
 def test_the_noise_of_a_cone_beam_scanner_does_not_hide_the_scale(head):
     """0.6 × (HU + 1000), with noise of 150 HU that reconstruction has sharpened."""
     noise = np.random.default_rng(3).standard_normal(head.image.values.shape)

@@ -1,16 +1,23 @@
 """Few landmarks placed by hand decide what is what; none is believed that lies on another bone."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import cmfsim
 import ct_variants as variants
+import real_heads
 from cmfsim.bones import cut_bones, place_procedure
 from cmfsim.cli import main
+from cmfsim.pipeline import proposing
+from cmfsim.pipeline.building.landmarks import found_landmarks, is_to_be_found
 from cmfsim.pipeline.building.site_checks import check_bones_of_sites, check_pieces
+from cmfsim.pipeline.building.stages import BuildOptions, Stages
+from cmfsim.pipeline.proposing import ProposedHead
 from cmfsim.values.landmark_sites import is_lower_site
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from real_heads import data_folder, landmarks
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
@@ -132,6 +139,64 @@ def test_a_piece_without_its_sites_or_with_the_lower_jaw_is_refused(coarse, case
     both = cut_bones(joined, [procedure])
     with pytest.raises(cmfsim.LandmarkError, match="holds part of the lower jaw"):
         check_pieces(case, sites, both.segments, both.procedures, by_hand=True)
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """What is found on a head, without the search: the operator's landmarks as they are."""
+    anatomy = real_heads.anatomy("ct_phantom")
+
+    def of(points, case, placed, impossible=""):
+        sites = {name: ProposedSite(point, 2.0) for name, point in points.items()}
+        marks = ProposedLandmarks(sites, {}, impossible_jaw=impossible, doubtful_jaw=impossible)
+        head = ProposedHead(anatomy, {}, None, marks)
+        monkeypatch.setattr(proposing, "proposed_head", lambda *_, **__: head)
+        stages = Stages(BuildOptions())
+        placed = {"skull": placed} if placed else {}
+        return found_landmarks(case, anatomy, stages, placed, is_read=True), stages.findings
+
+    return of
+
+
+def test_what_few_clicks_leave_is_found_and_the_clicks_stay(found, case):
+    points = landmarks("ct_phantom")
+    placed = {name: points[name] + [1.0, 0.0, 0.0] for name in UPPER_ROW}
+    assert is_to_be_found(case, {"skull": placed})
+    assert not is_to_be_found(case, {"skull": dict(list(points.items())[:12])})
+    head, (finding,) = found(points, case, placed)
+    assert finding.code == "landmarks-completed"
+    assert set(head.skull) == set(points)
+    assert all(np.array_equal(head.skull[name], place) for name, place in placed.items())
+
+
+def test_found_sites_that_contradict_clicks_are_not_used(found, case):
+    points = landmarks("ct_phantom")
+    placed = {name: points[name] for name in UPPER_ROW}
+    elsewhere = {name: point + [0.0, 0.0, 15.0] for name, point in points.items()}
+    head, (finding,) = found(elsewhere, case, placed)
+    assert finding.code == "landmarks-not-completed"
+    assert "supradentale by 15 mm" in finding.what
+    assert set(head.skull) == set(placed)
+
+
+def test_clicks_where_the_other_jaw_was_found_are_refused(found, case):
+    points = landmarks("ct_phantom")
+    wrong = {one: points[other] for one, other in zip(UPPER_ROW, LOWER_ROW, strict=True)}
+    with pytest.raises(cmfsim.LandmarkError, match=r"on the other jaw.*supradentale \(0.0 mm from"):
+        found(points, case, wrong)
+
+
+def test_a_mandible_that_is_none_is_left_out_where_the_plan_does_not_need_it(found, case):
+    points = landmarks("ct_phantom")
+    head, findings = found(points, case, {}, "its incisors are 102 mm above the upper ones")
+    codes = {finding.code for finding in findings}
+    assert "mandible-left-out" in codes
+    assert "jaw-impossible" not in codes
+    assert set(head.anatomy.bones) == {"skull"}
+    assert not any(is_lower_site(name) for name in head.skull)
+    lower = replace(case, plan={"mandible": case.plan["maxilla"]})
+    with pytest.raises(cmfsim.LandmarkError, match="Place infradentale, sub_m2_L and sub_m2_R"):
+        found(points, lower, {}, "its incisors are 102 mm above the upper ones")
 
 
 @pytest.mark.slow

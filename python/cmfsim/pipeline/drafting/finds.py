@@ -407,7 +407,7 @@ def _scale(image: ImageData) -> tuple[float, float, float] | None:
         found = calibration(image.values)
     except CmfsimError:
         return None
-    if not found.findings or not found.is_clear:
+    if not found.is_clear or (found.slope, found.offset) == (1.0, 0.0):
         return None
     return found.slope, found.offset, found.error
 
