@@ -19,7 +19,6 @@ from cmfsim.pipeline.proposing import ProposedHead
 from make_planning_figures import DRAWN, save
 
 FIGURE = Path(__file__).parents[1] / "docs/figures/landmarks_page.png"
-COLOURS = 96
 REMOVED = ("gonion_L", "zygomatic_arch_L")
 DOUBTFUL = ("infradentale", "supramentale", "pogonion", "menton", "sub_m2_L", "sub_m2_R")
 SHIFT = (0.0, 2.0, 9.0)
@@ -50,7 +49,7 @@ def main() -> None:
         page.wait_for_timeout(DRAWN)
         page.get_by_role("button", name="Gonion, left").click()
         page.wait_for_timeout(DRAWN)
-        save(page.screenshot(), FIGURE, COLOURS)
+        save(page.screenshot(), FIGURE, smooth=False)
         chromium.close()
 
 

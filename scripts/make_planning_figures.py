@@ -123,12 +123,16 @@ def top(page: Any) -> None:
     page.evaluate("scrollTo(0, 0)")
 
 
-def save(data: bytes, path: Path, colours: int = COLOURS) -> None:
-    """A picture of the width of a page, in few colours."""
+def save(data: bytes, path: Path, *, smooth: bool = True) -> None:
+    """A picture of the width of a page, in few colours; smooth ones are mixed of dots."""
     image = Image.open(io.BytesIO(data)).convert("RGB")
     height = round(image.height * WIDTH / image.width)
     small = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
-    small.quantize(colours, dither=Image.Dither.FLOYDSTEINBERG).save(path, optimize=True)
+    if smooth:
+        few = small.quantize(COLOURS, dither=Image.Dither.FLOYDSTEINBERG)
+    else:
+        few = small.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few.save(path, optimize=True)
     print(f"{path.name} {path.stat().st_size / 1e3:.0f} kB")
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from cmfsim._core import Surface
+from cmfsim.errors import LandmarkInputError
 from cmfsim.pipeline.proposing import ProposedHead
 from cmfsim.registration.site_covariance import (
     PLACED_STD,
@@ -29,6 +30,8 @@ GivenSites = Mapping[SiteKey, tuple[Floats, SiteState]]
 # A given site this near to its surface was placed on a coarser drawing of it, and is brought onto
 # it, mm: pages draw surfaces to within half of this.
 DRAWN = 1.0
+# A given site that is farther from its bone or skin, mm, is on another one, or of another head.
+OFF = 8.0
 # A site that follows by less than this has not moved, mm.
 STILL = 0.05
 # Kinds with their labels.
@@ -58,6 +61,11 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
     -------
     ProposedLandmarks
         With the origin of each site.
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) A given site lies on none of the bones, or not on the skin.
     """
     before = head_distribution(head)
     points = {key: point for key, (point, _) in given.items()}
@@ -77,7 +85,7 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
             continue
         site: ProposedSite | None
         if key in given:
-            site = _given_site(*given[key], surfaces.get(site_part(*key)))
+            site = _given_site(key, *given[key], surfaces)
         else:
             site = _following(head.landmarks, key, mean, float(error), float(shift))
             site = site and _on_surface(site, surfaces.get(site_part(*key)))
@@ -110,10 +118,27 @@ def _surfaces(head: ProposedHead) -> dict[str, list[Surface]]:
     return found
 
 
-def _given_site(point: Floats, state: SiteState, surfaces: list[Surface] | None) -> ProposedSite:
-    closest, distance = _closest(point, surfaces or [])
+def _given_site(
+    key: SiteKey, point: Floats, state: SiteState, surfaces: Mapping[str, list[Surface]]
+) -> ProposedSite:
+    """A given site on its surface; doubtful if it lies on another bone."""
+    own = site_part(*key)
+    parts = [own] if own == "skin" else ["cranium", "mandible"]
+    found = {part: _closest(point, surfaces[part]) for part in parts if part in surfaces}
+    if own not in found:
+        return ProposedSite(point, state.error, state.doubt, state.origin)
+    closest, distance = found[own]
+    other = min(found, key=lambda part: found[part][1])
+    if found[other][1] > OFF:
+        raise LandmarkInputError(
+            f"{key[1]} ({key[0]}) of the case lies {distance:.0f} mm from the {own}: the others "
+            "cannot follow it; check that the file belongs to this image, and its frame"
+        )
+    doubt = state.doubt
+    if distance > OFF:
+        doubt = f"it lies on the {other}, {distance:.0f} mm from the {own}"
     place = closest if distance <= DRAWN else point
-    return ProposedSite(place, state.error, state.doubt, state.origin)
+    return ProposedSite(place, state.error, doubt, state.origin)
 
 
 def _following(

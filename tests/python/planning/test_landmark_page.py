@@ -450,6 +450,16 @@ def test_a_point_of_the_drawn_surface_is_brought_onto_the_bone_itself(head):
     np.testing.assert_array_equal(found.skull["pogonion"].point, far)
 
 
+def test_a_given_site_on_another_bone_is_doubtful_and_one_beside_the_head_an_error(head):
+    point = average_head().skull["nasion"]
+    found = filled_landmarks(head, {("skull", "menton"): (point, SiteState())})
+    assert "lies on the cranium" in found.skull["menton"].doubt
+    assert "landmark-doubtful" in {f.code for f in found.findings}
+    mirrored = point * [-1.0, -1.0, 1.0] + [0.0, 40.0, 0.0]
+    with pytest.raises(cmfsim.LandmarkError, match=r"nasion \(skull\) of the case lies \d+ mm"):
+        filled_landmarks(head, {("skull", "nasion"): (mirrored, SiteState())})
+
+
 def test_without_any_proposal_a_few_placed_sites_place_the_rest(head):
     truth = average_head()
     nothing = dataclasses.replace(head, landmarks=ProposedLandmarks({}, {}))

@@ -20,7 +20,7 @@ export class FilesPanel {
     this.root = element("div", {},
       element("h2", { textContent: "Save" }),
       element("div", { className: "row" }, ...kinds.map((kind) =>
-        button(`Save ${fileOf(kind)}`, () => this.save(kind), { id: `save-${kind}` }))),
+        button(`Save the ${kind}`, () => this.save(kind), { id: `save-${kind}`, title: fileOf(kind) }))),
       this.note = element("p", { className: "note", id: "save-note" }),
       element("p", { className: "note", textContent: "Put the files next to the case file, and these lines into it:" }),
       element("code", { textContent: this.lines, className: "lines" }),
