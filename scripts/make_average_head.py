@@ -3,10 +3,11 @@
 Run it after a change of the shapes in cmfsim.phantom: python scripts/make_average_head.py
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import cmfsim
-from cmfsim.registration.proposed import TemplateHead, average_head
+from cmfsim.registration.proposed import TemplateHead, average_head, measured_biases
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 
 # Voxels that the surfaces are taken from, mm, and how many triangles each has at most.
@@ -17,6 +18,9 @@ def main() -> None:
     """Writes the file and prints its size."""
     path = Path(average_head.__file__).with_name(average_head.FILE)
     average_head.write_average_head(path, drawn_head(cmfsim.make_head(), "synthetic head"))
+    rounded = average_head.read_average_head(path)
+    biases = measured_biases(rounded, rounded)
+    average_head.write_average_head(path, replace(rounded, biases=biases))
     print(f"{path.name}: {path.stat().st_size / 1024:.0f} kB")
 
 

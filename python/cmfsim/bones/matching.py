@@ -9,10 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim._core import IcpFit, Surface
+from cmfsim._core import IcpFit, Surface, icp
 from cmfsim.bones.shape_fit import ShapeFit, fit_shape
 from cmfsim.errors import RegistrationError, RegistrationInputError
-from cmfsim.registration import icp
 from cmfsim.values.checks import Floats, as_number, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
@@ -91,14 +90,19 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
         It does not fit, or too little of it does; the search does not converge.
     """
     try:
+        moving = Surface(segment.vertices, segment.triangles, crease_angle=segment.crease_angle)
         found = icp(
-            segment,
+            moving.vertices,
             bone,
+            normals=moving.vertex_normals,
             initial=_start(segment.vertices, bone, options),
             trim=options.trim,
-            max_angle=options.max_angle,
+            max_angle=np.radians(options.max_angle),
             max_iterations=MOST_STEPS,
             tolerance=REST,
+            method=None,
+            max_distance=None,
+            keep_border=False,
         )
         found_matrix = found.matrix
         fit = fit_shape(
@@ -177,6 +181,11 @@ def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
             max_iterations=QUICK_STEPS,
             # Reaching the step limit is expected: the search continues from the best.
             tolerance=0.0,
+            method=None,
+            max_distance=None,
+            max_angle=None,
+            keep_border=False,
+            normals=None,
         )
         if best is None or fit.rms < best.rms:
             best = fit

@@ -141,7 +141,7 @@ def _bones(
     """The levels of bones and teeth, and the findings on how the jaws were separated."""
     if options.part_jaws:
         say("jaw")
-        jaws = part_jaws(work, bone, points)
+        jaws = part_jaws(work, bone, skin, points)
     else:
         jaws = Jaws(None, None, None, ())
     # A smoothed rim may not carry bone past the skin.

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim.errors import LandmarkError
 from cmfsim.imaging.bone import Bone
+from cmfsim.imaging.model_seeds import fitted_to, model_box, model_seeds
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -22,8 +24,9 @@ from cmfsim.imaging.morphology import (
     smoothed,
     watershed,
 )
-from cmfsim.imaging.rough_places import guessed_landmarks
+from cmfsim.imaging.skin import Skin
 from cmfsim.imaging.working_grid import Working
+from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
@@ -118,27 +121,43 @@ class Jaws:
     findings: tuple[Finding, ...]
 
 
-def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None) -> Jaws:
-    """The mandible by a flood from seeds, which stops where bones touch most narrowly."""
+def part_jaws(
+    work: Working, bone: Bone, skin: Skin, landmarks: Mapping[str, Floats] | None
+) -> Jaws:
+    """The mandible by a flood from seeds, which stops where bones touch most narrowly.
+
+    Landmarks give the seeds where they show a tooth row; else the model of shape, fitted to bone
+    and skin and to the landmarks there are.
+    """
     findings: list[Finding] = []
     given = dict(landmarks or {})
-    landmarks = given
-    if _occlusal_points(given) is None and _one_row(given) is None:
-        guess = guessed_landmarks(work, bone)
-        if guess is None:
-            return Jaws(None, None, None, (_not_parted("no tooth row or chin was recognised"),))
-        against = _against(guess, given)
-        if against:
-            elsewhere = (
-                f"the image seems to show the tooth rows elsewhere than {', '.join(against)}"
-            )
-            return Jaws(None, None, None, (_not_parted(elsewhere),))
-        landmarks = guess | given
+    head = None
     if _occlusal_points(given) is None:
+        if _one_row(given) is None:
+            try:
+                head = fitted_to(work, bone, skin, given)
+            except LandmarkError as reason:
+                return Jaws(None, None, None, (_not_parted(str(reason)),))
+            against = _against(
+                {n: p for (kind, n), p in head.sites.items() if kind == "skull"}, given
+            )
+            if against:
+                elsewhere = (
+                    f"the image seems to show the tooth rows elsewhere than {', '.join(against)}"
+                )
+                return Jaws(None, None, None, (_not_parted(elsewhere),))
         findings.append(_guessed())
-    box = _box(work, bone, landmarks)
+    box = _box(work, bone, given) if head is None else model_box(work, head)
     domain = np.asfortranarray(bone.mask[box])
-    seeds = _seeds(work.part(box), bone, landmarks, box)
+    part = work.part(box)
+    if head is None:
+        seeds = _seeds(part, bone, given, box)
+        rows = _occlusal_points(given) or _one_row(given)
+        height = None if rows is None else float(rows[0][2])
+    else:
+        seeds = _model_seeds(part, bone, head, given, box)
+        teeth = (head.sites["skull", name] for name in ("supradentale", "infradentale"))
+        height = 0.5 * float(sum(place[2] for place in teeth))
     if not ((seeds == 1).any() and (seeds == 2).any()):
         if (on_other := _on_other_jaw(work, given)) is not None:
             return Jaws(None, None, None, (on_other,))
@@ -161,8 +180,6 @@ def part_jaws(work: Working, bone: Bone, landmarks: Mapping[str, Floats] | None)
     rest = bone.mask[box] & ~mandible[box]
     mandible[box] |= _touching(rest & ~_largest_piece(rest), mandible[box])
     side = _side(mandible, bone.mask)
-    rows = _occlusal_points(landmarks) or _one_row(landmarks)
-    height = None if rows is None else float(rows[0][2])
     return Jaws(side, mandible, height, tuple(findings))
 
 
@@ -295,6 +312,20 @@ def _seeds(
     condyles = _condyles(landmarks)
     on_mandible = (*ON_MANDIBLE, *condyles)
     _balls(seeds, domain, work, landmarks | condyles, names=on_mandible, value=1)
+    seeds[~domain] = 0
+    return seeds
+
+
+def _model_seeds(
+    work: Working, bone: Bone, head: FittedHead, given: Mapping[str, Floats], box: Block
+) -> NDArray[np.int32]:
+    """The seeds of the model, and those of landmarks, which are what a person said."""
+    domain = bone.mask[box]
+    seeds = model_seeds(work, domain, head)
+    if bone.cavity is not None:
+        seeds[bone.cavity[box]] = 2
+    _balls(seeds, domain, work, given, names=ON_CRANIUM, value=2)
+    _balls(seeds, domain, work, given, names=ON_MANDIBLE, value=1)
     seeds[~domain] = 0
     return seeds
 

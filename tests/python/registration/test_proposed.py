@@ -12,7 +12,9 @@ from cmfsim.registration.proposed import measured_biases
 from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.groups import JAW_SITES
 from cmfsim.registration.proposed.judgement import missing_sites
-from cmfsim.registration.proposed.pose import Pose, find_pose
+from cmfsim.registration.proposed.pose import Pose, refined_pose
+from cmfsim.registration.proposed.shape_model.fitted_head import fit_head
+from cmfsim.registration.proposed.shape_model.samples import samples_of
 from cmfsim.values.motion import rigid_motion
 
 pytest.importorskip("scipy")
@@ -136,7 +138,7 @@ def test_the_plane_of_symmetry_of_a_leaning_skull_without_its_vault_is_found(lea
     below = cmfsim.SurfaceData(
         np.asarray(cranium.vertices)[used] @ turn.T, triangles.reshape(-1, 3)
     )
-    pose = find_pose(below, cranium)
+    pose = refined_pose(fit_head(samples_of(below, None)).pose, below, cranium)
     assert pose.axes[0] @ turn[:, 0] > np.cos(np.radians(1.5))
 
 

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.registration.proposed.proposal import measured_biases
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["average_head", "write_average_head"]
+__all__ = ["average_head", "read_average_head", "write_average_head"]
 
 FILE = "average_head.npz"
 # Coordinates are rounded to this, mm: they pack into 16 bits.
@@ -31,12 +30,20 @@ def average_head() -> TemplateHead:
     Its frame is that of `make_head`. Surfaces, landmarks and the biases of the definitions come
     with the package (`scripts/make_average_head.py` makes them again).
     """
-    with np.load(Path(__file__).with_name(FILE), allow_pickle=False) as stored:
+    return read_average_head(Path(__file__).with_name(FILE))
+
+
+def read_average_head(path: Path) -> TemplateHead:
+    """The head of a file by `write_average_head`."""
+    with np.load(path, allow_pickle=False) as stored:
         return _unpacked(stored)
 
 
 def write_average_head(path: Path, head: TemplateHead) -> None:
-    """Writes the head that `average_head` reads: surfaces packed, landmarks with every digit."""
+    """Writes the head that `average_head` reads: surfaces packed, landmarks with every digit.
+
+    Biases are those of the head as it is read: rounded.
+    """
     surfaces = {**head.bones, "skin": head.skin}
     packed: dict[str, NDArray[np.generic]] = {}
     for name in PARTS:
@@ -47,10 +54,9 @@ def write_average_head(path: Path, head: TemplateHead) -> None:
         packed[f"{name}_triangles"] = surface.triangles.astype(np.uint16)
     packed["skull_landmarks"] = np.array([head.skull[name] for name in SKULL_LANDMARKS])
     packed["skin_landmarks"] = np.array([head.skin_landmarks[name] for name in SKIN_LANDMARKS])
-    # Of the head as it is read: rounded.
-    rounded = _unpacked(packed)
-    for (kind, names), biases in zip(KINDS.items(), measured_biases(rounded, rounded), strict=True):
-        packed[f"{kind}_biases"] = np.array([biases[name] for name in names])
+    if head.biases is not None:
+        for (kind, names), biases in zip(KINDS.items(), head.biases, strict=True):
+            packed[f"{kind}_biases"] = np.array([biases[name] for name in names])
     np.savez_compressed(path, allow_pickle=False, **packed)
 
 

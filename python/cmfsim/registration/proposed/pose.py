@@ -1,6 +1,6 @@
-"""The pose of a head of unknown place: its plane of symmetry, and the frame of an average head."""
+"""The pose of a head: its plane of symmetry, and the frame of an average head."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,36 +8,25 @@ import numpy as np
 from cmfsim._core import IcpFit, Surface, icp
 from cmfsim.errors import LandmarkInputError, RegistrationError
 from cmfsim.values.checks import Floats
-from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Pose", "distance_from", "find_pose", "levelled", "surface_samples"]
+__all__ = ["Pose", "distance_from", "levelled", "refined_pose", "surface_samples"]
 
 # Points of a surface that poses are fitted with.
 SAMPLES = 4000
 # Share of the worst pairs that fits leave out: spine, couch and what the other head lacks.
 MIRROR_TRIM, POSE_TRIM = 0.3, 0.35
-# A head is even enough where the kept pairs lie nearer than this, mm: real ones 0.6 mm, in planes
-# that are none 1.6 mm and more. Else its mirror image is turned first, degrees about an axis: twice
-# as far as the head may lean to a side or look to it.
+# A plane of symmetry is one where the kept pairs lie nearer than this, mm: real heads 0.6 mm, in
+# planes that are none 1.6 mm and more.
 EVEN = 1.0
-UPWARDS, BACKWARDS = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
-TURNS = ((0.0, UPWARDS), *((turn, axis) for axis in (BACKWARDS, UPWARDS) for turn in (35.0, -35.0)))
-# Heads are offered to the fit nodding this far either way, degrees, and in these sizes.
-PITCHES = (-20.0, 0.0, 20.0)
-SIZES = (0.72, 0.86, 1.0, 1.14)
-# Rounds of pairs and similarity fits of a candidate, and of the best.
-FIRST_ROUNDS, ROUGH_ROUNDS, FINE_ROUNDS = 4, 15, 40
-# Starts that are followed up.
-MOST_STARTS = 10
-# How much of the vertex may be missing, mm.
-VERTEX_CUT = (0.0, 30.0, 60.0)
+# A pose may be refined by so much: degrees, mm, share of the size. More is another one.
+MOST_TURN, MOST_SHIFT, MOST_SCALE = 15.0, 20.0, 0.12
+# Rounds of pairs and similarity fits.
+FINE_ROUNDS = 40
 # Damping of a step, as a share of the pairs.
 DAMPING = 1e-3
 # Cosine between the normals of a pair at least; farthest distance that counts, mm; fewest pairs.
 LEAST_AGREEMENT, MOST_GAP, LEAST_PAIRS = 0.5, 30.0, 50
-# A pose whose kept points lie farther from the average head than this is none, mm.
-WORST_FIT = 6.0
 
 
 # Points of a surface and their outward unit normals, (n, 3) each.
@@ -104,75 +93,73 @@ def surface_samples(surface: SurfaceData, count: int, seed: int = 0) -> tuple[Fl
     return points, units[chosen]
 
 
-def find_pose(bones: SurfaceData, average: SurfaceData, average_size: float = 1.0) -> Pose:
-    """The pose of a head by its bones: the plane of symmetry, then the fit of an average cranium.
+def refined_pose(start: Pose, bones: SurfaceData, average: SurfaceData) -> Pose:
+    """A pose with the plane of symmetry of the bones, and the fit of an average cranium in it.
+
+    What the bones do not show, such as a plane of symmetry of half a head, stays as it is.
 
     Parameters
     ----------
+    start : Pose
+        Of the model of shape, right to some degrees.
     bones : SurfaceData
-        Cranium of the patient, roughly upright in LPS (within about 30°); parts may be missing.
+        Cranium of the patient; parts may be missing.
     average : SurfaceData
         Cranium of a whole head in its own frame: x = 0 its plane of symmetry.
-    average_size : float
-        Its size.
-
-    Returns
-    -------
-    Pose
-
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) The bones look like no head.
     """
     points, normals = surface_samples(bones, SAMPLES)
-    symmetry, centre = _symmetry(bones, points, normals)
-    return _fitted((points, normals), (symmetry, centre), average, average_size)
+    pose = _even(start, bones, (points, normals))
+    placed = pose.into(points), normals @ pose.axes.T
+    surface = Surface(average.vertices, average.triangles)
+    first = np.eye(3) / start.size, np.zeros(3)
+    (fine,) = _similarities(placed, surface, [first], FINE_ROUNDS)
+    if fine.is_lost:
+        return pose
+    scale = float(np.cbrt(np.linalg.det(fine.linear)))
+    middle: Floats = -np.linalg.solve(fine.linear, fine.offset).astype(np.float64)
+    origin = pose.out(middle[None])[0]
+    found = Pose(origin, fine.linear / scale @ pose.axes, 1.0 / scale, fine.distance)
+    return found if _is_near(found, pose) else pose
 
 
-def _symmetry(whole: SurfaceData, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
-    """The unit normal of the plane of symmetry, towards the left, and a point of it."""
-    surface = Surface(whole.vertices, whole.triangles)
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+def _is_near(found: Pose, start: Pose) -> bool:
+    """Whether a pose is another one than that of the start."""
+    turn = np.degrees(np.arccos(np.clip((found.axes @ start.axes.T).trace() / 2.0 - 0.5, -1, 1)))
+    shift = float(np.linalg.norm(found.origin - start.origin)) / start.size
+    scale = abs(found.size / start.size - 1.0)
+    return bool(turn < MOST_TURN and shift < MOST_SHIFT and scale < MOST_SCALE)
+
+
+def _even(start: Pose, bones: SurfaceData, samples: Samples) -> Pose:
+    """The pose with the plane of symmetry that is near its own, if there is one."""
+    points, normals = start.into(samples[0]), samples[1] @ start.axes.T
+    surface = Surface(start.into(bones.vertices), bones.triangles)
     flip = np.array([-1.0, 1.0, 1.0])
-    mirrored = (points - centre) * flip + centre
-    fits: list[IcpFit] = []
-    reason: RegistrationError | None = None
-    for angle, axis in TURNS:
-        turn = rigid_motion(angle=angle, axis=axis, centre=centre) if angle else None
-        try:
-            fit = _mirror_fit((mirrored, normals * flip), surface, turn)
-        except RegistrationError as error:
-            reason = error
-            continue
-        fits.append(fit)
-        if fit.rms <= EVEN:
-            break
-    if not fits:
-        raise LandmarkInputError(
-            f"the bones have no recognisable plane of symmetry ({reason}): place the landmarks "
-            "by hand"
-        ) from reason
-    matrix = min(fits, key=lambda fit: fit.rms).matrix
-    # p → R (S (p − c) + c) + t is nearly a reflection; its axis is the eigenvector of −1.
-    rotation = matrix[:3, :3] @ np.diag(flip)
+    try:
+        fit = _mirror_fit((points * flip, normals * flip), surface)
+    except RegistrationError:
+        return start
+    # p → R S p + t is nearly a reflection; its axis is the eigenvector of −1.
+    rotation = fit.matrix[:3, :3] @ np.diag(flip)
     values, vectors = np.linalg.eigh(0.5 * (rotation + rotation.T))
-    normal = vectors[:, int(np.argmin(values))]
-    normal = normal if normal[0] > 0.0 else -normal
-    image = matrix[:3, :3] @ ((points - centre) * flip + centre).T + matrix[:3, 3:]
-    middle = 0.5 * (image.T + points)
+    left = vectors[:, int(np.argmin(values))]
+    left = left if left[0] > 0.0 else -left
     # Midpoints of points and their images lie in the plane.
-    return normal, normal * float(np.median(middle @ normal)) + (
-        centre - normal * float(centre @ normal)
-    )
+    middle = 0.5 * (points @ rotation.T + fit.matrix[:3, 3] + points)
+    up = np.array([0.0, 0.0, 1.0]) - left * left[2]
+    up /= np.linalg.norm(up)
+    axes = np.stack([left, np.cross(up, left), up]) @ start.axes
+    origin = start.out((left * float(np.median(middle @ left)))[None])[0]
+    found = Pose(origin, axes, start.size, start.residual)
+    return found if fit.rms <= EVEN and _is_near(found, start) else start
 
 
-def _mirror_fit(mirrored: Samples, surface: Surface, turn: Floats | None) -> IcpFit:
-    """The rigid motion that brings mirrored points back to the surface, from a first turn."""
+def _mirror_fit(mirrored: Samples, surface: Surface) -> IcpFit:
+    """The rigid motion that brings mirrored points back to the surface."""
     return icp(
         mirrored[0],
         surface,
-        initial=turn,
+        initial=None,
         max_distance=None,
         keep_border=False,
         trim=MIRROR_TRIM,
@@ -182,38 +169,6 @@ def _mirror_fit(mirrored: Samples, surface: Surface, turn: Floats | None) -> Icp
         max_angle=np.radians(45.0),
         normals=mirrored[1],
     )
-
-
-def _fitted(
-    samples: Samples, plane: tuple[Floats, Floats], average: SurfaceData, average_size: float
-) -> Pose:
-    """The pose of points whose plane of symmetry is known by its normal and a point."""
-    (points, normals), (left, centre) = samples, plane
-    surface = Surface(average.vertices, average.triangles)
-    up = np.array([0.0, 0.0, 1.0]) - left * left[2]
-    up /= np.linalg.norm(up)
-    upright = np.stack([left, np.cross(up, left), up])
-    begin, turned = (points - centre) @ upright.T, normals @ upright.T
-    starts = _starts(begin, average.vertices, average_size)
-    few = begin[::6], turned[::6]
-    tried = _similarities(few, surface, starts, FIRST_ROUNDS)
-    tried.sort(key=lambda fit: fit.distance)
-    followed = [(fit.linear, fit.offset) for fit in tried[:MOST_STARTS]]
-    rough = _similarities(few, surface, followed, ROUGH_ROUNDS)
-    best = min(rough, key=lambda fit: fit.distance)
-    (fine,) = _similarities((begin, turned), surface, [(best.linear, best.offset)], FINE_ROUNDS)
-    rms, linear, offset = fine.distance, fine.linear, fine.offset
-    scale = float(np.cbrt(np.linalg.det(linear)))
-    residual = rms
-    if residual > WORST_FIT:
-        raise LandmarkInputError(
-            f"the bones lie {residual:.1f} mm from an average skull in the best pose (at most "
-            f"{WORST_FIT:g} mm allowed): they are not a head, or a head rotated by more than "
-            "30°; place the landmarks by hand"
-        )
-    axes = linear / scale @ upright
-    origin = centre - upright.T @ (np.linalg.solve(linear, offset))
-    return Pose(origin, axes, average_size / scale, residual)
 
 
 # Sites of the cranium that show how it nods, and the distance at which one counts half, mm.
@@ -290,27 +245,6 @@ def distance_from(points: Floats, normals: Floats, template: SurfaceData) -> flo
     start = np.eye(3), np.zeros(3)
     (fit,) = _similarities((points, normals), surface, [start], FINE_ROUNDS)
     return fit.distance
-
-
-def _starts(points: Floats, target: Floats, average_size: float) -> Iterator[tuple[Floats, Floats]]:
-    """Similarities to begin with: nods, sizes, and heads whose vertex is cut off."""
-    middle = np.array([0.0, *points[:, 1:].mean(axis=0)])
-    for pitch in np.radians(PITCHES):
-        c, s = np.cos(pitch), np.sin(pitch)
-        turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-        for size in SIZES:
-            linear = average_size / size * turn
-            moved = (points - middle) @ linear.T
-            for cut in VERTEX_CUT:
-                # The front of the bones on the front of the head, their top on its top.
-                shift = np.array(
-                    [
-                        0.0,
-                        np.quantile(target[:, 1], 0.02) - np.quantile(moved[:, 1], 0.02),
-                        np.quantile(target[:, 2], 0.98) - cut - np.quantile(moved[:, 2], 0.98),
-                    ]
-                )
-                yield linear, shift - linear @ middle
 
 
 @dataclass

@@ -27,10 +27,12 @@ from cmfsim.registration.proposed.limits import cut_planes
 from cmfsim.registration.proposed.pose import (
     Pose,
     distance_from,
-    find_pose,
     levelled,
+    refined_pose,
     surface_samples,
 )
+from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead, fit_head
+from cmfsim.registration.proposed.shape_model.samples import samples_of
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
@@ -89,7 +91,8 @@ def landmarks_from(
     # Points on all surfaces are drawn while the pose is found.
     with ThreadPoolExecutor(1) as beside:
         drawn = beside.submit(parts.draw)
-        pose = find_pose(parts.upper, average.bones["cranium"])
+        fitted = _fitted(parts)
+        pose = refined_pose(fitted.pose, parts.upper, average.bones["cranium"])
         drawn.result()
     for _ in range(LEVEL_ROUNDS):
         pose = levelled(pose, detect(parts, pose, skin=False).skull, average.skull)
@@ -134,6 +137,12 @@ def _surfaces(bones: Mapping[str, SurfaceData], skin: SurfaceData | None = None)
     return HeadSurfaces(joined_surface(upper), joined_surface(lower) if lower else None, skin)
 
 
+def _fitted(parts: HeadSurfaces) -> FittedHead:
+    """The model of shape in all bone, divided or not, and the skin."""
+    bones = [parts.upper, *([] if parts.lower is None else [parts.lower])]
+    return fit_head(samples_of(joined_surface(bones), parts.skin))
+
+
 def _check_head(skull: Mapping[str, Floats]) -> None:
     """Refuses what has no orbits, or too few sites of a cranium."""
     cranial = [name for name in skull if not name.startswith(JAW_SITES)]
@@ -170,7 +179,7 @@ def _template_pose(template: TemplateHead, average: TemplateHead) -> Pose:
     if template is average:
         pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
     else:
-        pose = find_pose(parts.upper, average.bones["cranium"])
+        pose = refined_pose(_fitted(parts).pose, parts.upper, average.bones["cranium"])
     for _ in range(LEVEL_ROUNDS):
         pose = levelled(pose, detect(parts, pose, skin=False).skull, average.skull)
     return pose

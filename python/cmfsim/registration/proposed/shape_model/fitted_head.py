@@ -1,0 +1,238 @@
+"""The model fitted to a head: pose, jaw, all sites with a covariance, and how well it fits."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cmfsim.errors import LandmarkInputError
+from cmfsim.registration.proposed.pose import Pose
+from cmfsim.registration.proposed.shape_model.fitting import MOST_GAP, Evidence, Known, refined
+from cmfsim.registration.proposed.shape_model.model import (
+    CRANIUM,
+    MANDIBLE,
+    SITES,
+    SKIN,
+    HeadModel,
+    head_model,
+)
+from cmfsim.registration.proposed.shape_model.samples import HeadSamples
+from cmfsim.registration.proposed.shape_model.search import found_poses
+from cmfsim.registration.proposed.shape_model.state import JAW_DEVIATIONS, POSE_UNITS, State
+from cmfsim.values.checks import Floats
+
+__all__ = ["FittedHead", "fit_head"]
+
+# Rounds in the first place, of all rough poses, and of the best: noise in mm and modes.
+FIRST = ((8.0, 0), (6.0, 0), (5.0, 20), (4.0, 20))
+OPENED = ((5.0, 20), (4.0, 40), (3.0, 40), (3.0, 80))
+LATER = ((2.5, 80), (2.0, 80), (2.0, 160), (1.5, 160), (1.5, 400), (1.0, 400))
+LAST = ((1.0, 400), (0.7, 400))
+OPENINGS = tuple(np.radians((0.0, 8.0, 16.0, 25.0)))
+COARSE_POINTS = 1200
+AGAIN = ((1.0, 400), (0.7, 400))
+# A point of the model fits where the patient's surface is nearer than this, mm of the average head.
+FITS = 4.0
+# Share of the visible face that must fit: heads of all kinds have 0.7 to 0.8, balls and tubes 0.4.
+LEAST_FIT, FACE_BACK, FACE_TOP = 0.55, 0.0, 60.0
+# A part of the face and the skull's base that the head's own frame is taken from, mm: back, up.
+FRAME_BACK, FRAME_TOP, FRAME_DISTANCE, FRAME_ROUNDS = 20.0, 70.0, 4.0, 10
+# Surfaces say little of where along them a site lies: relief finer than the modes, mm.
+ALONG_SURFACE = 4.5
+FLIPS = {
+    "upside down": np.array([-1.0, 1.0, -1.0]),
+    "with its face to the back": np.array([-1.0, -1.0, 1.0]),
+    "upside down and with its face to the back": np.array([1.0, -1.0, -1.0]),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FittedHead:
+    """The model in the shape and pose of a patient.
+
+    Attributes
+    ----------
+    model : HeadModel
+    samples : HeadSamples
+    evidence : Evidence
+    known : mapping
+        Sites that were given.
+    """
+
+    model: HeadModel
+    samples: HeadSamples
+    evidence: Evidence
+    known: Known
+
+    @property
+    def state(self) -> State:
+        """Pose, jaw and shape."""
+        return self.evidence.state
+
+    @cached_property
+    def points(self) -> Floats:
+        """The model's points in the patient's frame, (n, 3) mm."""
+        return self.state.out(self.state.points(self.model))
+
+    @cached_property
+    def sites(self) -> Mapping[tuple[str, str], Floats]:
+        """All 46 sites in the patient's frame, by kind and label, seen or not."""
+        places = self.state.out(self.state.sites(self.model)[0])
+        return dict(zip(SITES, places, strict=True))
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Of all coordinates of the sites in the patient's frame, (138, 138) mm².
+
+        That of the process after the fit, with what surfaces do not say along themselves.
+        """
+        places, derivatives = self.state.sites(self.model)
+        taken = np.concatenate([np.arange(6), 6 + self.evidence.modes])
+        # A step of the pose moves the patient: seen from there the model moves back.
+        turn = np.array([[[0, z, -y], [-z, 0, x], [y, -x, 0]] for x, y, z in places])
+        pose = np.concatenate(
+            [places[:, :, None], turn, np.tile(np.eye(3), (len(places), 1, 1))], axis=2
+        )
+        columns = np.concatenate([-pose / POSE_UNITS, derivatives[:, :, taken]], axis=2)
+        columns = np.linalg.solve(self.state.linear, columns)
+        flat = columns.reshape(-1, columns.shape[2])
+        covariance: Floats = flat @ np.linalg.solve(self.evidence.precision, flat.T)
+        along = (ALONG_SURFACE / self.state.scale) ** 2
+        for row in range(len(places)):
+            own = slice(3 * row, 3 * row + 3)
+            if row not in self.known:
+                covariance[own, own] += along / 2.0 * np.eye(3)
+        return covariance
+
+    @cached_property
+    def errors(self) -> Mapping[tuple[str, str], float]:
+        """Expected distance of each site from the true one, mm."""
+        variances = np.diag(self.covariance).reshape(-1, 3).sum(axis=1)
+        return dict(zip(SITES, np.sqrt(variances), strict=True))
+
+    @cached_property
+    def fits(self) -> float:
+        """Share of the visible face and jaw, by area, where the patient's bone lies near them.
+
+        Within 4 mm in the model's size, and looking the same way.
+        """
+        own = self.model.points
+        face = (self.model.parts != SKIN) & (own[:, 1] < FACE_BACK) & (own[:, 2] < FACE_TOP)
+        face &= self.evidence.seen
+        near = self.evidence.gaps[face] < FITS
+        areas = self.model.areas[face]
+        return float(areas[near].sum() / areas.sum()) if face.any() else 0.0
+
+    @cached_property
+    def gap(self) -> float:
+        """Mean distance of the visible model from the patient's surfaces, capped, patient's mm."""
+        seen = self.evidence.seen
+        if not seen.any():
+            return np.inf
+        gaps = np.minimum(self.evidence.gaps[seen], MOST_GAP)
+        return float(np.average(gaps, weights=self.model.areas[seen])) / self.state.scale
+
+    @cached_property
+    def pose(self) -> Pose:
+        """The frame of the average head by the fitted face and base of the skull."""
+        own = self.model.points
+        used = (self.model.parts == CRANIUM) & (own[:, 1] < FRAME_BACK) & (own[:, 2] < FRAME_TOP)
+        still = State(self.state.linear, self.state.offset, np.zeros(6), self.state.shape)
+        fitted = still.out(still.points(self.model))[used]
+        goal, area = own[used], self.model.areas[used]
+        weight = area
+        for _ in range(FRAME_ROUNDS):
+            linear, offset = _similarity(fitted, goal, weight)
+            gap = np.linalg.norm(fitted @ linear.T + offset - goal, axis=1)
+            weight = area / (1.0 + (gap / FRAME_DISTANCE) ** 2)
+        scale = float(np.cbrt(np.linalg.det(linear)))
+        origin: Floats = -np.linalg.solve(linear, offset).astype(np.float64)
+        return Pose(origin, linear / scale, 1.0 / scale, self.gap)
+
+    def conditioned(self, points: Mapping[tuple[str, str], Floats], error: float) -> "FittedHead":
+        """The fit with some sites known: they are kept, and the others follow.
+
+        Parameters
+        ----------
+        points : mapping of (kind, label) to (3,) float64, mm
+            In the patient's frame.
+        error : float, mm
+            Of each.
+        """
+        rows = {site: row for row, site in enumerate(SITES)}
+        known = {rows[site]: (place, error) for site, place in points.items()}
+        evidence = refined(self.model, self.samples, self.state, AGAIN, known)
+        return FittedHead(self.model, self.samples, evidence, known)
+
+
+def fit_head(samples: HeadSamples) -> FittedHead:
+    """The model fitted to a head of any pose within about 40°, from several starts.
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) Nothing like a head, or one that lies otherwise.
+    """
+    model = head_model()
+    best = _best(model, samples)
+    if best.fits >= LEAST_FIT:
+        return best
+    for how, flip in FLIPS.items():
+        other = _best(model, samples, flip)
+        if other.fits >= max(LEAST_FIT, best.fits):
+            raise LandmarkInputError(
+                f"the head lies {how} in LPS coordinates, so left and right cannot be trusted "
+                "either: export the image again with its orientation, or correct the axes"
+            )
+    raise LandmarkInputError(
+        f"{100.0 * best.fits:.0f} % of an average face lie within {FITS:g} mm of these bones "
+        f"in the best pose ({100.0 * LEAST_FIT:.0f} % needed): they are not a head, or show "
+        "too little of one; place the landmarks by hand"
+    )
+
+
+def _best(model: HeadModel, samples: HeadSamples, flip: Floats | None = None) -> FittedHead:
+    coarse, few = model.coarse, samples.fewer(COARSE_POINTS)
+    best = _least(
+        refined(coarse, few, start.state(coarse), FIRST, still_jaw=True)
+        for start in found_poses(coarse, few, flip)
+    )
+    # A closed jaw lies too far from an open one for its pairs.
+    opened = [
+        refined(coarse, few, _opened(best.state, by), OPENED, still_jaw=True) for by in OPENINGS
+    ]
+    best = min(opened, key=lambda evidence: _jaw_gap(coarse, evidence))
+    evidence = refined(coarse, few, best.state, LATER)
+    return FittedHead(model, samples, refined(model, samples, evidence.state, LAST), {})
+
+
+def _least(tried: Iterable[Evidence]) -> Evidence:
+    return min(tried, key=lambda evidence: evidence.score)
+
+
+def _jaw_gap(model: HeadModel, evidence: Evidence) -> float:
+    """How far the mandible lies from the patient's surfaces, patient's mm.
+
+    What would lie outside the image counts half of the largest distance: a chin does not get there
+    for free.
+    """
+    jaw = model.parts == MANDIBLE
+    gaps = np.where(evidence.seen, np.minimum(evidence.gaps, MOST_GAP), 0.5 * MOST_GAP)[jaw]
+    return float(gaps.mean()) / evidence.state.scale
+
+
+def _opened(state: State, angle: float) -> State:
+    jaw = np.array([angle / JAW_DEVIATIONS[0], 0.0, 0.0, 0.0, 0.0, 0.0])
+    return State(state.linear, state.offset, jaw, np.zeros_like(state.shape))
+
+
+def _similarity(source: Floats, target: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """The similarity from points to others, weighted (Umeyama 1991)."""
+    share = weight / weight.sum()
+    a, b = share @ source, share @ target
+    u, s, vt = np.linalg.svd((target - b).T @ ((source - a) * share[:, None]))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    scale = float((s * signs).sum() / (share @ ((source - a) ** 2).sum(axis=1)))
+    linear = scale * u @ np.diag(signs) @ vt
+    return linear, b - linear @ a
