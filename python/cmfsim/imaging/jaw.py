@@ -83,6 +83,9 @@ OTHER_JAW = (22.0, 60.0)
 # All three are those of an arch this wide at its second molars, and a child's are smaller; mm, and
 # parts of it.
 ARCH_WIDTH, LEAST_ARCH = 68.0, 0.6
+# Nothing of the mandible lies between its rami and above the teeth within this of the midline, nor
+# farther behind the second molars than this, mm: condyles end 10 mm before in an average head.
+BETWEEN_RAMI, BEHIND_JOINTS = 25.0, 55.0
 # Bone of a lower jaw that is shown reaches farther than this into the range, mm.
 INTO_OTHER_JAW = 5.0
 # The mandible's front edge of the ramus ends the tooth row, mm in front of the occlusal landmark.
@@ -360,6 +363,7 @@ def _tooth_rows(
     across = (x > low - BEFORE_RAMUS) & (x < high + BEFORE_RAMUS)
     # Heights only where the row is: both lines ascend, so that it is a block.
     row = box_of(across & (y < behind))[:2]
+    whole = x, y, z
     x, y, part = x[row[0]], y[:, row[1]], seeds[row]
     height = normal[0] * (x - incisal[0]) + normal[1] * (y - incisal[1])
     height = height + normal[2] * (z - incisal[2])
@@ -370,6 +374,7 @@ def _tooth_rows(
         size = _arch_size(left, right)
         other = (size * OTHER_JAW[0], OTHER_JAW[1])
         upper, lower = (CROWN, other) if is_upper else (other, CROWN)
+        _behind_row(seeds, (left, right), whole, incisal=float(incisal[2]), is_upper=is_upper)
     part[(height > upper[0]) & (height < upper[1])] = 2
     part[(height < -lower[0]) & (height > -lower[1])] = 1
 
@@ -390,6 +395,24 @@ def _occlusal_points(landmarks: Mapping[str, Floats]) -> tuple[Floats, Floats, F
         else:
             return None
     return points[0], points[1], points[2]
+
+
+def _behind_row(
+    seeds: NDArray[np.int32],
+    ends: tuple[Floats, Floats],
+    axes: tuple[Any, Any, Any],
+    *,
+    incisal: float,
+    is_upper: bool,
+) -> None:
+    """Seeds of spine and skull base, which an image without the vault would give the mandible."""
+    x, y, z = axes
+    left, right = ends
+    size = _arch_size(left, right)
+    middle, back = 0.5 * (left[0] + right[0]), 0.5 * (left[1] + right[1])
+    above = incisal + (CROWN[0] if is_upper else OTHER_JAW[0])
+    base = (np.abs(x - middle) < BETWEEN_RAMI * size) & (y > back) & (z > above)
+    seeds[base | (y > back + BEHIND_JOINTS * size)] = 2
 
 
 def _one_row(landmarks: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats] | None:

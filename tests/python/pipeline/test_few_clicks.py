@@ -90,6 +90,19 @@ def test_three_clicks_on_the_upper_teeth_separate_the_jaws_of_an_open_mouth(chil
     assert 25.0 < volume < 50.0
 
 
+def test_three_clicks_leave_spine_and_skull_base_to_the_cranium_where_no_vault_is_shown(coarse):
+    """A cone beam's field of view ends below the brow: nothing above the joints says cranium."""
+    sites = landmarks("ct_phantom")
+    face = variants.cropped(coarse, 2, high=float(sites["nasion"][2]))
+    anatomy = cmfsim.segment_head(face, landmarks={name: sites[name] for name in UPPER_ROW})
+    mandible = anatomy.bones["mandible"]
+    y = mandible.axes()[1].ravel()
+    inside = mandible.values > 0.0
+    assert y[np.flatnonzero(inside.any(axis=(0, 2)))[-1]] < sites["supraglenoid_L"][1] + 12.0
+    volume = np.count_nonzero(inside) * np.prod(mandible.spacing) / 1000.0
+    assert 50.0 < volume < 90.0
+
+
 def test_clicks_on_the_teeth_of_the_other_jaw_are_refused_by_name(coarse):
     """As if upper and lower were confused: no lower jaw is left below the clicked row."""
     image = variants.scaled(coarse, CHILD)

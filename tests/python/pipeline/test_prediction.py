@@ -130,10 +130,15 @@ def test_a_model_with_muscles_needs_them(predictions):
         cmfsim.model_scene(bare, "S")
 
 
-def test_muscles_need_landmarks_of_the_skull(predictions):
-    patient = dataclasses.replace(predictions["H"].patient, landmarks={})
-    with pytest.raises(cmfsim.LandmarkError, match="skull"):
-        cmfsim.with_muscles(patient, cmfsim.CaseMuscles())
+def test_muscles_without_landmarks_of_the_skull_are_left_out_and_reported(predictions):
+    """A model with muscles then has fat everywhere, as a homogeneous one."""
+    whole = predictions["H"].patient
+    scene = dataclasses.replace(whole.scene, tissue=whole.fat)
+    bare = dataclasses.replace(whole, landmarks={}, muscles=None, scene=scene)
+    patient = cmfsim.with_muscles(bare, cmfsim.CaseMuscles())
+    assert patient.muscles is None
+    assert [f.severity for f in patient.findings if f.code == "muscles-left-out"] == ["warning"]
+    assert cmfsim.model_scene(patient, "M+S").tissue is patient.fat
 
 
 def test_landmark_errors_move_muscles_more_than_skin(predictions):
