@@ -19,7 +19,13 @@ from cmfsim.registration.site_covariance import (
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
-from cmfsim.values.site_states import GOOD_ERROR, MOST_ERROR, SURFACE_REACH, SiteState
+from cmfsim.values.site_states import (
+    CLEARED_SHARE,
+    GOOD_ERROR,
+    MOST_ERROR,
+    SURFACE_REACH,
+    SiteState,
+)
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["GivenSites", "filled_landmarks", "head_distribution"]
@@ -77,9 +83,10 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
         "skull": dict(head.landmarks.missing_skull),
         "skin": dict(head.landmarks.missing_skin),
     }
+    shares = after.errors / before.errors
     shifts = np.linalg.norm(after.mean - before.mean, axis=1)
-    rows = zip(after.names, after.mean, after.errors, shifts, strict=True)
-    for key, mean, error, shift in rows:
+    rows = zip(after.names, after.mean, after.errors, shares, shifts, strict=True)
+    for key, mean, error, share, shift in rows:
         kind, name = key
         if kind == "skin" and head.skin is None and key not in given:
             continue
@@ -87,7 +94,8 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
         if key in given:
             site = _given_site(key, *given[key], surfaces)
         else:
-            site = _following(head.landmarks, key, mean, float(error), float(shift))
+            site = _following(head.landmarks, key, mean, float(error), float(share))
+            site = site if shift > STILL or site is None else _as_found(head.landmarks, key, site)
             site = site and _on_surface(site, surfaces.get(site_part(*key)))
         if site is not None:
             sites[kind][name] = site
@@ -142,17 +150,24 @@ def _given_site(
 
 
 def _following(
-    found: ProposedLandmarks, key: SiteKey, mean: Floats, error: float, shift: float
+    found: ProposedLandmarks, key: SiteKey, mean: Floats, error: float, share: float
 ) -> ProposedSite | None:
     """A site that nobody placed, moved with the others; None if it is missing and stays so."""
     kind, name = key
     site = (found.skull if kind == "skull" else found.skin).get(name)
     if site is None:
         return ProposedSite(mean, error, _unsure(error), "filled") if error <= MOST_ERROR else None
-    if shift <= STILL:
-        return site
-    doubt = "" if error <= GOOD_ERROR else site.doubt
-    return ProposedSite(mean, error if site.doubt else min(error, site.error), doubt, "moved")
+    if not site.doubt:
+        return ProposedSite(mean, min(error, site.error), "", "moved")
+    if share <= CLEARED_SHARE and error <= GOOD_ERROR:
+        return ProposedSite(mean, error, "", "moved")
+    return ProposedSite(mean, max(error, share * site.error), site.doubt, "moved")
+
+
+def _as_found(found: ProposedLandmarks, key: SiteKey, site: ProposedSite) -> ProposedSite:
+    """The site as it was proposed, if it was."""
+    kind, name = key
+    return (found.skull if kind == "skull" else found.skin).get(name, site)
 
 
 def _unsure(error: float) -> str:

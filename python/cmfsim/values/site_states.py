@@ -3,10 +3,21 @@
 import re
 from dataclasses import dataclass
 
-__all__ = ["GOOD_ERROR", "MOST_ERROR", "ORIGINS", "SURFACE_REACH", "SiteState", "site_state"]
+__all__ = [
+    "CLEARED_SHARE",
+    "GOOD_ERROR",
+    "MOST_ERROR",
+    "ORIGINS",
+    "SURFACE_REACH",
+    "SiteState",
+    "site_state",
+]
 
 # A missing or doubtful site whose expected error has fallen to this, mm, need not be placed.
 GOOD_ERROR = 4.0
+# And a doubt is lifted only if placed sites have lowered the expected error to this share of it:
+# sites far away say nothing of it.
+CLEARED_SHARE = 0.75
 # A missing site is filled in up to this expected error, mm; above `GOOD_ERROR` it is doubtful.
 MOST_ERROR = 8.0
 # A site that follows others is brought onto its surface if that is as near as this, mm.

@@ -13,6 +13,7 @@ from cmfsim.pipeline.filling import filled_landmarks, head_distribution
 from cmfsim.pipeline.landmark_page import head_content, write_landmark_page
 from cmfsim.pipeline.proposing import ProposedHead
 from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.site_covariance import PLACED_STD
 from cmfsim.values.landmark_sites import site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.site_states import SiteState, site_state
@@ -193,6 +194,25 @@ def test_a_click_places_the_site_on_its_bone_and_the_others_follow_as_in_python(
     assert np.linalg.norm(pogonion["point"] - truth) < 0.6 * HIGH
     glabella = shown(opened, index(content, "glabella"))
     assert np.linalg.norm(glabella["point"] - average_head().skull["glabella"]) < 0.5
+
+
+def test_the_page_names_the_site_that_helps_the_others_most(opened, content, head):
+    distribution = head_distribution(head)
+    nasion = average_head().skull["nasion"]
+    place(opened, index(content, "nasion"), nasion)
+    left = distribution.given({("skull", "nasion"): nasion}).covariance
+    names = [
+        s["label"]
+        for s in opened.evaluate("cmfsimPage.toCheck().map((i) => cmfsimPage.page.sites[i])")
+    ]
+    sites = opened.evaluate("cmfsimPage.toCheck()")
+    assert len(sites) > 1
+    gains = [
+        sum((left[:, i] ** 2).sum() / (left[i, i] + PLACED_STD**2) for i in range(3 * s, 3 * s + 3))
+        for s in sites
+    ]
+    best = names[int(np.argmax(gains))]
+    assert f"{best} would help the others most" in opened.locator("#error-state").inner_text()
 
 
 def test_a_click_on_another_bone_says_so_and_places_nothing(opened, content):

@@ -18,7 +18,7 @@ from cmfsim.values.landmark_sites import (
     site_labels,
     site_part,
 )
-from cmfsim.values.site_states import GOOD_ERROR, SURFACE_REACH, SiteState
+from cmfsim.values.site_states import CLEARED_SHARE, GOOD_ERROR, SURFACE_REACH, SiteState
 from cmfsim.values.surface_data import SurfaceData
 
 __all__ = ["LandmarkContent", "PageSite", "landmark_content"]
@@ -133,6 +133,7 @@ def landmark_content(
         "sites": [_values(site) for site in sites],
         "placed_std": placed_std,
         "good_error": GOOD_ERROR,
+        "cleared_share": CLEARED_SHARE,
         "surface_reach": SURFACE_REACH,
         **_framing(surfaces),
     }

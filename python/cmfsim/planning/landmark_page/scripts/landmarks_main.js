@@ -35,6 +35,7 @@ class App {
     });
     this.points = page.sites.map((_, i) => [...arrays.site_points.values.slice(3 * i, 3 * i + 3)]);
     this.model = new SiteModel(this.points.flat(), arrays.site_covariance.values, page.placed_std);
+    this.errorsBefore = this.model.given([]).errors;
     this.camera = new Camera(page.target, page.span);
     this.drawing = new Drawing(document.getElementById("drawing"), [[0, 0, 0], [1, 1, 1]]);
     this.overlay = document.getElementById("overlay");
@@ -94,10 +95,12 @@ class App {
       const near = follows ? this.closest(site.part, free) : { point: free, distance: 0 };
       const onSurface = near.distance <= this.page.surface_reach;
       const point = onSurface ? near.point : free;
+      const share = errors[i] / this.errorsBefore[i];
       const moved = Math.hypot(...point.map((v, k) => v - this.points[i][k]));
       const state = site.origin === "filled" ? (good(i) && onSurface ? "filled" : "missing")
-        : site.doubt ? (good(i) ? "moved" : "doubtful") : "proposed";
-      const error = site.origin === "filled" || site.doubt || moved > 0.05 ? errors[i] : Math.min(site.error, errors[i]);
+        : site.doubt ? (good(i) && share <= this.page.cleared_share ? "moved" : "doubtful") : "proposed";
+      const error = state === "doubtful" ? Math.max(errors[i], share * site.error)
+        : site.origin === "filled" || site.doubt ? errors[i] : Math.min(site.error, errors[i]);
       return { state, point, error, moved, onSurface };
     });
     this.timing.compute = Math.max(1e-3, performance.now() - begun);
@@ -365,10 +368,13 @@ class App {
 
   showState() {
     const box = document.getElementById("error-state");
-    const open = this.toCheck().length;
+    const toCheck = this.toCheck();
+    const open = toCheck.length;
     const done = this.decided.size;
+    const next = this.model.mostUseful([...this.decided.keys()].sort((a, b) => a - b), toCheck);
+    const hint = open > 1 ? ` ${this.page.sites[next].label} would help the others most.` : "";
     box.textContent = open
-      ? `${open} of ${this.page.sites.length} sites to check; ${done} placed or accepted.`
+      ? `${open} of ${this.page.sites.length} sites to check; ${done} placed or accepted.${hint}`
       : `Nothing is left to check; ${done} of ${this.page.sites.length} sites placed or accepted.`;
     box.classList.toggle("warning", open > 0);
   }

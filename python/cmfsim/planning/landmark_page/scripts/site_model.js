@@ -20,13 +20,30 @@ export class SiteModel {
     const at = (i, j) => this.covariance[i * this.size + j];
     const factor = factored(rows.map((i) => rows.map((j) => at(i, j) + (i === j ? this.noise : 0))));
     const errors = new Array(this.size / 3).fill(0);
+    const weights = [];
     for (let i = 0; i < this.size; i++) {
       const column = rows.map((j) => at(i, j));
-      const explained = column.length ? substituted(factor, column).reduce((sum, v, k) => sum + v * column[k], 0) : 0;
+      weights.push(column.length ? substituted(factor, column) : []);
+      const explained = weights[i].reduce((sum, v, k) => sum + v * column[k], 0);
       errors[Math.floor(i / 3)] += Math.max(0, at(i, i) - explained);
     }
-    this.known = { key, rows, factor, errors: errors.map(Math.sqrt) };
+    this.known = { key, rows, factor, weights, errors: errors.map(Math.sqrt) };
     return this.known;
+  }
+
+  /** Of some sites the one that, placed next, takes most from the variance of all; undefined of none. */
+  mostUseful(sites, candidates) {
+    const { rows, weights } = this.given(sites);
+    const left = (i, j) => weights[j].reduce((v, w, k) => v - w * this.covariance[i * this.size + rows[k]], this.covariance[i * this.size + j]);
+    const gains = candidates.map((site) => {
+      let gain = 0;
+      for (let i = 3 * site; i < 3 * site + 3; i++) {
+        const own = left(i, i) + this.noise;
+        for (let j = 0; j < this.size; j++) gain += left(j, i) ** 2 / own;
+      }
+      return gain;
+    });
+    return candidates[gains.indexOf(Math.max(...gains))];
   }
 
   /** The sites' shifts, mm, three for each, where those at `sites` are at `points`. */
