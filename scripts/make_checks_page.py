@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from cmfsim.values.finding_table import FINDING_KINDS
+from cmfsim.values.finding_table import FINDING_KINDS, filled
 
 PAGE = Path(__file__).parents[1] / "docs/checks.md"
 HEAD = """# What is checked
@@ -35,6 +35,7 @@ def page() -> str:
 
 def _cell(text: str) -> str:
     """A text that a cell of a table can hold."""
+    text = filled(text, {})
     for sign, escaped in (("|", "\\|"), ("<", "&lt;"), ("[", "\\["), ("*", "\\*")):
         text = text.replace(sign, escaped)
     return text

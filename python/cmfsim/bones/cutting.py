@@ -289,22 +289,22 @@ def _fragment_findings(
 ) -> Iterator[Finding]:
     """Findings about the fragments of the first of two segments, by their volumes in mm³."""
     if moved:
-        yield Finding.note(
-            "osteotomy-crumbs",
+        yield Finding(
+            "osteotomy-parts",
             f"fragments that the cut separated from {names[0]!r}: {len(moved)}, "
             f"{sum(moved):.0f} mm³ in all; they stay with {names[1]!r}",
+            severity="note",
             where=kind,
             why="they would move with a bone to which they are not connected",
             fix="move the planes, or lower crumb_volume",
         )
     if kept:
-        yield Finding.warning(
+        yield Finding(
             "osteotomy-parts",
             f"{names[0]!r} has {len(kept) + 1} disconnected parts; the volumes of the smaller "
             f"ones are {', '.join(f'{volume:.0f}' for volume in kept)} mm³",
+            severity="warning",
             where=kind,
-            why="disconnected parts move together as one segment",
-            fix="check the picture of the segments; move the planes",
         )
 
 

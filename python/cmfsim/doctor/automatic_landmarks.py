@@ -18,8 +18,8 @@ def check_automatic(evidence: Evidence) -> Iterator[Finding]:
         *(["the muscles"] if case.muscles is not None else []),
         "the region that is meshed",
     ]
-    yield Finding.note(
-        "landmarks-automatic",
+    yield Finding(
+        "landmarks-proposed",
         "the case names no landmarks, so the build will find them; the doctor does not check "
         + ", ".join(left),
         where=case.where("landmarks"),

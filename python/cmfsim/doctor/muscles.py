@@ -30,8 +30,8 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
     try:
         template = MuscleTemplate.load(given.template)
     except (CmfsimError, OSError) as error:
-        yield Finding.error(
-            "template-unreadable",
+        yield Finding(
+            "input-unreadable",
             str(error),
             where=evidence.case.where("muscles.template"),
             why="muscles cannot be placed without a template",
@@ -43,9 +43,10 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
         # They are found when the case is built.
         return
     if not evidence.skull_landmarks:
-        yield Finding.error(
-            "muscles-without-landmarks",
+        yield Finding(
+            "landmark-missing",
             "the case has [muscles], but no skull landmarks could be read",
+            severity="error",
             where=where,
             why="skull landmarks fit the template to the patient",
             fix="add [landmarks] skull, or remove [muscles]",
@@ -54,11 +55,10 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
     try:
         matched = match_landmarks(template.landmarks, evidence.skull_landmarks, required=())
     except CmfsimError as error:
-        yield Finding.error(
-            "muscles-landmarks",
+        yield Finding(
+            "template-landmarks",
             str(error),
             where=where,
-            why="the template cannot be fitted to the patient by these landmarks",
             fix='correct the landmarks; "cmfsim template morph" shows each one\'s error',
         )
         return
@@ -73,12 +73,11 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
     for name in given.moduli.muscles:
         if name not in names:
             close = difflib.get_close_matches(name, names)
-            yield Finding.error(
-                "muscle-moduli-unknown",
+            yield Finding(
+                "unknown-name",
                 f"moduli are given for the muscle {name!r}, which the template does not have",
                 where=case.where(f"muscles.moduli.{name}"),
-                why="they would have no effect",
-                fix=f"use one of: {', '.join(close or names)}",
+                facts={"names": ", ".join(close or names)},
             )
     tissue = case.fat
     if tissue.kind == "preset" and tissue.preset not in PRESETS:
@@ -88,9 +87,10 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
     try:
         moduli = replace(given.moduli, fat=FatModuli.of(tissue))
     except CmfsimError as error:
-        yield Finding.error(
-            "fat-moduli",
+        yield Finding(
+            "moduli-unusual",
             str(error),
+            severity="error",
             where=case.where("tissue"),
             why="the fat of [tissue] lies between the muscles",
             fix="set young (MPa) to a value that is plausible for fat, or remove [tissue]",

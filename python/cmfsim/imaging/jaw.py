@@ -171,24 +171,15 @@ def _side(mandible: Mask, bone: Mask) -> Volume:
 
 
 def _not_parted(reason: str) -> Finding:
-    return Finding.warning(
+    return Finding(
         "jaws-not-parted",
         f"the mandible could not be separated from the skull: {reason}",
         where="bone",
-        why="mandible and cranium would move together",
-        fix="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
-        "ready surfaces of both bones",
     )
 
 
 def _guessed() -> Finding:
-    return Finding.note(
-        "jaws-parted-by-shape",
-        "the mandible was separated from the skull by shape alone, without landmarks",
-        where="bone",
-        why="the cut between the tooth rows may be some millimetres off",
-        fix="give skull landmarks",
-    )
+    return Finding("jaws-parted-by-shape", where="bone")
 
 
 def _implausible(mandible: Mask, work: Working) -> str | None:

@@ -163,13 +163,10 @@ def _box(
 
 
 def _rest_removed(volume: float) -> Finding:
-    return Finding.note(
+    return Finding(
         "rest-removed",
         f"{volume / 1000.0:.0f} cm³ of couch, pillow or head-rest was removed",
         where="behind or beside the head",
-        why="where it touched the head, the skin comes from the shape of the head, not from the "
-        "image",
-        fix="check the back of the head visually if it matters",
     )
 
 

@@ -86,13 +86,11 @@ def _with_orientations(name: str, slices: list[Slice]) -> tuple[list[Slice], lis
     if not silent or len(stated) != 1 or 2 * len(silent) >= len(slices):
         return slices, []
     tags = {"orientation": stated.pop()}
-    finding = Finding.warning(
+    finding = Finding(
         "field-ignored",
         f"{counted(len(silent), 'slice')} without an orientation were taken to have that of all "
         f"others: {listed([s.name for s in silent])}",
         where=name,
-        why="a slice that is turned within its plane would be out of place",
-        fix="check these slices visually, or export the series again",
     )
     return [replace(s, tags={**s.tags, **tags}) if s in silent else s for s in slices], [finding]
 
@@ -103,14 +101,11 @@ def _assumed_findings(name: str, stack: Stack) -> list[Finding]:
     if not assumed:
         return []
     return [
-        Finding.warning(
+        Finding(
             "dicom-frames-assumed",
             f"the file states the place of its first frame alone; the {len(stack.slices)} frames "
             f"were placed one after the other along its normal, {assumed}",
             where=name,
-            why="if they run the other way, the head is mirrored: right is left or top is bottom",
-            fix="compare left and right, and the height of the head, with the patient; or export "
-            "the series as one file per slice",
         )
     ]
 
@@ -148,14 +143,14 @@ def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[F
     if not left:
         return groups[0], []
     finding = Finding(
-        severity="note" if not others else "warning",
-        code="dicom-scouts",
-        what=f"skipped {counted(len(left), 'scout')} (localisers, or slices of another "
+        "dicom-skipped",
+        f"skipped {counted(len(left), 'scout')} (localisers, or slices of another "
         "orientation): "
         f"{listed(left)}",
+        severity="note" if not others else "warning",
         where=name,
         why="they show the head from different directions",
-        fix="" if not others else "check that none of these is a slice of the volume",
+        fix="nothing to do" if not others else "",
     )
     return groups[0], [finding]
 
@@ -302,12 +297,14 @@ def _without_copies(
         copies.append(other.name)
     if not copies:
         return kept, []
-    finding = Finding.note(
-        "dicom-copies",
+    finding = Finding(
+        "dicom-skipped",
         f"skipped {counted(len(copies), 'copy')} of slices with the same place and pixels: "
         f"{listed(copies)}",
+        severity="note",
         where=name,
         why="the image is the same without them",
+        fix="nothing to do",
     )
     return kept, [finding]
 
@@ -344,7 +341,7 @@ def _acquisition_findings(name: str, stack: Stack) -> list[Finding]:
             )
         if low < high:
             return [
-                Finding.warning(
+                Finding(
                     "field-ignored",
                     f"the slices of acquisitions {first} and {second} alternate, and together "
                     "they are evenly spaced: they were taken as one scan",
@@ -459,7 +456,7 @@ def _tilt_findings(
                 f"slices shifted against one another by up to {np.ptp(along, axis=0).max():.1f} mm"
             )
         findings.append(
-            Finding.warning(
+            Finding(
                 "dicom-tilted",
                 f"{what}, resampled by the position of each slice "
                 f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)",
@@ -473,14 +470,11 @@ def _tilt_findings(
         )
     if abs(abs(tilt) - angle) > TILTS_AGREE:
         findings.append(
-            Finding.warning(
-                "dicom-tilt-unclear",
+            Finding(
+                "dicom-tilted",
                 f"the header states a gantry tilt of {tilt:g}°, the positions of the slices one of "
                 f"{angle:.1f}°; the positions were used",
                 where=name,
-                why="if another program wrote the positions without the tilt, the head is sheared",
-                fix="export the original series from the scanner or archive, and check the "
-                "shape of the head visually",
             )
         )
     return findings
@@ -503,33 +497,29 @@ def _whole_heights(stack: Stack) -> str:
 
 def _uneven(name: str, stack: Stack, uneven: list[int]) -> Finding:
     steps = np.diff(stack.heights)
-    return Finding.warning(
+    return Finding(
         "dicom-uneven",
         f"slices are {np.median(steps):.3g} mm apart, from {steps.min():.3g} to "
         f"{steps.max():.3g} mm: {_steps(stack, uneven)}; resampled by their positions",
         where=name,
-        why="shapes are less certain where slices are further apart",
-        fix="use a reconstruction with evenly spaced slices if there is one",
     )
 
 
 def _oblique(name: str, angle: float) -> Finding:
-    return Finding.note(
+    return Finding(
         "image-oblique",
         f"the image's axes are turned by {angle:.1f}° from the patient's; it was resampled",
+        severity="note",
         where=name,
-        why="all stages need a grid along the patient's axes",
     )
 
 
 def _coarse(name: str, gap: float) -> Finding:
-    return Finding.warning(
+    return Finding(
         "ct-spacing-coarse",
         f"slices are {gap:.3g} mm apart",
         where=name,
-        why=f"thin bone, lips and eyelids are lost between slices more than {COARSE_SLICES:g} mm "
-        "apart; surfaces are a millimetre less accurate",
-        fix="use the thin-slice reconstruction of the same scan",
+        facts={"most": COARSE_SLICES},
     )
 
 
@@ -538,11 +528,9 @@ def _rescale_findings(name: str, stack: Stack) -> list[Finding]:
     if not kinds:
         return []
     return [
-        Finding.warning(
-            "dicom-not-hu",
+        Finding(
+            "ct-not-hu",
             f"the header states that values are {', '.join(sorted(kinds))!r}, not HU",
             where=name,
-            why="thresholds of skin and bone are in HU",
-            fix="check skin and bone visually, or set skin_threshold and bone_threshold",
         )
     ]

@@ -229,9 +229,10 @@ def data_file(path: Path, name: str) -> Path:
 
 def unstated(path: Path, stated: str, how: str) -> Finding:
     """A finding on a file that does not state its frame, and how it would."""
-    return Finding.warning(
-        "image-frame-unstated",
+    return Finding(
+        "frame-unstated",
         f"{stated}: its axes were assumed to be left, posterior and superior",
+        severity="warning",
         where=path.name,
         why="if this is wrong, left and right of the face are swapped, or front and back; left "
         "and right cannot be recognised in an image",

@@ -232,17 +232,18 @@ def _affine_of(place: Any) -> NDArray[np.float64]:
 def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:
     shear = shear_of(affine)
     if shear <= SHEARED:
-        return Finding.note(
+        return Finding(
             "image-oblique",
             f"the image's axes are turned by {turn_of(affine):.1f}° from the patient's; it was "
             "resampled",
+            severity="note",
             where=path.name,
-            why="all stages need a grid along the patient's axes",
         )
-    return Finding.warning(
-        "image-sheared",
+    return Finding(
+        "image-oblique",
         f"the image's axes are {shear:.1f}° from right angles, as in a CT with a tilted gantry; it "
         "was resampled by its stated axes",
+        severity="warning",
         where=path.name,
         why="a program that assumes perpendicular axes would show the head sheared",
         fix="compare the skin with the scan visually",

@@ -250,9 +250,10 @@ def _lip_findings(patient: PatientModel, model: str) -> list[dict[str, str]]:
     """That separate lips do not touch, in a model without contact."""
     if not patient.lips or model.endswith("+S"):
         return []
-    found = Finding.warning(
-        "lips-without-contact",
+    found = Finding(
+        "lips-contact",
         f"the lips are separate, but model {model} has no contact between them",
+        severity="warning",
         where="[lips]",
         why="each lip follows its teeth, so the lips may pass through each other, which is "
         "impossible if they are one piece",

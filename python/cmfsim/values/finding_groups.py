@@ -10,15 +10,11 @@ __all__ = ["FindingGroup", "counted", "grouped"]
 
 # What several findings of one code have in common. Others are stated by the worst of them.
 TITLES: Mapping[str, str] = {
-    "muscle-cut-off": "{n} muscles partly outside the tissue",
-    "muscle-does-not-fit": "{n} muscles do not fit into the tissue",
-    "muscle-inside-out": "{n} muscle surfaces were inside out and were flipped",
+    "muscle-does-not-fit": "{n} muscles partly outside the tissue",
     "muscle-missed": "{n} muscles contain no sample of the tissue and do not affect it",
-    "muscle-open": "{n} muscle surfaces are not closed",
-    "muscle-sheet": "{n} muscles are sheets, whose outline hardly determines their fibre direction",
     "muscle-volume-changed": "{n} muscles changed in volume as they were moved into the tissue",
+    "muscle-sheet": "{n} muscles are sheets, whose outline hardly determines their fibre direction",
     "landmark-far": "{n} landmarks are far from their surface",
-    "surface-closed": "{n} surfaces were open and were closed",
     "surface-open": "{n} surfaces are open",
 }
 # A size within the text of a finding: the larger, the worse.

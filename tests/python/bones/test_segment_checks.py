@@ -223,7 +223,7 @@ def test_a_piece_beyond_the_mesh_that_nobody_named_is_a_warning(cut):
     )
     name = behind.name
     (finding,) = moved_without_nodes([behind], {name: forwards}, plan={})
-    assert (finding.severity, finding.code) == ("warning", "segment-touches-no-tissue")
+    assert (finding.severity, finding.code) == ("warning", "segment-no-tissue")
     with pytest.raises(cmfsim.CaseError, match=f"'{name}' moves, but no node"):
         moved_without_nodes([behind], {name: forwards}, plan={name: None})
     assert moved_without_nodes([behind], {name: np.eye(4)}, plan={name: None}) == ()

@@ -411,5 +411,5 @@ def test_a_sagittal_split_leaves_no_mandible_to_plan(tmp_path, capsys):
     )
     assert main(["doctor", str(path), "-q"]) == 2
     said = capsys.readouterr().out
-    assert "[plan-unknown-segment]" in said
+    assert "[unknown-name]" in said
     assert "write [plan.mandible_body]" in said

@@ -48,4 +48,4 @@ def test_doctor_accepts_muscles_without_landmarks_unless_finding_them_is_off(cas
         main(["doctor", str(case / name), "--json", "-q"])
         report = json.loads(capsys.readouterr().out)
         codes = {finding["code"] for finding in report["findings"]}
-        assert ("muscles-without-landmarks" in codes) is refused
+        assert ("landmark-missing" in codes) is refused

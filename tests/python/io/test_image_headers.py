@@ -380,7 +380,7 @@ def test_a_sheared_sform_is_resampled_by_its_own_map(tmp_path, qform):
         )
     found = read_image_file(path)
     (finding,) = found.findings
-    assert finding.code == "image-sheared"
+    assert finding.code == "image-oblique"
     assert "16.7°" in finding.what
     assert _values_at(found.image, SHEARED, to_lps=(-1, -1, 1)) < 0.51
 
@@ -392,7 +392,7 @@ def test_a_sheared_nrrd_is_resampled_by_its_own_map(tmp_path, linear):
         **{"space directions": "(1,0,0) (0,1,0) (0,0.6,2)", "space origin": "(5,6,7)"},
     )
     found = read_image_file(path)
-    assert [f.code for f in found.findings] == ["image-sheared"]
+    assert [f.code for f in found.findings] == ["image-oblique"]
     assert _values_at(found.image, SHEARED) < 0.51
 
 
@@ -435,12 +435,12 @@ def test_units_of_a_nifti_are_applied_to_spacing_and_place(tmp_path, units, scal
 def test_what_a_file_does_not_state_is_reported(tmp_path):
     straight = [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 2, 7]]
     assert codes(write_nifti(tmp_path / "a.nii", units=0, rows=straight)) == ["image-unit-unstated"]
-    assert codes(write_nifti(tmp_path / "b.nii", sform=0)) == ["image-frame-unstated"]
+    assert codes(write_nifti(tmp_path / "b.nii", sform=0)) == ["frame-unstated"]
     bare = {"space": None, "space directions": None, "space origin": None, "spacings": "1 1 2"}
     found = read_image_file(write_nrrd(tmp_path / "c.nrrd", **bare))
-    assert [f.code for f in found.findings] == ["image-frame-unstated"]
+    assert [f.code for f in found.findings] == ["frame-unstated"]
     np.testing.assert_allclose(found.image.spacing, [1.0, 1.0, 2.0])
-    assert codes(write_nrrd(tmp_path / "d.nrrd", space="scanner-xyz")) == ["image-frame-unstated"]
+    assert codes(write_nrrd(tmp_path / "d.nrrd", space="scanner-xyz")) == ["frame-unstated"]
 
 
 @pytest.mark.parametrize(

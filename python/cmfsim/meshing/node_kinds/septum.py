@@ -173,18 +173,15 @@ def _nearest(place: Floats, segments: Sequence[BoneSegment]) -> BoneSegment:
 
 
 def _by_vertex(skull: str) -> Finding:
-    return Finding.note(
+    return Finding(
         "septum-left-out",
         f"the nasal septum is not modelled: {skull} is followed vertex by vertex",
         where=f"segment {skull}",
-        why="the septum lies too far from the bone for that; without its support, the tip of the "
-        "nose follows the maxilla too far, mostly upwards",
-        fix="if the skull did not move, leave it out of the plan",
     )
 
 
 def _left_out(missing: Sequence[str]) -> Finding:
-    return Finding.note(
+    return Finding(
         "septum-left-out",
         f"the nasal septum is not modelled: {', '.join(missing)} "
         f"{'is' if len(missing) == 1 else 'are'} not among the landmarks",

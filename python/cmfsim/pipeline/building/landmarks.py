@@ -41,13 +41,10 @@ def found_landmarks(case: Case, anatomy: Anatomy, stages: Stages, *, is_read: bo
     except LandmarkError as error:
         stages.add(
             [
-                Finding.warning(
+                Finding(
                     "landmarks-not-found",
                     f"the case names no landmarks, and none were found automatically: {error}",
                     where="landmarks",
-                    why="the region is placed by the depth of the head, and the contact of the "
-                    "teeth from the image alone",
-                    fix="place the landmarks by hand and name the files under [landmarks]",
                 )
             ]
         )
