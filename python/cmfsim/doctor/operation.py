@@ -28,7 +28,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
+__all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of", "vertices_of"]
 
 # Depth by which a moved bone may pass the undeformed skin before it is reported, mm: skin goes with
 # the bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
@@ -150,6 +150,19 @@ def _piece(evidence: Evidence, name: str) -> Floats | None:
         if len(own):
             found.append(np.concatenate([own, body.index.closest(own)[1]], axis=1))
     return np.concatenate(found) if found else None
+
+
+def vertices_of(evidence: Evidence) -> dict[str, Floats | None]:
+    """The vertices, (k, 3) mm, of each segment whose motion is a matrix, as far as it has any."""
+    found: dict[str, Floats | None] = dict.fromkeys(evidence.motions)
+    for bone, body in evidence.bones.items():
+        points = body.repaired.vertices
+        owners = _owners(evidence, bone, points)
+        for name, known in found.items():
+            own = points[owners == name]
+            if len(own):
+                found[name] = own if known is None else np.concatenate([known, own])
+    return found
 
 
 def _parts(evidence: Evidence) -> list[BonePart]:

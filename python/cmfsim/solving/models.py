@@ -206,9 +206,8 @@ def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:
     A planner's are those about the segment's own centre (paper, Table 2).
     """
     motion = scene.plan[name]
-    surfaces = {segment.name: segment.surface for segment in patient.segments}
     if isinstance(motion, MovedSurface) or np.shape(motion) == (4, 4):
-        vertices = surfaces[name].vertices
+        vertices = patient.segment_vertices(name)
     else:
         vertices = scene.nodes[scene.segments[name].joined]
     clinical = clinical_motion(

@@ -254,11 +254,10 @@ def _carried(part: str, skin: SurfaceData, points: Floats) -> dict[str, NDArray[
 
 def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
     skull = planning.patient.landmarks.get("skull", {})
-    surfaces = {segment.name: segment.surface for segment in planning.patient.segments}
     boxes = segment_boxes(planning)
     found = []
     for name, centre in zip(planning.segments, planning.columns.centres, strict=True):
-        points = segment_points(name, skull, surfaces[name].vertices)
+        points = segment_points(name, skull, planning.patient.segment_vertices(name))
         found.append(
             {
                 "name": name,
