@@ -153,6 +153,9 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
             f"{what}{between}",
             severity="error",
             where=where,
+            why="bone does not grow during an operation: the files have different units, or one "
+            "was scaled",
+            fix="export both in the unit that the case states",
         )
     return Finding(
         "moved-scaled",

@@ -433,7 +433,11 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
             INNER_WALL,
             f"{share:.0%} of bone {name} lies outside the skin, which is a shell some "
             f"{thickness:.0f} mm thick around it: its outer and inner wall are joined",
+            severity="error",
             where=skin.where,
+            why="between the bone and the inner wall there would be no tissue",
+            fix="export the skin as a solid, its outer wall alone (in 3D Slicer: fill the segment, "
+            "or undo Hollow)",
         )
         return
     if share > ELSEWHERE_SHARE:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
-from cmfsim.io.dicom_headers import numbers_of
+from cmfsim.io.dicom_headers import SHOWN_INVERTED, DicomHeader, numbers_of
 from cmfsim.io.dicom_slices import Slice, Stack, counted, is_localizer, listed
 from cmfsim.io.files import utf8_path
 from cmfsim.io.image_grids import aligned, of_slices, turn_of, upright
@@ -91,6 +91,8 @@ def _with_orientations(name: str, slices: list[Slice]) -> tuple[list[Slice], lis
         f"{counted(len(silent), 'slice')} without an orientation were taken to have that of all "
         f"others: {listed([s.name for s in silent])}",
         where=name,
+        why="a slice that is turned within its plane would be out of place",
+        fix="check these slices visually, or export the series again",
     )
     return [replace(s, tags={**s.tags, **tags}) if s in silent else s for s in slices], [finding]
 
@@ -189,7 +191,7 @@ def _stack(name: str, slices: list[Slice]) -> Stack:
                 f"{name}: the series mixes {what} ({', '.join(sorted(stated))}): keep the slices "
                 "of one volume in the folder"
             )
-    kinds = {s.text("photometric") for s in slices} - {"", "MONOCHROME2"}
+    kinds = {s.text("photometric") for s in slices} - {"", SHOWN_INVERTED, "MONOCHROME2"}
     if kinds:
         raise ImageInputError(
             f"{name}: pixels are {', '.join(kinds)}: a CT has MONOCHROME2, in which more is "
@@ -226,11 +228,12 @@ def _pixels(name: str, stack: Stack) -> NDArray[Any]:
     try:
         if all(s.header.count == 1 and not s.header.frames for s in stack.slices):
             return _of_files(stack, limits)
-        parts = {path: _of_frames(path, limits) for path in files}
+        parts = {s.header.path: s.header for s in stack.slices}
+        frames = {path: _of_frames(header, limits) for path, header in parts.items()}
     except ReaderError as error:
         raise ImageInputError(f"{name}: {error}") from error
     _check_scales(name, stack)
-    return np.stack([parts[s.header.path][s.frame] for s in stack.slices])
+    return np.stack([frames[s.header.path][s.frame] for s in stack.slices])
 
 
 def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
@@ -238,11 +241,7 @@ def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
     with contextlib.ExitStack() as kept:
         folder = kept.enter_context(tempfile.TemporaryDirectory(prefix="cmfsim-dicom-"))
         for k, one in enumerate(stack.slices):
-            path = one.header.path
-            if one.header.odd:
-                path = Path(folder, f"{k}.dcm")
-                path.write_bytes(one.header.without_odd())
-            paths.append(kept.enter_context(utf8_path(path)))
+            paths.append(kept.enter_context(utf8_path(_readable(one.header, folder, f"{k}.dcm"))))
         answer = read_in_child("cmfsim.io.image_reading:read_slices", limits, paths=paths)
     places = np.array(answer.values["places"])
     expected = np.column_stack([stack.positions, np.tile(stack.spacing, (len(paths), 1))])
@@ -257,8 +256,21 @@ def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
     return answer.arrays["values"]
 
 
-def _of_frames(path: Path, limits: ReadLimits) -> NDArray[Any]:
-    with utf8_path(path) as plain:
+def _readable(header: DicomHeader, folder: str, name: str) -> Path:
+    """A file that ITK reads rightly: that of the header, or a copy."""
+    data = header.for_reader()
+    if data is None:
+        return header.path
+    copy = Path(folder, name)
+    copy.write_bytes(data)
+    return copy
+
+
+def _of_frames(header: DicomHeader, limits: ReadLimits) -> NDArray[Any]:
+    with (
+        tempfile.TemporaryDirectory(prefix="cmfsim-dicom-") as folder,
+        utf8_path(_readable(header, folder, "frames.dcm")) as plain,
+    ):
         answer = read_in_child("cmfsim.io.image_reading:read_frames", limits, path=plain)
     values = answer.arrays["values"]
     return values if values.ndim == 3 else values[None]
@@ -524,13 +536,14 @@ def _coarse(name: str, gap: float) -> Finding:
 
 
 def _rescale_findings(name: str, stack: Stack) -> list[Finding]:
+    findings = []
+    if any(s.text("photometric") == SHOWN_INVERTED for s in stack.slices):
+        what = f"{SHOWN_INVERTED} is ignored: it states that the lowest value is shown white"
+        why = "what is shown follows the rescaling: the values in HU are the same (PS3.3 C.7.6.3.1)"
+        fix = "check that bone is brighter than air in anatomy.png; otherwise export the CT again"
+        findings.append(Finding("field-ignored", what, where=name, why=why, fix=fix))
     kinds = {s.text("rescale_type").upper() for s in stack.slices} - UNSTATED_SCALES
-    if not kinds:
-        return []
-    return [
-        Finding(
-            "ct-not-hu",
-            f"the header states that values are {', '.join(sorted(kinds))!r}, not HU",
-            where=name,
-        )
-    ]
+    if kinds:
+        what = f"the header states that values are {', '.join(sorted(kinds))!r}, not HU"
+        findings.append(Finding("ct-not-hu", what, where=name))
+    return findings

@@ -154,6 +154,7 @@ def _known_labels(
         "landmark-spelling",
         f"{len(renamed)} labels are spelled differently: {', '.join(renamed[:4])}{more}",
         where=where,
+        why="the second spelling is used",
     )
     return MappingProxyType({labels[label]: point for label, point in points.items()}), [finding]
 

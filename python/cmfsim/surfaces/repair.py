@@ -209,10 +209,8 @@ def _wall_finding(name: str, share: float) -> Finding:
         INNER_WALL,
         f"the {name} has an inner wall, which encloses {share:.0%} of the outer one's volume; the "
         "outer wall alone is used",
+        severity="warning",
         where=name,
-        why="a skin saved as a shell (Hollow tool, threshold of the skin alone) has two walls, and "
-        "bone inside the inner one would lie outside the skin",
-        fix="look at the skin; export it as a solid if the wrong wall was kept",
     )
 
 

@@ -639,3 +639,17 @@ def test_nothing_rings_at_the_borders_of_bone_and_metal():
         axes = np.array([[cz, sz, 0.0], [-sz * c, cz * c, s]])
         made = of_slices(values, positions, axes, (0.8, 0.8), "x").values
         assert -1024 == made.min() < 1200 < made.max() <= 3071
+
+
+def test_pixels_shown_inverted_have_the_same_values_in_hu(tmp_path):
+    """PS3.3 C.7.6.3.1: MONOCHROME1 is about display, after the values were rescaled."""
+    image = smooth()
+    write_series(tmp_path / "plain", axial(image))
+    write_series(tmp_path / "shown", axial(image))
+    for path in (tmp_path / "shown").iterdir():
+        data = path.read_bytes()
+        assert data.count(b"MONOCHROME2") == 1
+        path.write_bytes(data.replace(b"MONOCHROME2", b"MONOCHROME1"))
+    plain, shown = (read_image_file(tmp_path / name) for name in ("plain", "shown"))
+    assert np.array_equal(plain.image.values, shown.image.values)
+    assert codes(shown) - codes(plain) == {"field-ignored"}

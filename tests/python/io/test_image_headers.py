@@ -270,10 +270,49 @@ def test_packed_voxels_are_held_against_their_checksum_and_length(tmp_path, kind
         packed = packed[:middle] + bytes([packed[middle] ^ 4]) + packed[middle + 1 :]
     path = tmp_path / "voxels"
     path.write_bytes(b"head" + packed)
-    with pytest.raises(ImageError, match="voxels"):
-        check_length("voxels", path, 4, VALUES.nbytes, kind)
+    layer = VALUES[:, :, 0].nbytes
+    given = (path, 4, VALUES.nbytes, layer, kind)
+    if change in {"tail", "long"}:
+        (finding,) = check_length(*given)
+        assert finding.what.startswith(f"{4 if change == 'tail' else 2} bytes after its voxels")
+    else:
+        with pytest.raises(ImageError, match="voxels"):
+            check_length(*given)
     path.write_bytes(b"head" + pack(VALUES.T.tobytes()))
-    check_length("voxels", path, 4, VALUES.nbytes, kind)
+    assert check_length(*given) == ()
+    # As many more as a slice has may be one that the header misses.
+    path.write_bytes(b"head" + pack(VALUES.T.tobytes() + bytes(layer)))
+    with pytest.raises(ImageError, match="longer than its header states"):
+        check_length(*given)
+
+
+@pytest.mark.parametrize("kind", ["raw", "gzip", "bzip2"])
+def test_a_nrrd_file_is_read_whatever_packs_it_and_with_bytes_after_it(tmp_path, kind):
+    pack = {"raw": bytes, "gzip": gzip.compress, "bzip2": bz2.compress}[kind]
+    path = write_nrrd(tmp_path / "a.nrrd", data=False, encoding=kind)
+    header = path.read_bytes()
+    apart = write_nrrd(tmp_path / "b.nhdr", data=False, encoding=kind, data_file="b.bin")
+    for tail, expected in ((b"", []), (b"\0\n", ["field-ignored"])):
+        path.write_bytes(header + pack(VALUES.T.tobytes()) + tail)
+        (tmp_path / "b.bin").write_bytes(pack(VALUES.T.tobytes()) + tail)
+        for file in (path, apart):
+            found = read_image_file(file)
+            assert np.array_equal(found.image.values, VALUES)
+            assert [f.code for f in found.findings] == expected
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_packed_voxels_of_a_meta_file_are_read_without_their_length(tmp_path, stated):
+    """Without it, ITK read the text of the header as the begin of the voxels: other values."""
+    packed = zlib.compress(VALUES.T.tobytes())
+    size = {"CompressedDataSize": str(len(packed))} if stated else {}
+    path = write_meta(tmp_path / "a.mha", data=False, CompressedData="True", **size)
+    header = path.read_bytes()
+    for tail, expected in ((b"", []), (b"\0\n", ["field-ignored"])):
+        path.write_bytes(header + packed + tail)
+        found = read_image_file(path)
+        assert np.array_equal(found.image.values, VALUES)
+        assert [f.code for f in found.findings] == expected
 
 
 # Files elsewhere -------------------------------------------------------------------------------

@@ -107,7 +107,9 @@ def test_init_doctor_and_predict_state_one_plan_alike(head):
     path = head / "case.toml"
     text = path.read_text(encoding="utf-8")
     # As coarse as a mesh can be: the segment's own surface ends 0.4 mm behind the bone.
-    path.write_text(re.sub(r"\[mesh\]\n", "[mesh]\nedge_length = 12\n", text), encoding="utf-8")
+    path.write_text(
+        text.replace("[output]", "[mesh]\nedge_length = 12\n\n[output]"), encoding="utf-8"
+    )
     case = cmfsim.Case.load(path)
     stated = examine(case).plan["mandible"]
     assert "pitch −7.8°" in stated.text

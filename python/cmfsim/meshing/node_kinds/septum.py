@@ -177,6 +177,9 @@ def _by_vertex(skull: str) -> Finding:
         "septum-left-out",
         f"the nasal septum is not modelled: {skull} is followed vertex by vertex",
         where=f"segment {skull}",
+        why="the septum lies too far from the bone for that; without its support, the tip of the "
+        "nose follows the maxilla too far, mostly upwards",
+        fix="if the skull did not move, leave it out of the plan",
     )
 
 
@@ -186,6 +189,4 @@ def _left_out(missing: Sequence[str]) -> Finding:
         f"the nasal septum is not modelled: {', '.join(missing)} "
         f"{'is' if len(missing) == 1 else 'are'} not among the landmarks",
         where="[landmarks]",
-        why="without its support, the tip of the nose follows the maxilla too far, mostly upwards",
-        fix="add these landmarks, or set septum = false in [node_kinds]",
     )

@@ -113,8 +113,6 @@ def _size_findings(
         why="bone does not grow during an operation, so the scans are calibrated or segmented "
         f"differently by {change:.1%}; the motion is that of the middle of the bone, without "
         f"the change of size{common}",
-        fix="check the voxel sizes of both scans and the thresholds of both segmentations, and "
-        "measure again",
     )
 
 
