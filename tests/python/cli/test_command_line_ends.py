@@ -90,7 +90,10 @@ def test_a_folder_without_a_case_is_named_in_full(tmp_path, monkeypatch, capsys)
 def test_a_folder_with_a_case_stands_for_it(case, monkeypatch, capsys):
     monkeypatch.chdir(case.parent)
     assert main(["doctor", ".", "--json", "-q"]) == 0
-    assert json.loads(capsys.readouterr().out)["case"] == "ellipsoids"
+    report = json.loads(capsys.readouterr().out)
+    assert report["case"] == "ellipsoids"
+    # Nothing is left to segment.
+    assert "not-segmented" not in {finding["code"] for finding in report["findings"]}
 
 
 def test_a_home_folder_that_nobody_has_is_bad_input(tmp_path, capsys):
