@@ -168,7 +168,7 @@ def test_a_moved_segment_without_a_node_is_an_error(tmp_path):
     head.replace("edge_length = 4.0", "edge_length = 12.0")
     head.toml += "\n[region]\nlower = 1475.0\n"
     case = Case.load(head.write(tmp_path))
-    with pytest.raises(cmfsim.CaseError, match=r"'mandible' moves, but no node.*touches-no-tissue"):
+    with pytest.raises(cmfsim.CaseError, match=r"'mandible' moves, but no node.*segment-no-tissue"):
         build_model(case, check=False)
 
 

@@ -574,6 +574,18 @@ def image_case(folder, spacing):
     return head
 
 
+def test_the_command_states_that_it_has_not_segmented_an_image(tmp_path, capsys):
+    path = image_case(tmp_path, 2.5).write(tmp_path)
+    main(["doctor", str(path), "--json", "-q"])
+    (found,) = [
+        f for f in json.loads(capsys.readouterr().out)["findings"] if f["code"] == "not-segmented"
+    ]
+    assert found["severity"] == "note"
+    assert "cmfsim landmarks" in found["fix"]
+    # Of the other commands the work itself follows.
+    assert "not-segmented" not in {f.code for f in cmfsim.diagnose(cmfsim.Case.load(path))}
+
+
 def test_an_image_is_compared_with_its_landmarks_and_its_voxels_are_looked_at(tmp_path):
     """Fine and fitting: nothing; coarse, in another frame, of another patient, damaged: said."""
     head = image_case(tmp_path, 2.5)

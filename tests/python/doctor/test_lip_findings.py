@@ -11,7 +11,9 @@ def found(folder, lips, more=""):
     head = HeadCase()
     head.toml += f"\n[lips]\n{lips}\n{more}"
     findings = cmfsim.diagnose(cmfsim.Case.load(head.write(folder)))
-    return [(f.severity, f.code) for f in findings if f.code.startswith(("lip", "file"))]
+    return [
+        (f.severity, f.code) for f in findings if f.code.startswith(("lip", "file", "landmark-m"))
+    ]
 
 
 def test_lips_that_are_not_asked_for_are_not_checked(tmp_path):

@@ -114,7 +114,7 @@ def test_four_landmarks_are_enough_and_the_others_are_named(template, patient):
     missing = found["template-landmarks-missing"]
     assert missing.startswith("28 of the template's 32 landmarks are missing: ")
     assert missing.endswith("placed by the other 4")
-    assert "4 landmarks: 5 are needed" in found["template-landmarks-missing"]
+    assert "4 landmarks: 5 are needed" in found["template-landmarks-few"]
 
 
 @pytest.mark.parametrize(

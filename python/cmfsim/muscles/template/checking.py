@@ -120,7 +120,6 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             "template-landmarks-missing",
             f"{len(missing)} of the {len(SKULL_LANDMARKS)} usual landmarks are missing: "
             f"{_listed(missing)}",
-            severity="warning",
             where=template.name,
             fix="place them on the skull reference",
         )

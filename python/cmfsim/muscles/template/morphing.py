@@ -211,7 +211,6 @@ def missing_landmarks(
             "template-landmarks-missing",
             f"{len(missing)} of the template's {len(template.landmarks)} landmarks are missing: "
             f"{listed}; muscles are placed by the other {len(used)}",
-            severity="warning",
             where=where,
             why=f"fewer than {FEW_LANDMARKS} landmarks scale and rotate the muscles, but do not "
             "fit their shape"
@@ -228,16 +227,7 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
         left_out = leave_one_out(matched.source, matched.target, matched.names)
     except LandmarkError as error:
         what = f"landmarks cannot be compared with one another: {error}"
-        why = "a misplaced landmark would go unnoticed"
-        finding = Finding(
-            "template-landmarks-missing",
-            what,
-            severity="note",
-            where="landmarks",
-            why=why,
-            fix="place more",
-        )
-        return None, [finding]
+        return None, [Finding("template-landmarks-few", what, where="landmarks")]
     if not left_out.misplaced:
         return left_out, []
     distances = dict(zip(left_out.names, left_out.distances, strict=True))
