@@ -19,12 +19,8 @@ def check_automatic(evidence: Evidence) -> Iterator[Finding]:
         "the region that is meshed",
     ]
     yield Finding(
-        "landmarks-proposed",
+        "landmarks-automatic",
         "the case names no landmarks, so the build will find them; the doctor does not check "
         + ", ".join(left),
         where=case.where("landmarks"),
-        why="items placed from landmarks can be checked only when the landmarks are known; the "
-        "build stops if they are insufficient",
-        fix='run "cmfsim landmarks case.toml" to see them with their expected errors, and '
-        "name its files under [landmarks]; the doctor then checks everything",
     )

@@ -46,6 +46,15 @@ def test_errors_come_first_and_unknown_kinds_are_counted_too():
     assert lines == ["e", "thing lies 12.5 mm off (there); and 1 more of this kind [b]", "n"]
 
 
+def test_different_facts_of_one_code_are_each_stated():
+    """The chin and the forehead have one code; "1 more of this kind" would leave one out."""
+    parts = ["chin cut off by 4 mm", "forehead cut off by 9 mm", "chin cut off by 5 mm"]
+    (group,) = grouped([Finding("ct-cut-off", part, severity="warning") for part in parts])
+    assert group.line == (
+        "forehead cut off by 9 mm; chin cut off by 5 mm; and 1 more of this kind [ct-cut-off]"
+    )
+
+
 def test_warnings_are_printed_once_as_they_come_and_once_at_the_end(capsys):
     notices = Notices(quiet=True)
     notices.add(MUSCLES)

@@ -307,7 +307,9 @@ def test_without_landmarks_a_head_gets_those_that_are_found_and_muscles(head):
     assert case.landmarks.proposed
     assert case.muscles is not None
     assert "cmfsim landmarks case.toml" in text_of(head)
-    assert [f.severity for f in cmfsim.diagnose(case) if f.code == "landmarks-proposed"] == ["note"]
+    assert [f.severity for f in cmfsim.diagnose(case) if f.code == "landmarks-automatic"] == [
+        "note"
+    ]
 
 
 def test_with_landmarks_of_the_skin_alone_muscles_wait_for_those_of_the_skull(head):
