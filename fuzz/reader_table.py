@@ -841,7 +841,12 @@ def _nrrd(data: bytes) -> tuple[tuple[int, ...], int, bool]:
     if fields.get("type") not in BYTES or "byte skip" in fields or "line skip" in fields:
         raise oracles.UndecidedError
     shape = tuple(int(n) for n in fields["sizes"].split())
-    body = gzip.decompress(body) if fields["encoding"] == "gzip" else body
+    if fields["encoding"] == "gzip":
+        # Bytes after the packed voxels are no voxels.
+        reader = zlib.decompressobj(zlib.MAX_WBITS + 16)
+        body = reader.decompress(body)
+        if not reader.eof:
+            raise zlib.error
     return shape, len(body) - 2 * math.prod(shape), upright
 
 

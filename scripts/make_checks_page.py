@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from cmfsim.values.finding_table import FINDING_KINDS
+from cmfsim.values.finding_table import FINDING_KINDS, FORMER_CODES, filled
 
 PAGE = Path(__file__).parents[1] / "docs/checks.md"
 HEAD = """# What is checked
@@ -22,6 +22,14 @@ This page lists every code; `…` stands for names and figures of your case.
 | code | severity | meaning | why it matters | remedy |
 |---|---|---|---|---|
 """
+FORMER = """
+## Former codes
+
+Results that were written with a former code are read with that of today.
+
+| code | formerly |
+|---|---|
+"""
 
 
 def page() -> str:
@@ -30,11 +38,16 @@ def page() -> str:
     for code, kind in sorted(FINDING_KINDS.items()):
         cells = (f"`{code}`", kind.severity, kind.meaning, kind.why, kind.fix)
         rows.append(f"| {' | '.join(_cell(cell) for cell in cells)} |")
-    return f"{HEAD}{chr(10).join(rows)}\n"
+    former: dict[str, list[str]] = {}
+    for old, code in sorted(FORMER_CODES.items()):
+        former.setdefault(code, []).append(f"`{old}`")
+    lines = [f"| `{code}` | {', '.join(olds)} |" for code, olds in sorted(former.items())]
+    return f"{HEAD}{chr(10).join(rows)}\n{FORMER}{chr(10).join(lines)}\n"
 
 
 def _cell(text: str) -> str:
     """A text that a cell of a table can hold."""
+    text = filled(text, {})
     for sign, escaped in (("|", "\\|"), ("<", "&lt;"), ("[", "\\["), ("*", "\\*")):
         text = text.replace(sign, escaped)
     return text

@@ -39,4 +39,5 @@ mod registration {
 mod statics {
     mod agreement;
     mod error_estimate;
+    mod hinged_body;
 }

@@ -289,14 +289,11 @@ def _names_of_cut(procedure: Procedure, cut: Cut, pieces: Iterable[str]) -> tupl
 
 
 def _jaws_joined(kind: str, segment: str) -> Finding:
-    return Finding.warning(
+    return Finding(
         "cut-of-joined-jaws",
         f"{segment!r} is cut from a skull whose jaws are not separated; it ends at the edges of "
         "the upper teeth, and all bone below stays where it is",
         where=kind,
-        why="the lower jaw is not there as a bone of its own: teeth in contact may be divided some "
-        "millimetres off, and tissue over the lower jaw cannot follow a motion of it",
-        fix="place landmarks of both tooth rows, or give surfaces of both bones",
     )
 
 
@@ -305,22 +302,22 @@ def _fragment_findings(
 ) -> Iterator[Finding]:
     """Findings about the fragments of the first of two segments, by their volumes in mm³."""
     if moved:
-        yield Finding.note(
-            "osteotomy-crumbs",
+        yield Finding(
+            "osteotomy-parts",
             f"fragments that the cut separated from {names[0]!r}: {len(moved)}, "
             f"{sum(moved):.0f} mm³ in all; they stay with {names[1]!r}",
+            severity="note",
             where=kind,
             why="they would move with a bone to which they are not connected",
             fix="move the planes, or lower crumb_volume",
         )
     if kept:
-        yield Finding.warning(
+        yield Finding(
             "osteotomy-parts",
             f"{names[0]!r} has {len(kept) + 1} disconnected parts; the volumes of the smaller "
             f"ones are {', '.join(f'{volume:.0f}' for volume in kept)} mm³",
+            severity="warning",
             where=kind,
-            why="disconnected parts move together as one segment",
-            fix="check the picture of the segments; move the planes",
         )
 
 

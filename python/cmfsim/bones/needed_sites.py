@@ -102,13 +102,11 @@ def with_missing_sites(
 
 
 def _estimated(kind: str, missing: Sequence[str], count: int) -> Finding:
-    return Finding.warning(
+    return Finding(
         "cut-site-estimated",
         f"{kind} is placed with {', '.join(missing)} estimated from {count} other landmarks and an "
         "average head",
         where=kind,
-        why="the landmarks were not found or placed; the cut may lie some millimetres off",
-        fix="check the cut in the picture, and place these landmarks if the image shows the bone",
     )
 
 

@@ -369,13 +369,11 @@ def _genioplasty(
     findings: tuple[Finding, ...] = ()
     if clearance < wanted:
         findings = (
-            Finding.warning(
+            Finding(
                 "chin-short",
                 f"the chin is {symphysis:.1f} mm high, so the cut passes {clearance:.1f} mm below "
                 f"the estimated roots instead of {wanted:.1f} mm",
                 where="genioplasty",
-                why="the piece is low, and the cut is near the roots",
-                fix="check the cut in the picture; set clearance, or give the plane",
             ),
         )
     front = tip - (LOWER_CANINE_REACH + clearance) * frame.up

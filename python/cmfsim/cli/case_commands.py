@@ -40,6 +40,9 @@ def doctor(options: argparse.Namespace) -> int:
         progress.stage(f"checking {case.name}")
         found = examine(case)
     findings, plan = found.findings, _plan_values(found)
+    if case.image is not None:
+        # Of other commands, the work itself follows.
+        findings = (*findings, Finding("not-segmented", where=case.where("image")))
     if options.json:
         counts = {f"{s}s": sum(f.severity == s for f in findings) for s in SEVERITIES}
         entries = [dataclasses.asdict(finding) for finding in findings]

@@ -126,12 +126,10 @@ def _write(folder: Path, head: ProposedHead, labels: str) -> tuple[list[str], tu
         names.append(PICTURE)
     except CmfsimError as error:
         findings.append(
-            Finding.warning(
+            Finding(
                 "landmarks-no-picture",
                 f"the picture was not drawn: {error}",
                 where=str(folder / PICTURE),
-                why="the landmarks should be checked before they are used",
-                fix="open the files in 3D Slicer together with the head",
             )
         )
     return names, tuple(findings)

@@ -16,7 +16,7 @@ from cmfsim.doctor.automatic_landmarks import check_automatic
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.lips import check_lips
 from cmfsim.doctor.moved_bones import check_moved
-from cmfsim.doctor.operation import check_cuts, check_plan, pieces_of
+from cmfsim.doctor.operation import check_cuts, check_plan, pieces_of, vertices_of
 from cmfsim.doctor.placement import check_placement
 from cmfsim.doctor.plan import state_plan
 from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
@@ -115,7 +115,7 @@ def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examinatio
     # Distances between things in different frames say nothing.
     if not any(finding.severity == "error" for finding in placement):
         pieces = pieces_of(evidence)
-        plan = state_plan(evidence, pieces)
+        plan = state_plan(evidence, vertices_of(evidence))
         findings += check_mesh_size(evidence)
         findings += check_plan(evidence, plan, pieces)
         findings += check_ends(evidence)

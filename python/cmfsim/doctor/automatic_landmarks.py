@@ -19,13 +19,9 @@ def check_automatic(evidence: Evidence) -> Iterator[Finding]:
         *(["the muscles"] if case.muscles is not None else []),
         "the region that is meshed",
     ]
-    yield Finding.note(
+    yield Finding(
         "landmarks-automatic",
         "the build will find the landmarks that the case does not give; the doctor does not check "
         + ", ".join(left),
         where=case.where("landmarks"),
-        why="items placed from landmarks can be checked only when the landmarks are known; the "
-        "build stops if they are insufficient",
-        fix='run "cmfsim landmarks case.toml" to see them with their expected errors, and '
-        "name its files under [landmarks]; the doctor then checks everything",
     )

@@ -155,13 +155,11 @@ def _check_overlap(parts: Sequence[BonePart], joints: Sequence[Floats]) -> Itera
         return
     gain, place, lower, upper = worst
     moving = upper if lower.is_still else lower
-    yield Finding.warning(
+    yield Finding(
         "plan-through-bone",
         f"{lower.name} lies {gain:.1f} mm deeper within {upper.name} than before, at "
         f"{place_text(place)}",
         where=moving.where,
-        why="bone does not pass through bone, nor teeth through teeth: the plan cannot be carried "
-        "out, and the face over it would be wrong",
         fix=_remedy(lower, upper, gain, joints),
     )
 
@@ -234,13 +232,12 @@ def _check_bite(parts: Sequence[BonePart], landmarks: Mapping[str, Floats]) -> I
     moving = lower if upper.is_still else upper
     words = "in front of" if after < 0.0 else "behind"
     was = "in front of" if before < 0.0 else "behind"
-    yield Finding.warning(
+    yield Finding(
         "bite-odd",
         f"the plan takes the lower front teeth from {abs(before):.0f} mm {was} the upper ones to "
         f"{abs(after):.0f} mm {words} them",
         where=moving.where,
-        why="operations on the jaws make bites better; one of the motions is not as it was meant",
-        fix=f"check whether {', or '.join(better)}; nothing to do if this bite is meant",
+        facts={"better": ", or ".join(better)},
     )
 
 
@@ -294,15 +291,11 @@ def _check_joints(joints: Sequence[_Joint]) -> Iterator[Finding]:
     worst = max(joints, key=lambda joint: joint.far, default=None)
     if worst is None or worst.far < LEAVES_JOINT:
         return
-    yield Finding.warning(
+    yield Finding(
         "joint-left",
         f"the joint head of {worst.part.name} at {place_text(worst.before)} leaves its joint by "
         f"{worst.far:.1f} mm",
         where=worst.part.where,
-        why="a jaw that is moved as a whole turns about its joints; what is moved against them is "
-        "cut off first, and the tissue over the angle of the jaw stays",
-        fix='is a sagittal split missing? Add [[osteotomies]] with procedure = "bsso" and move '
-        "mandible_body; otherwise check the motion",
     )
 
 

@@ -237,9 +237,10 @@ def _check_region(case: Case, skull: Mapping[str, Floats], findings: list[Findin
             case.region.plane(skull, 0.0, 0.0)
     except CaseError as error:
         findings.append(
-            Finding.error(
-                "region-unplaced",
+            Finding(
+                "landmark-missing",
                 str(error),
+                severity="error",
                 where=case.where("region.posterior_depth"),
                 why="the face cannot be separated from the rest of the head",
                 fix="place these landmarks, or give posterior_plane",
@@ -254,12 +255,11 @@ def _check_preset(case: Case, findings: list[Finding]) -> None:
         findings += moduli_unusual({"fat": FatModuli.of(case.fat)}, case.where("tissue"))
     if case.fat.kind == "preset" and case.fat.preset not in PRESETS:
         findings.append(
-            Finding.error(
-                "tissue-preset",
+            Finding(
+                "unknown-name",
                 f"preset is {case.fat.preset!r}",
                 where=case.where("tissue.preset"),
-                why="no tissue can be built from this preset",
-                fix=f"use one of: {', '.join(PRESETS)}",
+                facts={"names": ", ".join(PRESETS)},
             )
         )
 
@@ -287,11 +287,10 @@ def _body(
             _ = body.index
     except CmfsimError as error:
         findings.append(
-            Finding.error(
-                "surface-unreadable",
+            Finding(
+                "input-unreadable",
                 str(error),
                 where=where,
-                why="nothing can be built from it",
                 fix="export it again from the program that made it, as STL, PLY, OBJ or VTP",
             )
         )
@@ -309,11 +308,10 @@ def _image(case: Case, findings: list[Finding]) -> ImageData | None:
         found = read_image_file(path, series=case.image.series)
     except (CmfsimError, MemoryError) as error:
         findings.append(
-            Finding.error(
-                "image-unreadable",
+            Finding(
+                "input-unreadable",
                 str(error),
                 where=f"{case.where('image.file')} ({path.name})",
-                why="nothing can be built from it",
                 fix="export the CT series again, as DICOM, NRRD or NIfTI",
             )
         )
@@ -332,8 +330,8 @@ def _transform(
         return read_transform_file(motion.transform, direction=motion.direction, frame=motion.frame)
     except CmfsimError as error:
         findings.append(
-            Finding.error(
-                "transform-unreadable",
+            Finding(
+                "input-unreadable",
                 str(error),
                 where=case.where(f"plan.{name}.transform"),
                 why=f"the motion of {name} is unknown",
@@ -352,8 +350,8 @@ def _landmarks(
         found = read_landmark_file(path, frame=case.landmarks.frame)
     except CmfsimError as error:
         findings.append(
-            Finding.error(
-                "landmarks-unreadable",
+            Finding(
+                "input-unreadable",
                 str(error),
                 where=case.where(key),
                 why="cuts and muscles are placed from landmarks",
@@ -388,7 +386,7 @@ def _check_file(
     if not what:
         return True
     findings.append(
-        Finding.error(
+        Finding(
             "file-missing",
             what,
             where=case.where(key),
@@ -407,11 +405,9 @@ def _check_output(case: Case, findings: list[Finding]) -> None:
         return
     what = "is not writable" if folder.is_dir() else "is a file, not a folder"
     findings.append(
-        Finding.error(
+        Finding(
             "output-not-writable",
             f"{folder} {what}",
             where=case.where("output.folder"),
-            why="the results could not be written at the end of the run",
-            fix="choose another folder, or change its permissions",
         )
     )

@@ -189,27 +189,22 @@ def _off_surface(
         and shift.after <= SHIFT_LEAVES * shift.before
     ):
         yield Finding(
-            severity="error" if shift.size > SHIFT_ERROR else "warning",
-            code="landmarks-shifted",
-            what=f"all {n} landmarks of the {key} lie {shift_text(shift.offset)}: moved back, "
+            "landmarks-shifted",
+            f"all {n} landmarks of the {key} lie {shift_text(shift.offset)}: moved back, "
             "they lie "
             f"{shift.after:.1f} mm from the {surface} on average, now {shift.before:.1f} mm",
+            severity="error" if shift.size > SHIFT_ERROR else "warning",
             where=where,
-            why="a set that is displaced as a whole was placed in another image or frame; every "
-            "cut, muscle or measured point is displaced with it",
-            fix="check that the landmarks were placed in this image (same series, same frame, not "
-            "resampled or aligned since), and export them again",
         )
     elif far.mean() >= MANY and far.sum() > 1:
         yield Finding(
-            severity="error" if median > ANOTHER else "warning",
-            code="landmarks-off",
-            what=f"{int(far.sum())} of {n} landmarks of the {key} lie more than {FAR:g} mm from "
+            "landmarks-off",
+            f"{int(far.sum())} of {n} landmarks of the {key} lie more than {FAR:g} mm from "
             f"the {surface}, and half of them by more than {median:.1f} mm",
+            severity="error" if median > ANOTHER else "warning",
             where=where,
             why="errors of placement do not explain so many: the landmarks belong to another "
             f"patient, scan or frame, or the {surface} is not this patient's",
-            fix="check that both files come from the same patient and the same scan",
         )
     for (name, point), offset, distance in zip(landmarks.items(), offsets, found, strict=True):
         if distance <= FAR:
@@ -220,25 +215,23 @@ def _off_surface(
         else:
             lies = f"lies more than {REACH:g} mm from any {surface}"
         yield Finding(
+            "landmark-far",
+            f"{name} {lies}, at {place_text(point)}",
             severity="error" if distance > TOO_FAR else "warning",
-            code="landmark-far",
-            what=f"{name} {lies}, at {place_text(point)}",
             where=where,
-            why=f"{PLACED_FROM[key]}; a placement error does not exceed {FAR:g} mm",
             fix=AGAIN,
+            facts={"placed": PLACED_FROM[key], "most": FAR},
         )
 
 
 def _swapped(landmarks: Mapping[str, Floats], pair: tuple[str, str], where: str) -> Finding:
     one, other = pair
     apart = float(np.linalg.norm(landmarks[one] - landmarks[other]))
-    return Finding.error(
+    return Finding(
         "landmarks-swapped",
         f"{one} at {place_text(landmarks[one])} and {other} at {place_text(landmarks[other])} "
         f"seem to be swapped: when exchanged, they fit all the others ({apart:.0f} mm apart)",
         where=where,
-        why="each pulls nearby muscles and cuts to the wrong place",
-        fix="swap the two labels, or place both again",
     )
 
 
@@ -270,14 +263,11 @@ def _asymmetric(
             else f"{base}_L and {base}_R deviate from mirror symmetry by {distance:.1f} mm, "
             "judged by the other landmarks"
         )
-        yield Finding.warning(
+        yield Finding(
             "landmark-asymmetric",
             what,
             where=where,
-            why=f"{PLACED_FROM[key]}; overall asymmetry is taken into account, so one of them is "
-            "misplaced or the bone is deformed there",
-            fix="check both sides in 3D Slicer; place it again, or keep it if the bone is "
-            "asymmetric there",
+            facts={"placed": PLACED_FROM[key]},
         )
 
 
@@ -296,7 +286,7 @@ def _disagreeing(key: str, landmarks: Mapping[str, Floats], where: str) -> Itera
         if distances[name] < CLEARLY * distances[agreement.misplaced[0]]:
             continue
         offset = landmarks[name] - agreement.predicted[agreement.names.index(name)]
-        yield Finding.warning(
+        yield Finding(
             "landmark-disagrees",
             f"{name} lies {distances[name]:.1f} mm {direction_text(offset)} where the other "
             "landmarks put it in an average head",

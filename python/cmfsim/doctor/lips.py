@@ -22,17 +22,19 @@ def check_lips(evidence: Evidence) -> Iterator[Finding]:
     if not lips.contact:
         return
     if case.solver.method not in METHODS:
-        yield Finding.error(
-            "lips-method",
+        yield Finding(
+            "lips-contact",
             f"contact of the lips is not solved by method = {case.solver.method!r}",
+            severity="error",
             where=case.where("solver.method"),
             why="the solver would end with an error",
             fix=f"write one of {', '.join(METHODS)}, or contact = false in [lips]",
         )
     if case.node_kinds.get("sliding") is False:
-        yield Finding.warning(
-            "lips-attached",
+        yield Finding(
+            "lips-contact",
             "contact of the lips is enabled, but tissue does not slide on the teeth",
+            severity="warning",
             where=case.where("node_kinds.sliding"),
             why="the lips stay attached to the teeth and can hardly meet",
             fix="remove sliding = false from [node_kinds], or set contact = false in [lips]",
@@ -44,20 +46,21 @@ def check_lips(evidence: Evidence) -> Iterator[Finding]:
     if not missing:
         return
     if lips.seam == "landmarks":
-        yield Finding.error(
-            "lips-landmarks-missing",
+        yield Finding(
+            "landmark-missing",
             f'seam = "landmarks", and the skin landmarks {", ".join(missing)} are missing',
+            severity="error",
             where=case.where("lips.seam"),
             why="the lips would not be separated",
             fix='place them, or set seam = "auto" in [lips]',
         )
         return
-    yield Finding.note(
-        "lips-landmarks-few",
+    yield Finding(
+        "landmark-missing",
         f"the skin landmarks {', '.join(missing)} are missing",
+        severity="note",
         where=case.where("landmarks.skin"),
         why="the line between the lips and the corners of the mouth are then found on the skin "
         "alone and cannot be checked; if the skin shows neither gap nor crease, the lips "
         "are not separated",
-        fix="place them",
     )

@@ -65,12 +65,11 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
     for name, moved in evidence.moved.items():
         where = case.where(f"plan.{name}")
         if isinstance(moved, CmfsimError):
-            yield Finding.error(
+            yield Finding(
                 "moved-not-paired",
                 str(moved),
                 where=where,
                 why=f"the motion of each vertex of {name} is unknown",
-                fix="export the bone before, and the same mesh after the motion",
             )
             continue
         if not isinstance(moved, MovedSurface):
@@ -87,28 +86,20 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             yield from check_against_skin(evidence, name, here, there)
     others = set(evidence.bones) - set(case.plan) if case.surfaces is not None else {""}
     if least and not others and not case.osteotomies and min(least.values()) > STAYS:
-        yield Finding.warning(
+        yield Finding(
             "moved-all",
             f"every bone moves: {', '.join(least)}, by {min(least.values()):.1f} mm at least",
             where=case.where("plan"),
-            why="jaw surgery does not move the skull above the jaws; if the scans are in "
-            "different frames, the whole face would move by the difference",
-            fix="register the post-operative scan to the pre-operative one on the skull "
-            "(register_volumes, icp)",
         )
 
 
 def _remeshed(name: str, where: str, before: SurfaceData, after: SurfaceData) -> Finding:
     """A bone whose vertices cannot be followed: the build finds its motion by its shape."""
-    return Finding.note(
+    return Finding(
         "moved-remeshed",
         f"{name} has {len(after.triangles)} triangles after and {len(before.triangles)} before, "
         "or numbers them differently, so its rigid motion is found by its shape",
         where=where,
-        why="vertices cannot be followed; a bone that was cut into pieces gets the motion of "
-        "its largest piece",
-        fix="nothing to do if the bone is one piece that was segmented or remeshed twice; "
-        "otherwise name each piece",
     )
 
 
@@ -119,8 +110,8 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
     """
     here, there = moved.surface.vertices, moved.moved_vertices
     if _is_mirrored(here, there):
-        yield Finding.error(
-            "moved-mirrored",
+        yield Finding(
+            "moved-not-paired",
             f"{name} is mirrored after the operation relative to before",
             where=where,
             why="no motion mirrors a bone: in one of the files, left and right or another axis "
@@ -130,8 +121,8 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
         return
     scale, along = _edges(moved)
     if along < ALONG:
-        yield Finding.error(
-            "moved-scrambled",
+        yield Finding(
+            "moved-not-paired",
             f"the edges of {name} have other directions after the operation (cosine {along:.2f} "
             "on average, not 1)",
             where=where,
@@ -157,17 +148,19 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
     )
     if unit is not None or scale < LEAST_SCALE:
         between = f": that is {unit[0]} read as {unit[1]}" if unit is not None else ""
-        return Finding.error(
+        return Finding(
             "moved-scaled",
             f"{what}{between}",
+            severity="error",
             where=where,
             why="bone does not grow during an operation: the files have different units, or one "
             "was scaled",
             fix="export both in the unit that the case states",
         )
-    return Finding.warning(
+    return Finding(
         "moved-scaled",
         f"{what}: not close to the ratio of any two units (2.54, 10, 25.4, 100, 1000)",
+        severity="warning",
         where=where,
         why="bone does not grow during an operation, so the calibration or segmentation of the "
         f"scans differs by {abs(scale - 1.0):.1%}; where the shape differs as well, each vertex is "
@@ -214,8 +207,8 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
     moved = np.linalg.norm(there - here, axis=1)
     worst = int(np.argmax(moved))
     if moved[worst] < STILL:
-        yield Finding.warning(
-            "moved-still",
+        yield Finding(
+            "plan-still",
             f"{name} moves by {moved[worst]:.2g} mm at most",
             where=where,
             why="the plan does not move this segment",
@@ -225,15 +218,15 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
     if moved[worst] > FAR:
         turned = np.linalg.norm(here * [-1.0, -1.0, 1.0] - there, axis=1).max() < moved[worst]
         yield Finding(
+            "plan-far",
+            f"{name} moves by up to {moved[worst]:.1f} mm, at {place_text(here[worst])}",
             severity="error" if moved[worst] > TOO_FAR else "warning",
-            code="plan-far",
-            what=f"{name} moves by up to {moved[worst]:.1f} mm, at {place_text(here[worst])}",
             where=where,
-            why=f"ordinary surgery moves bone by at most {FAR:g} mm; tissue would tear",
             fix="one file is in LPS and the other in RAS: export both in one frame"
             if turned
             else "register the post-operative scan to the pre-operative one on the skull, and "
             "check that both files number their vertices in the same order",
+            facts={"most": FAR},
         )
         # What flies off may turn as well: one reason is enough.
         return

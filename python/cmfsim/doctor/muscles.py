@@ -30,8 +30,8 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
     try:
         template = MuscleTemplate.load(given.template)
     except (CmfsimError, OSError) as error:
-        yield Finding.error(
-            "template-unreadable",
+        yield Finding(
+            "input-unreadable",
             str(error),
             where=evidence.case.where("muscles.template"),
             why="muscles cannot be placed without a template",
@@ -50,11 +50,10 @@ def check_muscles(evidence: Evidence) -> Iterator[Finding]:
     try:
         matched = match_landmarks(template.landmarks, evidence.skull_landmarks, required=())
     except CmfsimError as error:
-        yield Finding.error(
-            "muscles-landmarks",
+        yield Finding(
+            "template-landmarks",
             str(error),
             where=where,
-            why="the template cannot be fitted to the patient by these landmarks",
             fix='correct the landmarks; "cmfsim template morph" shows each one\'s error',
         )
         return
@@ -69,12 +68,11 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
     for name in given.moduli.muscles:
         if name not in names:
             close = difflib.get_close_matches(name, names)
-            yield Finding.error(
-                "muscle-moduli-unknown",
+            yield Finding(
+                "unknown-name",
                 f"moduli are given for the muscle {name!r}, which the template does not have",
                 where=case.where(f"muscles.moduli.{name}"),
-                why="they would have no effect",
-                fix=f"use one of: {', '.join(close or names)}",
+                facts={"names": ", ".join(close or names)},
             )
     tissue = case.fat
     if tissue.kind == "preset" and tissue.preset not in PRESETS:
@@ -84,9 +82,10 @@ def _moduli(evidence: Evidence, given: CaseMuscles, template: MuscleTemplate) ->
     try:
         moduli = replace(given.moduli, fat=FatModuli.of(tissue))
     except CmfsimError as error:
-        yield Finding.error(
-            "fat-moduli",
+        yield Finding(
+            "moduli-unusual",
             str(error),
+            severity="error",
             where=case.where("tissue"),
             why="the fat of [tissue] lies between the muscles",
             fix="set young (MPa) to a value that is plausible for fat, or remove [tissue]",

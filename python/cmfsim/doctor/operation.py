@@ -28,7 +28,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of"]
+__all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of", "vertices_of"]
 
 # Depth by which a moved bone may pass the undeformed skin before it is reported, mm: skin goes with
 # the bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
@@ -45,30 +45,23 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
     for number, cut in enumerate(case.osteotomies):
         where = case.where(f"osteotomies.{number}")
         if cut.bone is not None and cut.bone not in available:
-            yield Finding.error(
-                "cut-unknown-bone",
+            yield Finding(
+                "unknown-name",
                 f"the cut is meant for bone {cut.bone!r}",
                 where=where,
                 why="no such bone or segment exists at this point of the list",
-                fix=f"use one of: {', '.join(sorted(available))}",
+                facts={"names": ", ".join(sorted(available))},
             )
         available |= set(cut.segments)
         yield from _check_procedure(evidence, cut, where)
     cut_up = {CUT_UP[p]: cut for cut in case.osteotomies if (p := cut.procedure or "") in CUT_UP}
     if {"le_fort_1", "le_fort_3"} <= {cut.procedure for cut in case.osteotomies}:
-        yield Finding.warning(
-            "cuts-both-le-fort",
-            "Le Fort I and Le Fort III are cut together",
-            where=case.where("osteotomies"),
-            why="a plan needs a motion for both pieces: the maxilla does not follow the midface, "
-            "nor the midface the maxilla",
-            fix="remove the cut that is not meant; if both are, give both segments a motion",
-        )
+        yield Finding("cuts-both-le-fort", where=case.where("osteotomies"))
     for name in case.plan:
         if name in cut_up:
             cut = cut_up[name]
-            yield Finding.error(
-                "plan-unknown-segment",
+            yield Finding(
+                "unknown-name",
                 f"the plan moves {name!r}, which {cut.procedure} cuts into "
                 f"{', '.join(cut.segments)}",
                 where=case.where(f"plan.{name}"),
@@ -76,8 +69,8 @@ def check_cuts(evidence: Evidence) -> Iterator[Finding]:
                 fix=f"write [plan.{cut.segments[0]}] for the piece with the teeth",
             )
         elif name not in available:
-            yield Finding.error(
-                "plan-unknown-segment",
+            yield Finding(
+                "unknown-name",
                 f"the plan moves {name!r}",
                 where=case.where(f"plan.{name}"),
                 why="no bone and no osteotomy of the case has this name",
@@ -97,21 +90,16 @@ def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iter
     try:
         yield from place_procedure(cut.procedure, evidence.skull_landmarks, cut.options).findings
     except LandmarkError as error:
-        yield Finding.error(
+        yield Finding(
             "landmark-missing",
             str(error),
+            severity="error",
             where=where,
             why="standard procedures are placed from skull landmarks",
             fix="add it to the file under [landmarks] skull, or cut by planes",
         )
     except CaseError as error:
-        yield Finding.error(
-            "cut-options",
-            str(error),
-            where=where,
-            why="the cut cannot be placed",
-            fix="correct the option, or remove it",
-        )
+        yield Finding("cut-options", str(error), where=where)
 
 
 def _cuts(evidence: Evidence) -> Iterator[Cut]:
@@ -163,6 +151,19 @@ def _piece(evidence: Evidence, name: str) -> Floats | None:
         if len(own):
             found.append(np.concatenate([own, body.index.closest(own)[1]], axis=1))
     return np.concatenate(found) if found else None
+
+
+def vertices_of(evidence: Evidence) -> dict[str, Floats | None]:
+    """The vertices, (k, 3) mm, of each segment whose motion is a matrix, as far as it has any."""
+    found: dict[str, Floats | None] = dict.fromkeys(evidence.motions)
+    for bone, body in evidence.bones.items():
+        points = body.repaired.vertices
+        owners = _owners(evidence, bone, points)
+        for name, known in found.items():
+            own = points[owners == name]
+            if len(own):
+                found[name] = own if known is None else np.concatenate([known, own])
+    return found
 
 
 def _parts(evidence: Evidence) -> list[BonePart]:
@@ -252,12 +253,11 @@ def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Find
     frame = case.surfaces.frame or _header_frame(case.surfaces.skin)
     if frame == "LPS" or np.allclose(motion_in_lps(matrix, frame), matrix, rtol=0.0, atol=1e-9):
         return
-    yield Finding.warning(
+    yield Finding(
         "plan-frame",
         f"the motion of {name} has no frame and is read as LPS, but the surfaces are in {frame}",
         where=case.where(f"plan.{name}"),
-        why="the other frame reverses forwards and backwards, left and right",
-        fix=f'write frame = "LPS" or frame = "{frame}" next to the numbers of the motion',
+        facts={"frame": frame},
     )
 
 
@@ -296,13 +296,11 @@ def _check_through_skin(
     if depth.max() <= THROUGH_SKIN:
         return
     worst = int(np.argmax(depth))
-    yield Finding.warning(
+    yield Finding(
         "plan-through-skin",
         f"{name} is moved through the undeformed skin, by {depth[worst]:.1f} mm at "
         f"{place_text(moved[through[worst]])}",
         where=evidence.case.where(f"plan.{name}"),
-        why="the tissue over it would be crushed or inverted",
-        fix="check the plan; if the advancement is really that large, solve it in steps",
     )
 
 
@@ -320,10 +318,9 @@ def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Find
             tissue[beside_tissue[inside]] = False
     if tissue.any():
         return
-    yield Finding.error(
+    yield Finding(
         "segment-no-tissue",
         f"{name} touches no soft tissue in the meshed region",
+        severity="error",
         where=evidence.case.where(f"plan.{name}"),
-        why="moving it has no effect",
-        fix="check region (posterior plane, lower, upper), and that the skin encloses it",
     )

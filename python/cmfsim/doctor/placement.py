@@ -85,7 +85,7 @@ def check_placement(evidence: Evidence) -> list[Finding]:
             wrong = list(_check_within_image(evidence, key, landmarks))
         if not wrong:
             wrong = list(_check_directions(evidence, key, landmarks))
-            turned = turned or any(f.code == "frame-turned" for f in wrong)
+            turned |= any(f.code == "frame-turned" and f.severity == "error" for f in wrong)
         if not wrong:
             wrong = list(_check_sides(evidence, key, landmarks))
             if not wrong:
@@ -119,13 +119,12 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
     # In the numbers of the file: if another unit is stated, they may simply be mm.
     numbers = extent / UNITS[stated]
     if low <= numbers <= high:
-        yield Finding.error(
+        yield Finding(
             "surface-units",
             f"the skin is {numbers:.4g} long in the numbers of the file: they look like mm but "
             f"are read as {stated} ({extent:.4g} mm)",
+            severity="error",
             where=evidence.skin.where,
-            why="every length of the case is mm; a head is 110 to 420 mm long",
-            fix='write units = "mm" under [surfaces], or leave units out',
         )
         return
     for name, least, most, factor in OTHER_UNITS:
@@ -135,18 +134,18 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
                 if factor and stated == "mm"
                 else "export the surfaces in mm, or correct units under [surfaces]"
             )
-            yield Finding.error(
+            yield Finding(
                 "surface-units",
                 f"the skin is {extent:.4g} mm long: this looks like {name}, read as {stated}",
+                severity="error",
                 where=evidence.skin.where,
-                why="every length of the case is mm; a head is 110 to 420 mm long",
                 fix=fix,
             )
             return
     yield Finding(
+        "surface-units",
+        f"the skin is {extent:.4g} mm long",
         severity="error" if not 0.5 * low <= extent <= 2.0 * high else "warning",
-        code="surface-size",
-        what=f"the skin is {extent:.4g} mm long",
         where=evidence.skin.where,
         why=f"a head or face is {low:g} to {high:g} mm long",
         fix="check the units, and that the file holds the skin alone",
@@ -164,9 +163,10 @@ def _check_bone_sizes(evidence: Evidence) -> Iterator[Finding]:
         extent = _extent(body.repaired.vertices)
         if BONE_SHARE[0] * skin <= extent <= BONE_SHARE[1] * skin:
             continue
-        yield Finding.error(
+        yield Finding(
             "surface-units",
             f"bone {name} is {extent:.4g} mm long, the skin {skin:.4g} mm",
+            severity="error",
             where=body.where,
             why="all surfaces of a case must have the same units and the same frame",
             fix="export it in the units of the skin",
@@ -206,7 +206,6 @@ def _check_landmark_fit(
     where = evidence.case.where(f"landmarks.{key}")
     surface = "bones" if key == "skull" else "skin"
     what = f"half of the landmarks are more than {median:.0f} mm from the {surface}"
-    why = "cuts, muscles and the region are placed from landmarks"
     tries = {
         "frame": (HALF_TURN, "converted from RAS to LPS"),
         "m": (np.full(3, 1000.0), "read as metres"),
@@ -218,24 +217,17 @@ def _check_landmark_fit(
         fitted = float(np.median(_nearest(bodies, points * factors)))
         if fitted <= LANDMARK_WARNING:
             is_frame = name == "frame"
-            yield Finding.error(
-                "landmark-frame" if is_frame else "landmark-units",
+            yield Finding(
+                "landmark-frame",
                 f"{what}; {done}, {fitted:.1f} mm",
                 where=where,
-                why=why,
                 fix="correct coordinateSystem in the file (LPS or RAS), or frame under "
                 "[surfaces] if it is the surfaces that have the wrong frame"
                 if is_frame
                 else "correct coordinateUnits in the file, or save it again in mm",
             )
             return
-    yield Finding.error(
-        "landmark-frame",
-        what,
-        where=where,
-        why=why,
-        fix="check that landmarks and surfaces are from one patient and in one frame",
-    )
+    yield Finding("landmark-frame", what, where=where)
 
 
 def _check_within_image(
@@ -262,13 +254,12 @@ def _check_within_image(
     names = [name for name, is_wrong in zip(landmarks, wrong, strict=True) if is_wrong]
     more = ", …" if len(names) > 4 else ""
     yield Finding(
-        severity="error" if is_frame or wrong.mean() > ELSEWHERE_SHARE else "warning",
-        code="landmark-frame" if is_frame else "landmark-outside-image",
-        what=f"{len(names)} of {len(landmarks)} landmarks lie outside the image"
+        "landmark-frame" if is_frame else "landmark-outside-image",
+        f"{len(names)} of {len(landmarks)} landmarks lie outside the image"
         + (f", converted from RAS to LPS {int(turned.sum())}" if is_frame else "")
         + f": {', '.join(names[:4])}{more}",
+        severity="error" if is_frame or wrong.mean() > ELSEWHERE_SHARE else "warning",
         where=evidence.case.where(f"landmarks.{key}"),
-        why="cuts, muscles and the region are placed from landmarks",
         fix="correct coordinateSystem in the file (LPS or RAS)"
         if is_frame
         else "check that landmarks and image are from one patient, and that the scan is complete",
@@ -316,19 +307,18 @@ def _check_directions(
         for axis, v in enumerate((left, back, up))
     ]
     where = evidence.case.where(f"landmarks.{key}")
-    why = "left and right, front and back would be swapped"
     if signs[0] < 0 and signs[1] < 0:
-        yield Finding.error(
+        yield Finding(
             "frame-turned",
             "the face looks towards +P and its left side lies towards R: these are RAS coordinates "
             "read as LPS",
+            severity="error",
             where=where,
-            why=why,
             fix='state the frame: "coordinateSystem": "RAS" in the file, and frame = "RAS" under '
             "[surfaces] if the surfaces are in it as well",
         )
     elif signs[0] < 0:
-        yield Finding.error(
+        yield Finding(
             "left-right-swapped",
             f"of {len(pairs)} pairs of landmarks, the left ones are on the right (R) side",
             where=where,
@@ -339,18 +329,17 @@ def _check_directions(
         )
     elif signs[1] < 0 or signs[2] < 0:
         what = "the face looks backwards" if signs[1] < 0 else "the head is upside down"
-        yield Finding.error(
+        yield Finding(
             "frame-turned",
             f"according to its landmarks, {what}",
+            severity="error",
             where=where,
-            why=why,
-            fix="check the axes of the program that wrote the files: LPS is left, posterior, "
-            "superior",
         )
     elif any(v is not None and s == 0 for v, s in zip((left, back, up), signs, strict=True)):
-        yield Finding.warning(
-            "frame-tilted",
+        yield Finding(
+            "frame-turned",
             "according to its landmarks, the head is rotated by more than 60° from the axes",
+            severity="warning",
             where=where,
             why="default planes are placed along the axes",
             fix="rotate the data upright, or give posterior_plane and the planes of the cuts",
@@ -363,12 +352,10 @@ def _check_sides(
     wrong = wrong_sides(landmarks)
     if wrong:
         names = ", ".join(wrong)
-        yield Finding.error(
-            "landmark-pair-swapped",
+        yield Finding(
+            "left-right-swapped",
             f"left and right are swapped in: {names}",
             where=evidence.case.where(f"landmarks.{key}"),
-            why="cuts and muscles would be placed on the wrong side",
-            fix="swap the labels _L and _R of these points",
         )
 
 
@@ -417,7 +404,7 @@ def _check_bone_directions(evidence: Evidence) -> Iterator[Finding]:
     margin = 0.05 * (highest - lowest)
     if away[1] > margin[1] or away[2] > margin[2]:
         direction = "behind" if away[1] > margin[1] else "above"
-        yield Finding.error(
+        yield Finding(
             "surface-frame",
             f"the mandible lies {direction} the middle of the cranium",
             where=mandible.where,
@@ -442,10 +429,11 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
     depth[outside] = np.linalg.norm(closest - points[outside], axis=1)
     share = float(outside.mean())
     if share > ELSEWHERE_SHARE and (thickness := _shell_thickness(skin, body)) is not None:
-        yield Finding.error(
+        yield Finding(
             INNER_WALL,
             f"{share:.0%} of bone {name} lies outside the skin, which is a shell some "
             f"{thickness:.0f} mm thick around it: its outer and inner wall are joined",
+            severity="error",
             where=skin.where,
             why="between the bone and the inner wall there would be no tissue",
             fix="export the skin as a solid, its outer wall alone (in 3D Slicer: fill the segment, "
@@ -455,20 +443,18 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
     if share > ELSEWHERE_SHARE:
         turned = float((skin.index.winding_number(points * HALF_TURN) < 0.5).mean())
         is_frame = turned <= FITTING_SHARE
-        yield Finding.error(
-            "surface-frame" if is_frame else "bone-elsewhere",
+        yield Finding(
+            "surface-frame",
             f"{share:.0%} of bone {name} lies outside the skin"
             + (f", converted from RAS to LPS {turned:.0%}" if is_frame else ""),
             where=body.where,
-            why="skin and bones of a case must be in one frame",
-            fix="export skin and bones in the same frame",
         )
         return
     if depth.max() <= THROUGH_SKIN:
         return
     worst = int(np.argmax(depth))
-    yield Finding.warning(
-        "bone-through-skin",
+    yield Finding(
+        "bone-outside-skin",
         f"bone {name} protrudes from the skin by {depth[worst]:.1f} mm at "
         f"{place_text(points[worst])}, with {share:.1%} of its points",
         where=body.where,
@@ -514,12 +500,9 @@ def _check_bone_overlap(evidence: Evidence) -> Iterator[Finding]:
                 continue
             share = float((other.index.winding_number(inner) > 0.5).mean())
             if share > OVERLAP_SHARE:
-                yield Finding.warning(
+                yield Finding(
                     "bone-overlap",
                     f"{share:.0%} of bone {name} lies within bone {other_name}",
                     where=body.where,
-                    why="the case contains the same bone twice; if one copy moves and the other "
-                    "stays, tissue is attached to both",
-                    fix=f"cut {name} out of {other_name}, or remove the file and define the cut "
-                    "in [[osteotomies]]",
+                    facts={"name": name, "other_name": other_name},
                 )

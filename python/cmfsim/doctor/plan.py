@@ -16,7 +16,7 @@ BENT = 0.5
 
 
 def state_plan(
-    evidence: Evidence, pieces: Mapping[str, Floats | None]
+    evidence: Evidence, vertices: Mapping[str, Floats | None]
 ) -> dict[str, ClinicalMotion]:
     """The motion of each segment that the plan names and that can be read, by name.
 
@@ -25,8 +25,8 @@ def state_plan(
     Parameters
     ----------
     evidence : Evidence
-    pieces : mapping of str to (k, 6) float64 or None
-        Points on the surface of a segment, with normals, where known.
+    vertices : mapping of str to (k, 3) float64, mm, or None
+        Of the surface of each segment, where known.
     """
     found: dict[str, ClinicalMotion] = {}
     for name, given in evidence.case.plan.items():
@@ -35,13 +35,12 @@ def state_plan(
             if isinstance(moved, MovedSurface):
                 found |= _of_surface(evidence, name, moved, given.source())
             continue
-        piece = pieces.get(name)
         read = evidence.transforms.get(name)
         found[name] = clinical_motion(
             name,
             evidence.motions[name],
             landmarks=evidence.skull_landmarks,
-            vertices=None if piece is None else piece[:, :3],
+            vertices=vertices.get(name),
             centre=given.centre,
             source=given.source("" if read is None else read.text),
         )

@@ -88,15 +88,11 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
             remedy = "check the unit (mm), frame (LPS or RAS) and direction of the transform"
         yield _too_far(motion, far, remedy)
     elif angle > TINY_TURN[0] and motion.typed and not motion.has_centre:
-        yield Finding.warning(
+        yield Finding(
             "plan-no-centre",
             f"{motion.name} turns by {angle:.1f}° about the origin of the coordinates, for no "
             f"centre is given: the turn moves it by up to {far:.1f} mm",
             where=motion.where,
-            why="a segment is turned about one of its own landmarks; about another point, the same "
-            "angle moves it elsewhere",
-            fix="give centre, such as the place of the upper incisors; centre = [0, 0, 0] if the "
-            "origin is meant",
         )
     yield from check_turn(motion.name, motion.where, angle)
     reach = 0.0 if motion.points is not None else REACH * math.radians(angle)
@@ -105,12 +101,12 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
 
 def _too_far(motion: SizedMotion, far: float, remedy: str) -> Finding:
     return Finding(
+        "plan-far",
+        f"{motion.name} moves by up to {far:.1f} mm",
         severity="error" if far > TOO_FAR else "warning",
-        code="plan-far",
-        what=f"{motion.name} moves by up to {far:.1f} mm",
         where=motion.where,
-        why=f"ordinary surgery moves bone by at most {FAR:g} mm; tissue would tear",
         fix=remedy,
+        facts={"most": FAR},
     )
 
 
@@ -119,72 +115,55 @@ def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
     size = math.hypot(motion.forwards, motion.up, motion.left)
     turn = math.hypot(motion.pitch, motion.yaw, motion.roll)
     if TINY <= size < SMALL and turn < SMALL:
-        yield Finding.warning(
-            "plan-small",
+        yield Finding(
+            "plan-tiny",
             f"{motion.segment} moves by {size:.2g} mm",
             where=where,
-            why="bones are moved by millimetres, and an operation is not more exact than 1 mm",
-            fix=f"check the unit: translations are in mm ({size:.2g} cm would be "
-            f"{10.0 * size:.2g} mm); nothing to do if it is meant",
+            facts={"size": size, "unit": "cm", "larger": 10.0 * size},
         )
     if abs(motion.left) > SIDEWAYS and size < math.sqrt(2.0) * abs(motion.left):
         side = "left" if motion.left > 0.0 else "right"
-        yield Finding.warning(
+        yield Finding(
             "plan-sideways",
             f"{motion.segment} moves {abs(motion.left):.1f} mm to the {side}, which is most of its "
             "motion",
             where=where,
-            why="jaws are moved forwards, back, up or down, and to a side by a few millimetres",
-            fix="check the order of the numbers: to the left, backwards, up (LPS), so 5 mm "
-            "forwards is [0, -5, 0]; nothing to do if it is meant",
         )
 
 
 def nothing_moves(where: str) -> Finding:
     """The warning about a plan that moves no segment."""
-    return Finding.warning(
-        "plan-still",
-        "no segment moves",
-        where=where,
-        why="the predicted face is the face before the operation",
-        fix="give a motion in [plan.SEGMENT], or a file of the planning page by --plan",
-    )
+    return Finding("plan-still", "no segment moves", where=where)
 
 
 def check_turn(name: str, where: str, angle: float) -> Iterator[Finding]:
     """A finding about a turn, in degrees, of more than bone is turned."""
     if angle > TURNED:
         yield Finding(
+            "plan-turned",
+            f"{name} turns by {angle:.1f}°",
             severity="error" if angle > TOO_TURNED else "warning",
-            code="plan-turned",
-            what=f"{name} turns by {angle:.1f}°",
             where=where,
-            why=f"ordinary surgery rotates bone by at most {TURNED:g}°; linear strain creates "
-            "spurious volume",
-            fix="check angle (degrees, not radians) and axis",
+            facts={"most": TURNED},
         )
 
 
 def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Finding]:
     """Findings about a motion of `far` mm at most and a turn, in degrees, that nobody plans."""
     if NOTHING < far < TINY:
-        yield Finding.warning(
+        yield Finding(
             "plan-tiny",
             f"{name} moves by {far:.2g} mm at most",
             where=where,
             why="this is too small to be visible: the prediction equals the face before the "
             "operation",
-            fix=f"check the unit: translations and matrices are in mm ({far:.2g} m would be "
-            f"{1000.0 * far:.2g} mm); if the segment does not move, remove it from the plan",
+            facts={"size": far, "unit": "m", "larger": 1000.0 * far},
         )
     least, most = TINY_TURN
     if least <= angle < most:
-        yield Finding.warning(
+        yield Finding(
             "plan-tiny-angle",
             f"{name} turns by {angle:.2g}°",
             where=where,
-            why=f"operations are not planned that precisely; {angle:.2g} radians would be "
-            f"{math.degrees(angle):.1f}°",
-            fix="check the unit: angles are in degrees; nothing to do if the rotation is "
-            "intended, or was measured",
+            facts={"angle": angle, "degrees": math.degrees(angle)},
         )

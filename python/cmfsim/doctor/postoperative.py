@@ -36,12 +36,11 @@ def check_after(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _unreadable(where: str, error: CmfsimError) -> Finding:
-    return Finding.error(
-        "postoperative-unreadable",
+    return Finding(
+        "input-unreadable",
         str(error),
         where=where,
         why="the prediction cannot be compared with the face after the operation",
-        fix="repair or replace the file",
     )
 
 
@@ -56,13 +55,10 @@ def _check_changed(evidence: Evidence, after: SurfaceData, *, severity: str) -> 
     if here.shape != there.shape or np.abs(here - there).max(initial=0.0) > SAME:
         return
     yield Finding(
+        "postoperative-unchanged",
+        "the face after the operation is the face before, vertex by vertex",
         severity=severity,
-        code="postoperative-unchanged",
-        what="the face after the operation is the face before, vertex by vertex",
         where=case.where("postoperative.skin"),
-        why="the prediction would be compared with a face that was not operated on",
-        fix="give the scan after the operation; if it is right, write verified = true in "
-        "[postoperative]",
     )
 
 
@@ -79,10 +75,11 @@ def _check_landmarks(case: Case, file: Path, skin: SurfaceData) -> Iterator[Find
     far = [n for n, d in zip(places, away, strict=True) if d > LANDMARK_WARNING]
     if far:
         more = ", …" if len(far) > 4 else ""
-        yield Finding.warning(
-            "postoperative-landmarks-off",
+        yield Finding(
+            "landmarks-off",
             f"{len(far)} of {len(away)} landmarks lie more than {LANDMARK_WARNING:g} mm from the "
             f"skin after the operation, {away.max():.1f} mm at most: {', '.join(far[:4])}{more}",
+            severity="warning",
             where=where,
             why="these landmarks decide which points are compared, so their errors would count "
             "as errors of the prediction",

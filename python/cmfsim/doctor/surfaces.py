@@ -32,7 +32,7 @@ def check_image(evidence: Evidence) -> Iterator[Finding]:
     largest = float(np.max(image.spacing))
     if largest > COARSE_SPACING:
         size = " × ".join(f"{s:.2f}" for s in image.spacing)
-        yield Finding.warning(
+        yield Finding(
             "ct-spacing-coarse",
             f"voxels are {size} mm",
             where=evidence.case.where("image.file"),
@@ -68,35 +68,34 @@ def _check_borders(body: Body) -> Iterator[Finding]:
     extent = float((report.highest - report.lowest).max())
     wide = longest.length > WIDE_BORDER * extent
     yield Finding(
-        severity="warning" if wide or body.name != "skin" else "note",
-        code="surface-open",
-        what=f"{len(report.borders)} open borders of {lengths}{more} mm, the longest around "
+        "surface-open",
+        f"{len(report.borders)} open borders of {lengths}{more} mm, the longest around "
         f"{place_text(longest.centre)}",
+        severity="warning" if wide or body.name != "skin" else "note",
         where=body.where,
         why="only a closed surface has an inside and an outside: gaps are capped"
         + (", and the shape of a cap this wide is invented" if wide else ""),
-        fix="check the caps after build; if they are wrong, close the surface yourself",
     )
 
 
 def _check_orientation(body: Body) -> Iterator[Finding]:
     report = body.report
     if report.inconsistent or not report.orientable:
-        yield Finding.warning(
-            "surface-inconsistent",
+        yield Finding(
+            "surface-normals",
             f"{report.inconsistent} edges have triangles that face opposite ways"
             + ("" if report.orientable else "; a part has only one side (Möbius)"),
+            severity="warning",
             where=body.where,
             why="inside and outside differ from place to place; the smaller part is flipped",
-            fix="recompute normals in the program that wrote it",
         )
     elif report.volume < 0.0:
-        yield Finding.warning(
-            "surface-inward",
+        yield Finding(
+            "surface-normals",
             f"normals point inwards (volume {report.volume:.0f} mm³)",
+            severity="warning",
             where=body.where,
             why="inside and outside are swapped; build flips it",
-            fix="flip normals in the program that wrote it",
         )
 
 
@@ -105,37 +104,32 @@ def _check_edges(body: Body) -> Iterator[Finding]:
     report = body.report
     if len(report.non_manifold):
         vertex = body.surface.vertices[report.non_manifold[0, 0]]
-        yield Finding.warning(
+        yield Finding(
             "surface-non-manifold",
             f"{len(report.non_manifold)} edges have more than two triangles, first at "
             f"{place_text(vertex)}",
             where=body.where,
-            why="the surface forks there, so inside and outside are undefined near it",
-            fix="remove inner walls and repeated parts, or remesh it",
         )
 
 
 def _check_crossings(body: Body) -> Iterator[Finding]:
     report = body.report
     if report.crossings is None:
-        yield Finding.warning(
-            "surface-crossings-unknown",
+        yield Finding(
+            "surface-crossing",
             "triangles are too crowded to check for intersections",
+            severity="warning",
             where=body.where,
-            why="intersecting triangles make inside and outside ambiguous",
             fix="remesh it with triangles of about equal size",
         )
     elif len(report.crossings) and report.crossing_points is not None:
         share = len(np.unique(report.crossings)) / max(report.n_triangles, 1)
         yield Finding(
-            severity="warning" if share > CROSSING_SHARE or body.name == "skin" else "note",
-            code="surface-crossing",
-            what=f"{len(report.crossings)} pairs of triangles intersect, first at "
+            "surface-crossing",
+            f"{len(report.crossings)} pairs of triangles intersect, first at "
             f"{place_text(report.crossing_points[0])}",
+            severity="warning" if share > CROSSING_SHARE or body.name == "skin" else "note",
             where=body.where,
-            why="volume enclosed twice counts once, and volume between the folds may count as "
-            "outside",
-            fix="smooth or remesh it there",
         )
 
 
@@ -149,22 +143,21 @@ def _check_pieces(body: Body) -> Iterator[Finding]:
         return
     share = sum(piece.area for piece in solid) / largest.area
     yield Finding(
-        severity="warning" if body.name == "skin" else "note",
-        code="surface-islands",
-        what=f"{len(solid)} pieces besides the largest, with {share:.1%} of its area; the next has "
+        "surface-islands",
+        f"{len(solid)} pieces besides the largest, with {share:.1%} of its area; the next has "
         f"{solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
+        severity="warning" if body.name == "skin" else "note",
         where=body.where,
-        why="debris becomes islands of bone or skin; pieces below 1 % of the largest are dropped",
-        fix="delete the pieces that do not belong to it, or put each bone into a separate file",
     )
 
 
 def _check_triangles(body: Body) -> Iterator[Finding]:
     report = body.report
     if len(report.degenerate) or len(report.duplicate):
-        yield Finding.note(
+        yield Finding(
             "surface-degenerate",
             f"{len(report.degenerate)} triangles without area and {len(report.duplicate)} repeated",
+            severity="note",
             where=body.where,
             why="they have no normal, or their volume counts twice; they are removed",
             fix="nothing to do",
@@ -172,12 +165,11 @@ def _check_triangles(body: Body) -> Iterator[Finding]:
     share = len(report.slivers) / max(report.n_triangles, 1)
     if share > SOME_SLIVERS:
         yield Finding(
-            severity="warning" if share > SLIVER_SHARE else "note",
-            code="surface-slivers",
-            what=f"{len(report.slivers)} of {report.n_triangles} triangles are slivers, over a "
+            "surface-degenerate",
+            f"{len(report.slivers)} of {report.n_triangles} triangles are slivers, over a "
             "hundred times longer than high",
+            severity="warning" if share > SLIVER_SHARE else "note",
             where=body.where,
-            why="their normals are unreliable, which disturbs contact",
             fix="remesh it if tissue slides on it" if share <= SLIVER_SHARE else "remesh it",
         )
 
@@ -198,10 +190,10 @@ def check_mesh_size(evidence: Evidence) -> Iterator[Finding]:
     place = points[int(np.argmin(thickness))]
     refined = case.mesh.refine
     yield Finding(
-        severity="note" if refined else "warning",
-        code="edge-length-coarse",
-        what=f"{thin.mean():.0%} of the skin of the region lies closer to bone than "
+        "edge-length-coarse",
+        f"{thin.mean():.0%} of the skin of the region lies closer to bone than "
         f"an edge of {edge:g} mm, {thickness.min():.1f} mm at {place_text(place)}",
+        severity="note" if refined else "warning",
         where=case.where("mesh.edge_length"),
         why="layers thinner than an edge are lost or too stiff"
         + (" unless refined" if refined else ""),

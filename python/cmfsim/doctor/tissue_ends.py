@@ -40,13 +40,12 @@ def check_ends(evidence: Evidence) -> Iterator[Finding]:
     # A jaw that lies beyond the end altogether is another finding's.
     if room >= NEAR_END or top < end:
         return
-    yield Finding.warning(
+    yield Finding(
         "segment-near-end",
         f"{', '.join(sorted(moving))} moves, and the tissue ends, fixed, {max(room, 0.0):.1f} mm "
         f"below {where} (z = {place:.1f} mm, end at {end:.1f} mm; at least {NEAR_END:g} mm is "
         "needed)",
         where=key,
-        why="tissue below the chin cannot follow: the face there moves too little, or not at all",
         fix=f"{how}, or leave chin and throat out of the evaluation",
     )
 

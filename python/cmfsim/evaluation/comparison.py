@@ -485,23 +485,18 @@ def _findings(
     found = []
     if matches.n_border > MANY_AT_BORDER * n_chosen:
         found.append(
-            Finding.note(
+            Finding(
                 "many-border-matches",
                 f"{matches.n_border} of {n_chosen} vertices are matched to the border of the "
                 "post-operative skin and excluded",
-                why="the scan ends there, or the landmarks map the skin past its end",
-                fix="evaluate only the face with mask='face', or use a mask of the simulated skin",
             )
         )
     folds = warp.folds(places) if warp is not None else None
     if folds is not None and folds.count:
         found.append(
-            Finding.warning(
+            Finding(
                 "correspondence-folds",
                 f"the map between the landmarks folds at {folds.count} of {n_chosen} vertices",
-                why="points that are paired there do not correspond anatomically",
-                fix="check the landmarks: one may be swapped with another, or placed at a "
-                "different point of the face",
             )
         )
     return found

@@ -224,14 +224,10 @@ def _finding(thing: _Thing) -> Finding:
     size = " × ".join(f"{length:.0f}" for length in thing.size)
     volume = f", {thing.volume / 1000.0:.1f} cm³" if thing.volume else ""
     x, y, z = thing.middle
-    return Finding.warning(
+    return Finding(
         "skin-attachment",
         f"something protrudes from the face, {thing.kind}: {size} mm{volume}",
         where=f"skin at ({x:.0f}, {y:.0f}, {z:.0f}) mm",
-        why="a tube, a holder, a pad or tape on the face is treated as skin: it is moved and "
-        "compared as skin",
-        fix="check it in the image; erase it there (air, −1000 HU), or exclude that part of the "
-        "face from the evaluation",
     )
 
 

@@ -121,14 +121,11 @@ def _without_islands(
     findings = []
     if dropped > options.island:
         findings.append(
-            Finding.note(
+            Finding(
                 "bone-islands",
                 f"{len(sizes) - 1 - np.count_nonzero(kept)} pieces of bone below "
                 f"{options.island:g} mm³ each, {dropped / 1000.0:.1f} cm³ together, were dropped",
                 where="bone",
-                why="they are thin bone, calcified vessels or noise, and are treated as soft "
-                "tissue",
-                fix="lower bone_threshold or island if a wanted piece is missing",
             )
         )
     return kept_mask, findings

@@ -45,20 +45,17 @@ def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
     away = (np.argwhere(beyond).mean(axis=0) - np.argwhere(cavity).mean(axis=0)) * spacing
     findings = []
     if away[2] > LEAST_OFFSET:
-        findings.append(_turned("ct-upside-down", "the head is upside down"))
+        findings.append(_turned("the head is upside down"))
     if away[1] > LEAST_OFFSET:
-        findings.append(_turned("ct-facing-back", "the face points backwards (+y, posterior)"))
+        findings.append(_turned("the face points backwards (+y, posterior)"))
     return tuple(findings)
 
 
-def _turned(code: str, what: str) -> Finding:
-    return Finding.error(
-        code,
+def _turned(what: str) -> Finding:
+    return Finding(
+        "ct-flipped",
         f"{what}: the image is flipped, or its header is wrong",
         where="image",
-        why="front and back, or up and down, would be swapped; left and right may be swapped as "
-        "well, but an image cannot show that",
-        fix="export the image again with its orientation, and check left and right",
     )
 
 
@@ -69,19 +66,13 @@ def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     front = float(np.count_nonzero(skin.mask[:, 0]) * x * z)
     if work.border[0, 1] and front > CUT_SKIN:
         findings.append(
-            _missing(
-                "ct-cut-front", "nose or face", f"skin meets the front border over {front:.0f} mm²"
-            )
+            _missing("front", "nose or face", f"skin meets the front border over {front:.0f} mm²")
         )
     for side, layer, begin in (("right", 0, 0), ("left", -1, 1)):
         area = float(np.count_nonzero(skin.mask[layer]) * y * z)
         if work.border[begin, 0] and area > CUT_SKIN:
             findings.append(
-                _missing(
-                    "ct-cut-right" if begin == 0 else "ct-cut-left",
-                    f"{side} side",
-                    f"skin meets the border over {area:.0f} mm²",
-                )
+                _missing(side, f"{side} side", f"skin meets the border over {area:.0f} mm²")
             )
     top = float(np.count_nonzero(bone.solid[:, :, -1]) * x * y)
     if work.border[1, 2] and top > CUT_BONE:
@@ -89,9 +80,7 @@ def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     chin = _chin_area(work, bone, skin)
     if work.border[0, 2] and chin > CUT_BONE:
         findings.append(
-            _missing(
-                "ct-cut-bottom", "chin", f"bone of the jaw meets the border over {chin:.0f} mm²"
-            )
+            _missing("bottom", "chin", f"bone of the jaw meets the border over {chin:.0f} mm²")
         )
     return findings
 
@@ -113,10 +102,11 @@ def _round(work: Working, skin: Skin) -> list[Finding]:
     if area < CUT_SKIN:
         return []
     return [
-        Finding.warning(
-            "ct-cut-round",
+        Finding(
+            "ct-cut-off",
             f"the head extends beyond the round field of view, {2.0 * work.field.radii.min():.0f} "
             f"mm across: skin or tissue meets its border over {area / 100.0:.0f} cm²",
+            severity="warning",
             where="border of the field of view",
             why="the surface is closed there, and values near the border are too high",
             fix="plan and evaluate only well inside the field, or use a scan of the whole head",
@@ -132,12 +122,14 @@ def _top(bone: Bone, area: float) -> Finding:
     per_layer = bone.mask.sum(axis=(0, 1))
     what = f"bone of the skull meets the border over {area:.0f} mm²"
     if bone.cavity is None or per_layer[-1] > 0.75 * per_layer.max():
-        return _missing("ct-cut-top", "forehead", what)
-    return Finding.note(
-        "ct-cut-vertex",
+        return _missing("top", "forehead", what)
+    return Finding(
+        "ct-cut-off",
         f"the vertex is cut off: {what}",
+        severity="note",
         where="top border of the image",
         why="the skull is closed by a flat surface there; the face is not affected",
+        fix="nothing to do",
     )
 
 
@@ -148,11 +140,10 @@ def _chin_area(work: Working, bone: Bone, skin: Skin) -> float:
     return float(np.count_nonzero(layer) * work.spacing[0] * work.spacing[1])
 
 
-def _missing(code: str, part: str, what: str) -> Finding:
-    return Finding.warning(
-        code,
+def _missing(border: str, part: str, what: str) -> Finding:
+    return Finding(
+        "ct-cut-off",
         f"{part} cut off: {what}",
-        where=f"{code.removeprefix('ct-cut-')} border of the image",
-        why="the surface is closed by a plane there, and the prediction near it is meaningless",
-        fix="use an image that shows the whole face, or exclude that region from the evaluation",
+        severity="warning",
+        where=f"{border} border of the image",
     )

@@ -58,14 +58,12 @@ def without_cupping(work: Working) -> tuple[Volume, tuple[Finding, ...]]:
     gain = np.float32(SOFT - AIR) / (soft - np.float32(AIR))
     fine = resampled_to(np.asfortranarray(gain), steps, shift, work.hu.shape, work.spacing)
     corrected: Volume = (work.hu - np.float32(AIR)) * fine + np.float32(AIR)
-    finding = Finding.warning(
+    finding = Finding(
         "ct-cupping",
         f"soft tissue is {loss:.0f} HU darker in the middle of the head than near its surface, as "
         "is typical of cone-beam scanners; the values were scaled between air and soft tissue to "
         "compensate",
         where="image",
-        why="a single threshold finds too much bone near the skin and too little in the middle",
-        fix="check the bone visually; a CT from a fan-beam scanner does not have this effect",
     )
     return corrected, (finding,)
 

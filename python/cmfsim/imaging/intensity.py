@@ -226,7 +226,7 @@ def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float,
 
 
 def _not_hu(air: float, soft: float, slope: float, offset: float, error: float) -> Finding:
-    return Finding.warning(
+    return Finding(
         "ct-not-hu",
         f"the image is not in HU: air is at {air:.4g}, soft tissue at {soft:.4g}; converted as "
         f"HU = {slope:.4g}·value {'+' if offset >= 0.0 else '−'} {abs(offset):.4g}, to within "
@@ -255,12 +255,10 @@ def _odd_spread(hu: NDArray[np.float64], air: float, soft: float) -> str:
 
 
 def _unusual(odd: str) -> Finding:
-    return Finding.warning(
+    return Finding(
         "ct-unusual",
         f"the image has air as a CT does, but not the tissue of a living head: {odd}",
         where="image",
-        why="phantoms and cadavers may have other densities: skin and bone may be placed wrongly",
-        fix="check skin and bone visually; set skin_threshold and bone_threshold in [image]",
     )
 
 
@@ -286,12 +284,11 @@ def weak_bone(hu: Volume, threshold: float) -> tuple[Finding, ...]:
     if half >= 0.9 * threshold:
         return ()
     return (
-        Finding.warning(
+        Finding(
             "bone-weak",
             f"compact bone reaches only {compact:.0f} HU, so a threshold of {threshold:g} HU "
             "misses much of it",
             where="image",
-            why="thin bone is lost and the skull gets holes",
-            fix=f"try bone_threshold = {round(half, -1):.0f}",
+            facts={"threshold": round(half, -1)},
         ),
     )

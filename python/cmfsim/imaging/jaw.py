@@ -215,13 +215,10 @@ def _side(mandible: Mask, bone: Mask) -> Volume:
 
 
 def _not_parted(reason: str) -> Finding:
-    return Finding.warning(
+    return Finding(
         "jaws-not-parted",
         f"the mandible could not be separated from the skull: {reason}",
         where="bone",
-        why="mandible and cranium would move together",
-        fix="give skull landmarks (menton, gonion_L, gonion_R, supradentale, infradentale, …) or "
-        "ready surfaces of both bones",
     )
 
 
@@ -237,27 +234,17 @@ def _on_other_jaw(work: Working, given: Mapping[str, Floats]) -> Finding | None:
     room = float(row[0][2] - work.origin[2])
     if room < size * OTHER_JAW[0] + INTO_OTHER_JAW:
         return None
-    return Finding.error(
+    return Finding(
         "sites-on-other-jaw",
         f"no bone lies more than {size * (OTHER_JAW[0] + TO_EDGES):.0f} mm below the landmarks "
         f"supradentale and supra_m2, although the image goes on for {room:.0f} mm below the "
         "upper teeth",
         where="landmarks.skull",
-        why="these landmarks of the upper jaw seem to lie on the lower one: the plan would move "
-        "that",
-        fix="place supradentale, supra_m2_L and supra_m2_R on the upper jaw",
     )
 
 
 def _guessed() -> Finding:
-    return Finding.note(
-        "jaws-parted-by-shape",
-        "the mandible was separated from the skull by shape: the landmarks of both tooth rows are "
-        "not given",
-        where="bone",
-        why="the cut between the tooth rows may be some millimetres off",
-        fix="give skull landmarks",
-    )
+    return Finding("jaws-parted-by-shape", where="bone")
 
 
 def _implausible(mandible: Mask, work: Working) -> str | None:

@@ -104,14 +104,12 @@ def find_metal(work: Working, options: SegmentOptions) -> Metal:
     layers = np.flatnonzero(mask.any(axis=(0, 1)))
     hu, streaked = _corrected(work, mask, layers)
     low, high = (work.origin[2] + work.spacing[2] * layers[i] for i in (0, -1))
-    finding = Finding.warning(
+    finding = Finding(
         "metal",
         f"{int(np.count_nonzero(large))} pieces of metal, "
         f"{np.count_nonzero(mask) * volume / 1000.0:.1f} cm³ above {threshold:.0f} HU, between "
         f"z = {low:.0f} and {high:.0f} mm; " + _streaks_text(work, streaked),
         where="image",
-        why="streaks obscure skin and bone at that height",
-        fix="check lips, cheeks and tooth rows visually",
     )
     return Metal(mask, streaked, hu, (*noticed, finding))
 
@@ -179,19 +177,18 @@ def _threshold(work: Working, options: SegmentOptions) -> tuple[float, tuple[Fin
         return METAL, ()
     sees = cut >= LEAST_SATURATION
     finding = Finding(
-        severity="warning" if cut >= LEAST_WINDOW else "note",
-        code="ct-saturated",
-        what=f"the image is cut off at {work.saturation:.0f} HU, but metal is recognised by "
+        "ct-saturated",
+        f"the image is cut off at {work.saturation:.0f} HU, but metal is recognised by "
         f"{METAL:g} HU"
         + (
             f"; voxels from {cut:.0f} HU on were taken for metal"
             if sees
             else ": metal was not searched for"
         ),
+        severity="warning" if cut >= LEAST_WINDOW else "note",
         where="image",
         why="metal, enamel and dense bone have the same value there"
         + ("" if sees else ", so metal streaks may remain in skin and bone"),
-        fix="export the CT with its whole range of values, or set metal_threshold in [image]",
     )
     return (cut if sees else np.inf), (finding,)
 

@@ -23,13 +23,10 @@ def without_noise(hu: Volume) -> tuple[Volume, tuple[Finding, ...]]:
     sigma = next((sigma for least, sigma in SMOOTHING if noise >= least), 0.0)
     if sigma == 0.0:
         return hu, ()
-    finding = Finding.warning(
+    finding = Finding(
         "ct-noise",
         f"the noise of the image is {noise:.0f} HU in voxels of the working grid; bone was found "
         f"in the image smoothed by a Gaussian of {sigma:g} voxels",
         where="image",
-        why="thin bone, as in the orbits and sinus walls, may be lost, or appear where there is "
-        "none",
-        fix="use a smoother reconstruction (kernel) of the same scan, and check thin bone visually",
     )
     return smoothed(hu, sigma), (finding,) if noise >= REPORTED else ()

@@ -192,13 +192,11 @@ def weak_tissue(hu: Volume, spacing: NDArray[np.float64], threshold: float) -> V
 
 
 def _weak(added: Volume) -> Finding:
-    return Finding.warning(
+    return Finding(
         "skin-weak",
         f"tissue at the front of the face is up to {added.max():.0f} HU too dark for a fixed level "
         "of the skin, which was lowered there",
         where="image",
-        why="nose and lips would lose their surface; it is less accurate there than elsewhere",
-        fix="check nose and lips visually; use a reconstruction with a larger field of view",
     )
 
 
@@ -225,13 +223,10 @@ def _box(
 
 
 def _rest_removed(volume: float) -> Finding:
-    return Finding.note(
+    return Finding(
         "rest-removed",
         f"{volume / 1000.0:.0f} cm³ of couch, pillow or head-rest was removed",
         where="behind or beside the head",
-        why="where it touched the head, the skin comes from the shape of the head, not from the "
-        "image",
-        fix="check the back of the head visually if it matters",
     )
 
 

@@ -190,13 +190,11 @@ def _spacing_findings(spacing: NDArray[np.float64]) -> list[Finding]:
     if spacing.max() <= COARSE_SLICES:
         return []
     return [
-        Finding.warning(
+        Finding(
             "ct-spacing-coarse",
             f"voxels are {' × '.join(f'{s:g}' for s in spacing)} mm",
             where="image",
-            why="thin bone, lips and eyelids are lost between slices more than "
-            f"{COARSE_SLICES:g} mm apart; surfaces are a millimetre less accurate",
-            fix="use the thin-slice reconstruction of the same scan",
+            facts={"most": COARSE_SLICES},
         )
     ]
 
@@ -231,12 +229,11 @@ def _target(
 
 
 def _coarsened(target: NDArray[np.float64], options: SegmentOptions) -> Finding:
-    return Finding.note(
+    return Finding(
         "ct-coarsened",
         f"the head was resampled at {' × '.join(f'{t:.2f}' for t in target)} mm",
         where="image",
-        why=f"a finer grid would have more than most_voxels = {options.most_voxels} voxels",
-        fix="crop the image to the face, or raise most_voxels",
+        facts={"most_voxels": options.most_voxels},
     )
 
 

@@ -220,21 +220,21 @@ def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[
         )
     if damaged:
         findings.append(
-            Finding.warning(
-                "dicom-other-files",
+            Finding(
+                "dicom-skipped",
                 f"skipped {counted(len(damaged), 'file')} in folders below: {damaged[0]}",
+                severity="warning",
                 where=folder.name,
-                why="it may be a slice of this series",
-                fix="copy it again, or remove it",
             )
         )
     missing = [p.name for p in sorted(folder.iterdir()) if p.is_symlink() and not p.exists()]
     if missing:
         findings.append(
-            Finding.warning(
-                "dicom-other-files",
+            Finding(
+                "dicom-skipped",
                 f"skipped {counted(len(missing), 'link')} to files that are not here: "
                 f"{listed(missing)}",
+                severity="warning",
                 where=folder.name,
                 why="slices at the ends of a series are not missed when they are absent",
                 fix="fetch the files (with DataLad: datalad get)",
@@ -242,11 +242,11 @@ def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[
         )
     if others:
         findings.append(
-            Finding.note(
-                "dicom-other-files",
+            Finding(
+                "dicom-skipped",
                 f"skipped {counted(len(others), 'file')} not in DICOM: {listed(others)}",
+                severity="note",
                 where=folder.name,
-                why="a slice whose first bytes are damaged would also be skipped",
             )
         )
     return headers, findings
@@ -282,11 +282,10 @@ def _below_findings(
         return []
     parts = [f"{name} ({n})" for name, n in sorted(places.items())]
     return [
-        Finding.note(
+        Finding(
             "dicom-folders",
             f"images were also read from folders below: {listed(parts)}",
             where=folder.name,
-            why="a series is known by its UID, not by its folder",
         )
     ]
 
@@ -356,12 +355,11 @@ def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Seri
         raise ImageInputError(f"{folder.name}: {several}; {how}: {listed}")
     if len(found) == 1:
         return first, []
-    finding = Finding.warning(
+    finding = Finding(
         "dicom-series",
         f"{len(found)} series in the folder; the largest CT, {first.described()}, was chosen from: "
         f"{listed}",
         where=folder.name,
-        why="another series may be the right one",
         fix=how,
     )
     return first, [finding]

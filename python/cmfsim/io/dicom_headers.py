@@ -16,8 +16,13 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 
-__all__ = ["DicomHeader", "Frame", "Tags", "dicom_header"]
+__all__ = ["SHOWN_INVERTED", "DicomHeader", "Frame", "Tags", "dicom_header"]
 
+# Pixels whose lowest value is shown white (PS3.3 C.7.6.3.1), and the element that states it.
+SHOWN_INVERTED = "MONOCHROME1"
+INVERTED = re.compile(
+    rb"((?:\x28\0\x04\0|\0\x28\0\x04)(?:CS..|\x0c\0\0\0|\0\0\0\x0c))MONOCHROME1", re.DOTALL
+)
 # Elements that are kept, by their tag.
 NAMES: Mapping[int, str] = {
     0x00020010: "transfer_syntax",
@@ -116,11 +121,27 @@ class DicomHeader:
     frames: tuple[Frame, ...] = ()
     odd: tuple[tuple[int, int], ...] = ()
 
-    def without_odd(self) -> bytes:
-        """The file without its private elements of no known kind, which not all readers pass."""
+    def for_reader(self) -> bytes | None:
+        """The file as ITK reads it rightly; None if it does so as it is.
+
+        Private elements of no known kind, which not all readers pass, are left out. Pixels that
+        are shown inverted would be inverted, although that does not concern their values in HU.
+        """
+        inverted = self.text("photometric") == SHOWN_INVERTED
+        if not (self.odd or inverted):
+            return None
         data, ends = self.path.read_bytes(), [0, *(end for _, end in self.odd)]
         starts = [*(start for start, _ in self.odd), len(data)]
-        return b"".join(data[a:b] for a, b in zip(ends, starts, strict=True))
+        data = b"".join(data[a:b] for a, b in zip(ends, starts, strict=True))
+        if not inverted:
+            return data
+        data, count = INVERTED.subn(rb"\1MONOCHROME2", data, count=1)
+        if not count:
+            raise ImageInputError(
+                f"{self.path.name}: {SHOWN_INVERTED} is not found where it is stated: export the "
+                "series again"
+            )
+        return data
 
     @property
     def count(self) -> int:

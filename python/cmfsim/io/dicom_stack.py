@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.child import ReaderError, ReadLimits, read_in_child
-from cmfsim.io.dicom_headers import numbers_of
+from cmfsim.io.dicom_headers import SHOWN_INVERTED, DicomHeader, numbers_of
 from cmfsim.io.dicom_slices import Slice, Stack, counted, is_localizer, listed
 from cmfsim.io.files import utf8_path
 from cmfsim.io.image_grids import aligned, of_slices, turn_of, upright
@@ -86,7 +86,7 @@ def _with_orientations(name: str, slices: list[Slice]) -> tuple[list[Slice], lis
     if not silent or len(stated) != 1 or 2 * len(silent) >= len(slices):
         return slices, []
     tags = {"orientation": stated.pop()}
-    finding = Finding.warning(
+    finding = Finding(
         "field-ignored",
         f"{counted(len(silent), 'slice')} without an orientation were taken to have that of all "
         f"others: {listed([s.name for s in silent])}",
@@ -103,14 +103,11 @@ def _assumed_findings(name: str, stack: Stack) -> list[Finding]:
     if not assumed:
         return []
     return [
-        Finding.warning(
+        Finding(
             "dicom-frames-assumed",
             f"the file states the place of its first frame alone; the {len(stack.slices)} frames "
             f"were placed one after the other along its normal, {assumed}",
             where=name,
-            why="if they run the other way, the head is mirrored: right is left or top is bottom",
-            fix="compare left and right, and the height of the head, with the patient; or export "
-            "the series as one file per slice",
         )
     ]
 
@@ -148,14 +145,14 @@ def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[F
     if not left:
         return groups[0], []
     finding = Finding(
-        severity="note" if not others else "warning",
-        code="dicom-scouts",
-        what=f"skipped {counted(len(left), 'scout')} (localisers, or slices of another "
+        "dicom-skipped",
+        f"skipped {counted(len(left), 'scout')} (localisers, or slices of another "
         "orientation): "
         f"{listed(left)}",
+        severity="note" if not others else "warning",
         where=name,
         why="they show the head from different directions",
-        fix="" if not others else "check that none of these is a slice of the volume",
+        fix="nothing to do" if not others else "",
     )
     return groups[0], [finding]
 
@@ -194,7 +191,7 @@ def _stack(name: str, slices: list[Slice]) -> Stack:
                 f"{name}: the series mixes {what} ({', '.join(sorted(stated))}): keep the slices "
                 "of one volume in the folder"
             )
-    kinds = {s.text("photometric") for s in slices} - {"", "MONOCHROME2"}
+    kinds = {s.text("photometric") for s in slices} - {"", SHOWN_INVERTED, "MONOCHROME2"}
     if kinds:
         raise ImageInputError(
             f"{name}: pixels are {', '.join(kinds)}: a CT has MONOCHROME2, in which more is "
@@ -231,11 +228,12 @@ def _pixels(name: str, stack: Stack) -> NDArray[Any]:
     try:
         if all(s.header.count == 1 and not s.header.frames for s in stack.slices):
             return _of_files(stack, limits)
-        parts = {path: _of_frames(path, limits) for path in files}
+        parts = {s.header.path: s.header for s in stack.slices}
+        frames = {path: _of_frames(header, limits) for path, header in parts.items()}
     except ReaderError as error:
         raise ImageInputError(f"{name}: {error}") from error
     _check_scales(name, stack)
-    return np.stack([parts[s.header.path][s.frame] for s in stack.slices])
+    return np.stack([frames[s.header.path][s.frame] for s in stack.slices])
 
 
 def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
@@ -243,11 +241,7 @@ def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
     with contextlib.ExitStack() as kept:
         folder = kept.enter_context(tempfile.TemporaryDirectory(prefix="cmfsim-dicom-"))
         for k, one in enumerate(stack.slices):
-            path = one.header.path
-            if one.header.odd:
-                path = Path(folder, f"{k}.dcm")
-                path.write_bytes(one.header.without_odd())
-            paths.append(kept.enter_context(utf8_path(path)))
+            paths.append(kept.enter_context(utf8_path(_readable(one.header, folder, f"{k}.dcm"))))
         answer = read_in_child("cmfsim.io.image_reading:read_slices", limits, paths=paths)
     places = np.array(answer.values["places"])
     expected = np.column_stack([stack.positions, np.tile(stack.spacing, (len(paths), 1))])
@@ -262,8 +256,21 @@ def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
     return answer.arrays["values"]
 
 
-def _of_frames(path: Path, limits: ReadLimits) -> NDArray[Any]:
-    with utf8_path(path) as plain:
+def _readable(header: DicomHeader, folder: str, name: str) -> Path:
+    """A file that ITK reads rightly: that of the header, or a copy."""
+    data = header.for_reader()
+    if data is None:
+        return header.path
+    copy = Path(folder, name)
+    copy.write_bytes(data)
+    return copy
+
+
+def _of_frames(header: DicomHeader, limits: ReadLimits) -> NDArray[Any]:
+    with (
+        tempfile.TemporaryDirectory(prefix="cmfsim-dicom-") as folder,
+        utf8_path(_readable(header, folder, "frames.dcm")) as plain,
+    ):
         answer = read_in_child("cmfsim.io.image_reading:read_frames", limits, path=plain)
     values = answer.arrays["values"]
     return values if values.ndim == 3 else values[None]
@@ -302,12 +309,14 @@ def _without_copies(
         copies.append(other.name)
     if not copies:
         return kept, []
-    finding = Finding.note(
-        "dicom-copies",
+    finding = Finding(
+        "dicom-skipped",
         f"skipped {counted(len(copies), 'copy')} of slices with the same place and pixels: "
         f"{listed(copies)}",
+        severity="note",
         where=name,
         why="the image is the same without them",
+        fix="nothing to do",
     )
     return kept, [finding]
 
@@ -344,7 +353,7 @@ def _acquisition_findings(name: str, stack: Stack) -> list[Finding]:
             )
         if low < high:
             return [
-                Finding.warning(
+                Finding(
                     "field-ignored",
                     f"the slices of acquisitions {first} and {second} alternate, and together "
                     "they are evenly spaced: they were taken as one scan",
@@ -459,7 +468,7 @@ def _tilt_findings(
                 f"slices shifted against one another by up to {np.ptp(along, axis=0).max():.1f} mm"
             )
         findings.append(
-            Finding.warning(
+            Finding(
                 "dicom-tilted",
                 f"{what}, resampled by the position of each slice "
                 f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)",
@@ -473,14 +482,11 @@ def _tilt_findings(
         )
     if abs(abs(tilt) - angle) > TILTS_AGREE:
         findings.append(
-            Finding.warning(
-                "dicom-tilt-unclear",
+            Finding(
+                "dicom-tilted",
                 f"the header states a gantry tilt of {tilt:g}°, the positions of the slices one of "
                 f"{angle:.1f}°; the positions were used",
                 where=name,
-                why="if another program wrote the positions without the tilt, the head is sheared",
-                fix="export the original series from the scanner or archive, and check the "
-                "shape of the head visually",
             )
         )
     return findings
@@ -503,46 +509,41 @@ def _whole_heights(stack: Stack) -> str:
 
 def _uneven(name: str, stack: Stack, uneven: list[int]) -> Finding:
     steps = np.diff(stack.heights)
-    return Finding.warning(
+    return Finding(
         "dicom-uneven",
         f"slices are {np.median(steps):.3g} mm apart, from {steps.min():.3g} to "
         f"{steps.max():.3g} mm: {_steps(stack, uneven)}; resampled by their positions",
         where=name,
-        why="shapes are less certain where slices are further apart",
-        fix="use a reconstruction with evenly spaced slices if there is one",
     )
 
 
 def _oblique(name: str, angle: float) -> Finding:
-    return Finding.note(
+    return Finding(
         "image-oblique",
         f"the image's axes are turned by {angle:.1f}° from the patient's; it was resampled",
+        severity="note",
         where=name,
-        why="all stages need a grid along the patient's axes",
     )
 
 
 def _coarse(name: str, gap: float) -> Finding:
-    return Finding.warning(
+    return Finding(
         "ct-spacing-coarse",
         f"slices are {gap:.3g} mm apart",
         where=name,
-        why=f"thin bone, lips and eyelids are lost between slices more than {COARSE_SLICES:g} mm "
-        "apart; surfaces are a millimetre less accurate",
-        fix="use the thin-slice reconstruction of the same scan",
+        facts={"most": COARSE_SLICES},
     )
 
 
 def _rescale_findings(name: str, stack: Stack) -> list[Finding]:
+    findings = []
+    if any(s.text("photometric") == SHOWN_INVERTED for s in stack.slices):
+        what = f"{SHOWN_INVERTED} is ignored: it states that the lowest value is shown white"
+        why = "what is shown follows the rescaling: the values in HU are the same (PS3.3 C.7.6.3.1)"
+        fix = "check that bone is brighter than air in anatomy.png; otherwise export the CT again"
+        findings.append(Finding("field-ignored", what, where=name, why=why, fix=fix))
     kinds = {s.text("rescale_type").upper() for s in stack.slices} - UNSTATED_SCALES
-    if not kinds:
-        return []
-    return [
-        Finding.warning(
-            "dicom-not-hu",
-            f"the header states that values are {', '.join(sorted(kinds))!r}, not HU",
-            where=name,
-            why="thresholds of skin and bone are in HU",
-            fix="check skin and bone visually, or set skin_threshold and bone_threshold",
-        )
-    ]
+    if kinds:
+        what = f"the header states that values are {', '.join(sorted(kinds))!r}, not HU"
+        findings.append(Finding("ct-not-hu", what, where=name))
+    return findings

@@ -29,6 +29,7 @@ __all__ = [
     "MOST_PACKED",
     "MOST_VOXELS",
     "ImageHeader",
+    "PackedVoxels",
     "apart",
     "check_affine",
     "check_length",
@@ -64,6 +65,36 @@ KNOWN = "NRRD, NIfTI, MetaImage or DICOM is needed"
 
 
 @dataclass(frozen=True, eq=False)
+class PackedVoxels:
+    """Voxels that ITK does not unpack, and the header of a file that has them unpacked.
+
+    Attributes
+    ----------
+    header : bytes
+    data : Path
+    start : int
+        Where they begin.
+    packing : str
+        As `check_length` takes it.
+    """
+
+    header: bytes
+    data: Path
+    start: int
+    packing: str
+
+    def write(self, path: Path, needed: int) -> None:
+        """Writes the file with its voxels unpacked, `needed` bytes of them."""
+        reader = _unpacker(self.packing)
+        with self.data.open("rb") as file, path.open("wb") as copy:
+            copy.write(self.header)
+            file.seek(self.start)
+            while not reader.eof and (block := file.read(CHUNK)):
+                copy.write(reader.decompress(block))
+            copy.truncate(len(self.header) + needed)
+
+
+@dataclass(frozen=True, eq=False)
 class ImageHeader:
     """What the header of an image file states.
 
@@ -81,6 +112,8 @@ class ImageHeader:
     scaled : bool
         Whether the affine differs from the reader's for a stated reason: a unit, a choice.
     findings : tuple of Finding
+    packed : PackedVoxels or None
+        Where ITK does not unpack them.
     """
 
     reader: str
@@ -89,6 +122,7 @@ class ImageHeader:
     bytes: int
     scaled: bool = False
     findings: tuple[Finding, ...] = ()
+    packed: PackedVoxels | None = None
 
 
 def check_shape(name: str, size: list[int], components: int = 1) -> None:
@@ -120,20 +154,22 @@ def check_shape(name: str, size: list[int], components: int = 1) -> None:
         )
 
 
-def check_length(name: str, data: Path, start: int, needed: int, packing: str = "") -> None:
-    """Refuses voxels that are fewer or more than their header states, or damaged where packed.
+def check_length(
+    data: Path, start: int, needed: int, layer: int, packing: str = ""
+) -> tuple[Finding, ...]:
+    """A finding on bytes after the voxels; refuses voxels that are fewer, or damaged where packed.
 
     ITK pads what is short, drops what is long, and does not compare checksums.
 
     Parameters
     ----------
-    name : str
-        What errors call the file.
     data : Path
     start : int
         Where the voxels begin.
     needed : int
         Bytes of the voxels, unpacked.
+    layer : int
+        Bytes of one slice: as many more may be slices that the header misses, and are refused.
     packing : str
         "gzip", "zlib" or "bzip2"; empty where they are not packed.
 
@@ -142,46 +178,50 @@ def check_length(name: str, data: Path, start: int, needed: int, packing: str = 
     ImageError
         (also `ValueError`) With both lengths.
     """
-    if not packing:
-        found = data.stat().st_size - start
-    else:
-        found = _unpacked_length(name, data, start, needed, packing)
-    if found == needed:
-        return
-    what = "is cut short" if found < needed else "is longer than its header states"
-    raise ImageInputError(f"{name}: {what}: {found} of {needed} bytes of voxels; copy it again")
+    found, left = data.stat().st_size - start, 0
+    if packing:
+        found, left = _unpacked_length(data, start, needed + layer, packing)
+    if not 0 <= found - needed < layer:
+        what = "is cut short" if found < needed else "is longer than its header states"
+        raise ImageInputError(
+            f"{data.name}: {what}: {found} of {needed} bytes of voxels; copy it again"
+        )
+    left += found - needed
+    if not left:
+        return ()
+    what = f"{left} bytes after its voxels were ignored: they are no slice that its header misses"
+    return (Finding("field-ignored", what, where=data.name),)
 
 
-def _unpacked_length(name: str, data: Path, start: int, needed: int, packing: str) -> int:
-    """The bytes of voxels in a packed file, or a few more than needed where there are more."""
-    if packing == "bzip2":
-        reader: Any = bz2.BZ2Decompressor()
-    else:
-        reader = zlib.decompressobj(zlib.MAX_WBITS + 16 if packing == "gzip" else zlib.MAX_WBITS)
+def _unpacked_length(data: Path, start: int, most: int, packing: str) -> tuple[int, int]:
+    """The bytes of voxels in a packed file, or a few above `most`, and those after its end."""
+    reader = _unpacker(packing)
     found = 0
     try:
         with data.open("rb") as file:
             file.seek(start)
-            while not reader.eof and found <= needed and (block := file.read(CHUNK)):
+            while not reader.eof and found < most and (block := file.read(CHUNK)):
                 # Unpacked by pieces: a block of zeros alone would take a thousand times its size.
                 found += len(reader.decompress(block, CHUNK))
-                while not reader.eof and found <= needed and (more := _rest(reader)):
+                while not reader.eof and found < most and (more := _rest(reader)):
                     found += len(more)
             left = len(reader.unused_data) + len(file.read(CHUNK))
     except (OSError, zlib.error) as error:
         raise ImageInputError(
-            f"{name}: its voxels are damaged ({error}); copy the file again"
+            f"{data.name}: its voxels are damaged ({error}); copy the file again"
         ) from error
-    if reader.eof and left:
+    if found < most and not reader.eof:
         raise ImageInputError(
-            f"{name}: holds {left} bytes or more after the end of its voxels: copy it again"
+            f"{data.name}: is cut short: its voxels are compressed, and the file ends before them; "
+            "copy it again"
         )
-    if found <= needed and not reader.eof:
-        raise ImageInputError(
-            f"{name}: is cut short: its voxels are compressed, and the file ends before them; copy "
-            "it again"
-        )
-    return found
+    return found, left if reader.eof else 0
+
+
+def _unpacker(packing: str) -> Any:
+    if packing == "bzip2":
+        return bz2.BZ2Decompressor()
+    return zlib.decompressobj(zlib.MAX_WBITS + 16 if packing == "gzip" else zlib.MAX_WBITS)
 
 
 def _rest(reader: Any) -> bytes:
@@ -229,9 +269,10 @@ def data_file(path: Path, name: str) -> Path:
 
 def unstated(path: Path, stated: str, how: str) -> Finding:
     """A finding on a file that does not state its frame, and how it would."""
-    return Finding.warning(
-        "image-frame-unstated",
+    return Finding(
+        "frame-unstated",
         f"{stated}: its axes were assumed to be left, posterior and superior",
+        severity="warning",
         where=path.name,
         why="if this is wrong, left and right of the face are swapped, or front and back; left "
         "and right cannot be recognised in an image",

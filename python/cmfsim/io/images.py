@@ -3,6 +3,9 @@
 import glob
 import os
 import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +32,8 @@ __all__ = ["ImageFile", "read_image", "read_image_file", "write_image"]
 SUFFIXES = (".nrrd", ".nii", ".nii.gz", ".mha")
 # Names of files that are no DICOM, whose content is none of their formats.
 OTHER_SUFFIXES = (".nrrd", ".nhdr", ".nii", ".gz", ".mha", ".mhd", ".hdr")
+# The ending of a file that holds header and voxels, by ITK's reader.
+ATTACHED = {"NrrdImageIO": ".nrrd", "MetaImageIO": ".mha"}
 # What tells formats apart.
 FIRST_BYTES = 1024
 # The header as read here and by ITK agree on the place of each corner to this, mm.
@@ -182,7 +187,7 @@ def _read_file(path: Path, header: ImageHeader) -> ImageFile:
     size = max(path.stat().st_size, header.bytes)
     limits = ReadLimits(20.0 + size / 5e6, 4 * 2**30 + COPIES * size)
     try:
-        with utf8_path(path) as plain:
+        with _unpacked(path, header) as readable, utf8_path(readable) as plain:
             task = "cmfsim.io.image_reading:read_volume"
             answer = read_in_child(task, limits, path=plain, reader=header.reader)
     except ReaderError as error:
@@ -204,6 +209,19 @@ def _read_file(path: Path, header: ImageHeader) -> ImageFile:
             "image again"
         )
     return _placed(path, values, affine, header.findings)
+
+
+@contextmanager
+def _unpacked(path: Path, header: ImageHeader) -> Iterator[Path]:
+    """A file that ITK reads: this one, or a copy with its voxels unpacked."""
+    if header.packed is None:
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="cmfsim-unpacked-") as folder:
+        # ITK goes by the ending as well: that of a header alone has its voxels elsewhere.
+        copy = Path(folder, path.name).with_suffix(ATTACHED[header.reader])
+        header.packed.write(copy, header.bytes)
+        yield copy
 
 
 def _placed(
@@ -232,17 +250,18 @@ def _affine_of(place: Any) -> NDArray[np.float64]:
 def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:
     shear = shear_of(affine)
     if shear <= SHEARED:
-        return Finding.note(
+        return Finding(
             "image-oblique",
             f"the image's axes are turned by {turn_of(affine):.1f}° from the patient's; it was "
             "resampled",
+            severity="note",
             where=path.name,
-            why="all stages need a grid along the patient's axes",
         )
-    return Finding.warning(
-        "image-sheared",
+    return Finding(
+        "image-oblique",
         f"the image's axes are {shear:.1f}° from right angles, as in a CT with a tilted gantry; it "
         "was resampled by its stated axes",
+        severity="warning",
         where=path.name,
         why="a program that assumes perpendicular axes would show the head sheared",
         fix="compare the skin with the scan visually",

@@ -171,12 +171,11 @@ def _known_labels(
     if not renamed:
         return labels, []
     more = f" and {len(renamed) - 4} more" if len(renamed) > 4 else ""
-    finding = Finding.note(
+    finding = Finding(
         "landmark-spelling",
         f"{len(renamed)} labels are spelled differently: {', '.join(renamed[:4])}{more}",
         where=where,
         why="the second spelling is used",
-        fix="nothing needs to be done, but a single spelling is easier to find",
     )
     return labels, [finding]
 
@@ -316,9 +315,9 @@ def _landmark_file(
         origin = "as the case says" if given else "the rule of this format"
         findings.append(
             Finding(
+                "frame-unstated",
+                f"the file does not state its frame: read as {chosen}, {origin}",
                 severity="note" if given else "warning",
-                code="landmark-frame-unstated",
-                what=f"the file does not state its frame: read as {chosen}, {origin}",
                 where=path.name,
                 why="reading RAS as LPS rotates the head by 180° about its long axis",
                 fix='state it: "coordinateSystem": "LPS" (.mrk.json), # CoordinateSystem = LPS '
@@ -329,12 +328,10 @@ def _landmark_file(
     if unset:
         names = ", ".join(unset[:5]) + (", …" if len(unset) > 5 else "")
         findings.append(
-            Finding.note(
+            Finding(
                 "landmark-unset",
                 f"{len(unset)} points were never placed and are skipped: {names}",
                 where=path.name,
-                why="items placed from them use their defaults or are refused",
-                fix="place them in 3D Slicer, or delete them",
             )
         )
     placed = MappingProxyType(_by_label(points))

@@ -14,6 +14,7 @@ from cmfsim.io.image_headers import (
     MOST_HEADER,
     MOST_PACKED,
     ImageHeader,
+    PackedVoxels,
     check_affine,
     check_length,
     check_shape,
@@ -21,6 +22,7 @@ from cmfsim.io.image_headers import (
     number,
     whole,
 )
+from cmfsim.values.finding import Finding
 
 __all__ = ["is_meta", "meta_header"]
 
@@ -64,16 +66,30 @@ def meta_header(path: Path) -> ImageHeader:
     if name.upper() != "LOCAL":
         data, start = data_file(path, name), 0
     packed = fields.get("CompressedData", "False").lower() in {"true", "1"}
+    findings: tuple[Finding, ...] = ()
     if fields.get("HeaderSize", "0") == "0":
-        check_length(data.name, data, start, needed, "zlib" if packed else "")
+        layer = sizes[0] * sizes[1] * each
+        findings = check_length(data, start, needed, layer, "zlib" if packed else "")
     elif (found := data.stat().st_size - start) * (MOST_PACKED if packed else 1) < needed:
         raise ImageInputError(
             f"{data.name}: is cut short: {found} of {needed} bytes; copy it again"
         )
+    unpacked = None
+    if packed and data == path and "CompressedDataSize" not in fields:
+        # ITK would take the header for the begin of the voxels.
+        unpacked = _unpacked(path, start)
     size = (sizes[0], sizes[1], sizes[2])
     affine, scaled = _affine(path, fields, axes)
     check_affine(path.name, affine, size)
-    return ImageHeader("MetaImageIO", size, affine, needed, scaled)
+    return ImageHeader("MetaImageIO", size, affine, needed, scaled, findings, unpacked)
+
+
+def _unpacked(path: Path, start: int) -> PackedVoxels:
+    """The voxels of a file, and its header without their packing."""
+    with path.open("rb") as file:
+        text = file.read(start)
+    header = re.sub(rb"(?m)^\s*CompressedData\s*=.*$", b"CompressedData = False", text)
+    return PackedVoxels(header, path, start, "zlib")
 
 
 def _fields(path: Path) -> tuple[dict[str, str], int]:

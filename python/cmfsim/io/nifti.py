@@ -252,7 +252,7 @@ def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> tuple[
 
 
 def _ignored(path: Path, what: tuple[str, ...]) -> Finding:
-    return Finding.warning(
+    return Finding(
         "field-ignored",
         f"ignored: {'; '.join(what)}",
         where=path.name,
@@ -263,12 +263,10 @@ def _ignored(path: Path, what: tuple[str, ...]) -> Finding:
 
 def _no_unit(path: Path, spacing: NDArray[np.float64]) -> Finding:
     text = " × ".join(f"{s:.4g}" for s in spacing)
-    return Finding.note(
+    return Finding(
         "image-unit-unstated",
         f"it states no unit of length: voxels were taken as {text} mm",
         where=path.name,
-        why="every length of the head depends on it",
-        fix="compare a distance in the image with one on the patient, or export with units of mm",
     )
 
 
@@ -305,12 +303,11 @@ def _affine(path: Path, header: _Header) -> tuple[NDArray[np.float64], list[Find
 
 def _template(path: Path, code: int, severity: str, used: str) -> Finding:
     return Finding(
+        "image-template-space",
+        f"its sform (code {code}) leads to the space of a template{used}",
         severity=severity,
-        code="image-template-space",
-        what=f"its sform (code {code}) leads to the space of a template{used}",
         where=path.name,
-        why="lengths in the space of a template differ from those of the patient",
-        fix="" if used else "use the image in the scanner's space",
+        fix="nothing to do" if used else "",
     )
 
 

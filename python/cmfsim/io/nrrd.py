@@ -14,6 +14,7 @@ from cmfsim.io.image_headers import (
     MOST_DIGITS,
     MOST_HEADER,
     ImageHeader,
+    PackedVoxels,
     check_affine,
     check_length,
     check_shape,
@@ -80,12 +81,15 @@ def nrrd_header(path: Path) -> ImageHeader:
     if components:
         check_shape(path.name, sizes[-3:], math.prod(components))
     check_shape(path.name, sizes)
-    _check_data(path, fields, begin, math.prod(sizes) * each)
+    more = _check_data(path, fields, begin, (math.prod(sizes) * each, math.prod(sizes[:2]) * each))
     affine, scaled, findings = nrrd_affine(path, fields, axes)
+    # ITK's reader has no bzip2.
+    packed = _packed(path, fields, begin) if _packing(fields) == "bzip2" else None
     size = (sizes[0], sizes[1], sizes[2])
     if affine is not None:
         check_affine(path.name, affine, size)
-    return ImageHeader("NrrdImageIO", size, affine, math.prod(sizes) * each, scaled, findings)
+    n_bytes = math.prod(sizes) * each
+    return ImageHeader("NrrdImageIO", size, affine, n_bytes, scaled, (*findings, *more), packed)
 
 
 def nrrd_fields(path: Path) -> tuple[dict[str, str], int]:
@@ -113,7 +117,26 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], int]:
     return fields, end
 
 
-def _check_data(path: Path, fields: Mapping[str, str], begin: int, needed: int) -> None:
+def _packing(fields: Mapping[str, str]) -> str | None:
+    return PACKINGS.get(fields.get("encoding", "raw").lower())
+
+
+def _packed(path: Path, fields: Mapping[str, str], begin: int) -> PackedVoxels:
+    """The voxels of a file, and its header without their packing."""
+    with path.open("rb") as file:
+        text = file.read(begin)
+    text = re.sub(rb"(?im)^(encoding|data ?file): .*\n?", b"", text).rstrip()
+    data, start = path, begin
+    if "data file" in fields:
+        data, start = data_file(path, fields["data file"]), 0
+    return PackedVoxels(text + b"\nencoding: raw\n\n", data, start, "bzip2")
+
+
+def _check_data(
+    path: Path, fields: Mapping[str, str], begin: int, lengths: tuple[int, int]
+) -> tuple[Finding, ...]:
+    """Refuses too few bytes of voxels; `lengths` are those of all, and of one slice."""
+    needed, layer = lengths
     skips = False
     for key in ("byte skip", "byteskip", "line skip", "lineskip"):
         if fields.get(key, "0") != "0":
@@ -123,14 +146,15 @@ def _check_data(path: Path, fields: Mapping[str, str], begin: int, needed: int) 
     data, start = path, begin
     if "data file" in fields:
         data, start = data_file(path, fields["data file"]), 0
-    packing = PACKINGS.get(fields.get("encoding", "raw").lower())
+    packing = _packing(fields)
     if packing is not None and not skips:
-        check_length(data.name, data, start, needed, packing)
-    elif packing == "" and data.stat().st_size - start < needed:
+        return check_length(data, start, needed, layer, packing)
+    if packing == "" and data.stat().st_size - start < needed:
         raise ImageInputError(
             f"{data.name}: is cut short: {data.stat().st_size - start} of {needed} bytes; copy it "
             "again"
         )
+    return ()
 
 
 def nrrd_affine(

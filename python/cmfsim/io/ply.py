@@ -139,7 +139,7 @@ def _may_be_a_row(source: "_Binary | _Text", last: _Element, n_vertices: int) ->
 
 
 def _bytes_left(left: str) -> Finding:
-    return Finding.warning(
+    return Finding(
         "field-ignored",
         f"{left} after the last row were ignored: they are no row that its header could have "
         "missed",

@@ -167,7 +167,7 @@ def read_labels(path: Path) -> Segmentation:
     else:
         read = read_image_file(path)
         values, findings = read.image.values, read.findings
-        if any(f.code in {"image-oblique", "image-sheared"} for f in findings):
+        if any(f.code == "image-oblique" for f in findings):
             raise ImageInputError(
                 f"{path.name}: labels on a turned grid are read from NRRD and NIfTI: save it so"
             )

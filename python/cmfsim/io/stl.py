@@ -52,7 +52,7 @@ def read_stl(data: bytes) -> tuple[Floats, tuple[Finding, ...]]:
         )
     if _count(data) == 0 and len(data) > HEADER + 4 and not (len(data) - HEADER - 4) % ROW.itemsize:
         count = (len(data) - HEADER - 4) // ROW.itemsize
-        finding = Finding.warning(
+        finding = Finding(
             "field-ignored",
             f"it states 0 triangles, and has bytes for {count}, which were read",
             why="the program that wrote it did not finish its header, or was stopped",
@@ -61,7 +61,7 @@ def read_stl(data: bytes) -> tuple[Floats, tuple[Finding, ...]]:
         whole = data[:HEADER] + count.to_bytes(4, "little") + data[HEADER + 4 :]
         return _read_binary(whole), (finding,)
     if 0 < (left := len(data) - _length(data)) < ROW.itemsize:
-        finding = Finding.warning(
+        finding = Finding(
             "field-ignored",
             f"{left} bytes after the last triangle were ignored: a triangle takes {ROW.itemsize}",
             why="the file may have been changed after it was written",

@@ -52,7 +52,7 @@ KEYS = (
 MUSCLE_KEYS = ("name", "side", "kind", "file", "boxes", "course", "concepts")
 # File and line at the start of an error's text.
 PLACE = re.compile(r"([^\s:]+(?::\d+)?): (.*)", re.DOTALL)
-MISSING = "template-file-missing"
+MISSING = "file-missing"
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
     if path.is_dir():
         template = _survey_folder(path, gathered)
     else:
-        with gathered.at("template-archive", "create it again"), named(path):
+        with gathered.at("create it again"), named(path):
             template = read_template_archive(path)
     if gathered.has_error:
         template = None
@@ -149,16 +149,16 @@ class _Gathered:
     def has_error(self) -> bool:
         return any(finding.severity == "error" for finding in self.findings)
 
-    def at(self, code: str, fix: str) -> "_Attempt":
+    def at(self, fix: str) -> "_Attempt":
         """A context that turns an error into a finding with its place, and goes on."""
-        return _Attempt(self, code, fix)
+        return _Attempt(self, fix)
 
 
 class _Attempt:
     """The context of `_Gathered.at`."""
 
-    def __init__(self, gathered: _Gathered, code: str, fix: str) -> None:
-        self._gathered, self._code, self._fix = gathered, code, fix
+    def __init__(self, gathered: _Gathered, fix: str) -> None:
+        self._gathered, self._fix = gathered, fix
 
     def __enter__(self) -> None:
         pass
@@ -173,15 +173,10 @@ class _Attempt:
             return False
         found = PLACE.fullmatch(str(error))
         where, what = (found[1], found[2]) if found else (self._gathered.where, str(error))
-        is_missing = isinstance(error, FileNotFoundError)
         self._gathered.findings.append(
-            Finding.error(
-                MISSING if is_missing else self._code,
-                what,
-                where=where,
-                why="the template cannot be used",
-                fix="put the file there, or correct its name" if is_missing else self._fix,
-            )
+            Finding(MISSING, what, where=where)
+            if isinstance(error, FileNotFoundError)
+            else Finding("template-unusable", what, where=where, fix=self._fix)
         )
         return True
 
@@ -193,27 +188,27 @@ def _with_findings(template: TemplateData, findings: list[Finding]) -> TemplateD
 
 def _survey_folder(folder: Path, gathered: _Gathered) -> TemplateData | None:
     table: Table | None = None
-    with gathered.at("template-text", "correct the line"):
+    with gathered.at("correct the line"):
         table = read_tables(folder / TEMPLATE_FILE)
     if table is None:
         return None
     given: dict[str, Any] = {}
-    with gathered.at("template-text", "correct the line"):
+    with gathered.at("correct the line"):
         table.only(*KEYS)
-    with gathered.at("template-format", f'write format = "{TEMPLATE_FORMAT}"'):
+    with gathered.at(f'write format = "{TEMPLATE_FORMAT}"'):
         _check_format(table)
-    with gathered.at("template-licence", 'state its terms of use: licence = "…"'):
+    with gathered.at('state its terms of use: licence = "…"'):
         given["licence"] = table.text("licence")
-    with gathered.at("template-text", "correct the line"):
+    with gathered.at("correct the line"):
         given["name"] = table.text("name")
         given.update({key: table.text(key) for key in ("attribution", "source") if key in table})
     units, frame = "mm", "LPS"
-    with gathered.at("template-text", "correct the line"):
+    with gathered.at("correct the line"):
         units = table.text("units", units, tuple(UNITS))
         frame = table.text("frame", frame, FRAMES)
-    with gathered.at("template-surface", "repair the skull reference"):
+    with gathered.at("repair the skull reference"):
         given["skull"] = _surface(table, "skull", folder, units, frame)
-    with gathered.at("template-landmarks", "correct the landmarks"):
+    with gathered.at("correct the landmarks"):
         landmarks = table.table("landmarks").only("file", "definitions")
         definitions = landmarks.table("definitions")
         given["definitions"] = {name: definitions.text(name) for name in definitions}
@@ -223,16 +218,16 @@ def _survey_folder(folder: Path, gathered: _Gathered) -> TemplateData | None:
     muscles: list[MuscleSurface] = []
     concepts: dict[str, tuple[str, ...]] = {}
     entries: list[Table] = []
-    with gathered.at("template-text", "write [[muscles]] before each muscle"):
+    with gathered.at("write [[muscles]] before each muscle"):
         entries = table.tables("muscles")
     for entry in entries:
-        with gathered.at("template-muscle", "correct this muscle's table or file"):
+        with gathered.at("correct this muscle's table or file"):
             muscle = _muscle(entry, folder, units, frame)
             muscles.append(muscle)
             concepts[muscle.name] = _texts(entry, "concepts")
     if gathered.has_error:
         return None
-    with gathered.at("template-content", "correct the template"):
+    with gathered.at("correct the template"):
         return TemplateData(
             muscles=tuple(muscles), concepts={k: v for k, v in concepts.items() if v}, **given
         )

@@ -141,11 +141,8 @@ def _outside(name: str, bone: ImageData, skin: ImageData) -> Finding | None:
         return None
     volume = count * float(np.prod(bone.spacing))
     place = bone.lowest + np.argwhere(beyond).mean(axis=0) * bone.spacing
-    return Finding.warning(
+    return Finding(
         "bone-outside-skin",
         f"{volume:.0f} mm³ of bone {name!r} lie outside the skin",
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        why="no tissue covers it, so the face cannot be predicted there",
-        fix="check that skin and bone are from one patient and in one frame; if the spine "
-        "protrudes, cut the neck lower",
     )

@@ -96,23 +96,20 @@ def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:
         worst = report.worst[0]
         x, y, z = worst["centroid"]
         findings.append(
-            Finding.warning(
+            Finding(
                 "mesh-poor-tet",
                 f"tet {worst['tet']} has a dihedral angle of {report.min_dihedral:.1f}°",
                 where=f"mesh, at ({x:.1f}, {y:.1f}, {z:.1f}) mm",
-                why="its deformation is inaccurate, and it worsens the conditioning of the system",
-                fix="change edge_length slightly, or set refinements = 0",
             )
         )
     if report.dropped_parts:
         findings.append(
-            Finding.note(
-                "mesh-specks-dropped",
+            Finding(
+                "tissue-not-held",
                 f"{report.dropped_parts} specks of tissue with {report.dropped_volume:.1f} mm³ in "
                 "all were removed",
+                severity="note",
                 where="mesh",
-                why="they are not attached to anything",
-                fix="nothing to do; check the thresholds if a part of the face is missing",
             )
         )
     return tuple(findings)

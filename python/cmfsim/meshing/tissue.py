@@ -184,10 +184,8 @@ def _without_hollows(
     if volume < NOTEWORTHY_HOLLOW:
         return
     place = grid.lowest + np.argwhere(hollow).mean(axis=0) * grid.spacing
-    yield Finding.note(
+    yield Finding(
         "hollow-left-out",
         f"{volume / 1000.0:.1f} cm³ behind bone were removed from the tissue",
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        why="the cranial cavity and closed sinuses do not deform with the face",
-        fix="nothing to do; lower foramen_radius if tissue of the face is missing",
     )

@@ -390,49 +390,43 @@ def _findings(
     ready: Sequence[tuple[Surface, MuscleFibres]],
 ) -> Iterator[Finding]:
     if not volumes:
-        yield Finding.warning(
-            "muscles-none",
-            "no muscle was given, so every tet is fat",
-            why="The tissue is homogeneous and isotropic.",
-        )
+        yield Finding("muscles-none")
     for (name, volume), was_turned, (surface, fibres) in zip(
         volumes.items(), turned, ready, strict=True
     ):
         if was_turned:
-            yield Finding.note(
-                "muscle-inside-out",
+            yield Finding(
+                "surface-repaired",
                 f"the surface of {name} was inside out and has been flipped",
                 where=name,
             )
         if volume.enclosed is None:
-            yield Finding.note(
-                "muscle-open",
+            yield Finding(
+                "surface-open",
                 f"the surface of {name} is not closed: {surface.n_border_edges} border edges",
+                severity="note",
                 where=name,
                 why="Points with a winding number above one half count as inside, which bridges "
                 "holes.",
+                fix="close the surface in the template",
             )
         if volume.inside == 0.0:
-            yield Finding.warning(
+            yield Finding(
                 "muscle-missed",
                 f"{name} contains no sample of any tet",
                 where=name,
-                why="It does not affect the tissue: it lies outside the mesh, or encloses nothing.",
-                fix="Check its frame and that its surface is closed, or use more samples.",
             )
         elif volume.enclosed is not None:
             lost = 1.0 - volume.inside / volume.enclosed
             if lost > LOST_PART and lost * volume.enclosed > 3.0 * volume.error:
-                yield Finding.note(
-                    "muscle-cut-off",
+                yield Finding(
+                    "muscle-does-not-fit",
                     f"{lost:.1%} of {name} lies outside the mesh or in its own overlaps",
                     where=name,
                 )
         if fibres.is_sheet:
-            yield Finding.note(
+            yield Finding(
                 "muscle-sheet",
                 f"{name} is a sheet: second extent {fibres.sheet_ratio:.2f} of the first",
                 where=name,
-                why="The direction of its fibres can hardly be determined from its outline.",
-                fix="Add fibre lines (course) for this muscle.",
             )

@@ -119,11 +119,9 @@ def moduli_findings(moduli: TissueModuli, preset: str, where: str = "") -> Itera
         "{} {:g} along and {:g} across (poisson {:g})".format(name, *m.constants())
         for name, m in named.items()
     ]
-    yield Finding.note(
+    yield Finding(
         "muscle-moduli",
         f"moduli differ from those of {preset}, MPa: {'; '.join(stated)}",
         where=where,
-        why="Displacements depend on the ratios of moduli; the accuracy was measured with those "
-        "of the preset.",
     )
     yield from moduli_unusual({"fat": own.fat, **named}, where)

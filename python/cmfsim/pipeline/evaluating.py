@@ -311,26 +311,14 @@ class _Compared:
 
 
 def _landmarks_unused() -> Finding:
-    return Finding.note(
-        "landmarks-after-unused",
-        "the landmarks of the post-operative face are not used, because the pre-operative ones "
-        "were found automatically",
-        where="postoperative.landmarks",
-        why="Distances are those to the closest point, which ignores skin that slid along "
-        "itself. An error of a proposed landmark would count as an error of the prediction.",
-        fix="Place the skin landmarks before the operation as well, and name the file under "
-        "[landmarks].",
-    )
+    return Finding("landmarks-after-unused", where="postoperative.landmarks")
 
 
 def _not_shown(reason: str) -> Finding:
-    return Finding.note(
+    return Finding(
         "not-operated-none",
         f"the error where nothing was operated on is not known: {reason}",
         where="postoperative",
-        why="Errors of registration, swelling and weight cannot be separated from the error of "
-        "a model.",
-        fix="Use scans that both show the forehead and temples.",
     )
 
 

@@ -22,12 +22,6 @@ DIFFERS, OTHER_FACE = 1.0, 3.0
 # one face differ by 0.15 mm.
 SHOWS, HALF, MOST, UNCHANGED = 1.0, 0.5, 0.95, 0.15
 
-OTHER_WHY = (
-    "another patient's face, or a scan in another frame, gives errors that no model makes: every "
-    "figure of the evaluation includes this difference"
-)
-VERIFIED = "if it is right, write verified = true in [postoperative]"
-
 
 def check_face_after(
     case: Case,
@@ -60,23 +54,18 @@ def check_face_after(
         what = f"by {change:.2f} mm on average, more than any model moves the skin anywhere"
     if differs > (DIFFERS if unmoved is not None else OTHER_FACE):
         yield Finding(
+            "postoperative-other-face",
+            f"the faces before and after the operation differ {what}",
             severity=severity if differs > OTHER_FACE else "warning",
-            code="postoperative-other-face",
-            what=f"the faces before and after the operation differ {what}",
             where=where,
-            why=OTHER_WHY,
-            fix="check that the post-operative file is this patient's and is registered on the "
-            f"skull above the jaws (aligned = false registers it); {VERIFIED}",
         )
     if _is_unchanged(comparison):
         yield Finding(
-            severity=severity,
-            code="postoperative-unchanged",
-            what="the face after the operation is the face before: where the plan moves the skin "
+            "postoperative-unchanged",
+            "the face after the operation is the face before: where the plan moves the skin "
             f"most, they differ by {change:.2f} mm on average",
+            severity=severity,
             where=where,
-            why="the prediction would be compared with a face that was not operated on",
-            fix=f"give the scan after the operation; {VERIFIED}",
         )
 
 

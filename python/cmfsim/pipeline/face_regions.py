@@ -61,23 +61,18 @@ def _proposed(points: Mapping[str, Floats], errors: Mapping[str, float]) -> Face
     if missing:
         return FaceLandmarks({}, (_none(f"{', '.join(missing)} were not found"),))
     worst = max(errors[name] for name in SKIN_LANDMARKS)
-    note = Finding.note(
-        "regions-proposed",
+    note = Finding(
+        "regions-none",
         "regions of the face are placed by proposed landmarks, each with an expected error of "
         f"up to {worst:.1f} mm",
         where="landmarks.skin",
         why="The case has no complete skin landmarks. The borders between regions are equally "
         "uncertain.",
-        fix="Check them with cmfsim landmarks, and save them.",
     )
     return FaceLandmarks({name: points[name] for name in SKIN_LANDMARKS}, (note,))
 
 
 def _none(reason: str) -> Finding:
-    return Finding.note(
-        "regions-none",
-        f"the face is not divided into regions: {reason}",
-        where="landmarks.skin",
-        why="The case has no complete skin landmarks, and none could be proposed.",
-        fix="Place the skin landmarks.",
+    return Finding(
+        "regions-none", f"the face is not divided into regions: {reason}", where="landmarks.skin"
     )

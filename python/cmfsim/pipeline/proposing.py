@@ -257,25 +257,25 @@ def _with_moves(
 
 def _separated_again(apart: Mapping[str, float]) -> Finding:
     name = max(apart, key=lambda site: apart[site])
-    return Finding.note(
+    return Finding(
         "jaws-separated-again",
         "the mandible was separated from the skull by shape, and again by the landmarks found: "
         f"they moved by {np.mean(list(apart.values())):.1f} mm on average, {apart[name]:.1f} mm at "
         f"most ({name})",
+        severity="note",
         where="bone",
-        why="with shape alone, the cut between the tooth rows is some millimetres off",
         fix="place skull landmarks by hand if a millimetre matters",
     )
 
 
 def _not_separated_again() -> Finding:
-    return Finding.warning(
-        "jaws-not-separated-again",
+    return Finding(
+        "jaws-separated-again",
         "the landmarks found separate the jaws less well than shape does: they are inconsistent",
+        severity="warning",
         where="bone",
         why="the cut between the tooth rows may be some millimetres off, and so may the "
         "landmarks of teeth and jaw",
-        fix="place the landmarks of the skull by hand and name the file under [landmarks]",
     )
 
 

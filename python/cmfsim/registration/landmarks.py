@@ -166,12 +166,10 @@ def _spelling(keys: Mapping[str, Mapping[str, str]], shared: Iterable[str]) -> l
     if not different:
         return []
     return [
-        Finding.note(
+        Finding(
             "landmark-spelling",
             f"{len(different)} labels are spelled differently: {_listed(different)}",
             where="landmarks",
-            why="they are treated as the same landmarks",
-            fix="use the same spelling in both files",
         )
     ]
 
@@ -186,11 +184,11 @@ def _extra(keys: Mapping[str, Mapping[str, str]], *, strict: bool) -> list[Findi
         if strict:
             raise LandmarkInputError(f"{what}; add them to the {other} or remove them")
         findings.append(
-            Finding.note(
+            Finding(
                 "landmark-extra",
                 what,
+                severity="note",
                 where=f"landmarks of the {name}",
-                why="they are not used",
                 fix=f"to use them, place them in the {other} as well",
             )
         )

@@ -106,13 +106,9 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
         return 0, None
     worst = int(np.argmin(ratios))
     x, y, z = tensors.mesh.nodes[tensors.mesh.tets[worst]].mean(axis=0)
-    return count, Finding.warning(
+    return count, Finding(
         "inverted-tets",
         f"{count} of {len(ratios)} tets are inverted at equilibrium; the worst is tet {worst}, at "
         f"{ratios[worst]:.2g} of its volume",
         where=f"({x:.1f}, {y:.1f}, {z:.1f}) mm before the operation",
-        why="tissue cannot turn inside out: forces and displacements around these tets are wrong",
-        fix="use a smaller motion, or larger tets where bones squeeze a thin layer; if "
-        'kinematics is "corotational", also try "hyperelastic", which resists inversion '
-        "longer",
     )

@@ -207,9 +207,8 @@ def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:
     A planner's are those about the segment's own centre (paper, Table 2).
     """
     motion = scene.plan[name]
-    surfaces = {segment.name: segment.surface for segment in patient.segments}
     if isinstance(motion, MovedSurface) or np.shape(motion) == (4, 4):
-        vertices = surfaces[name].vertices
+        vertices = patient.segment_vertices(name)
     else:
         vertices = scene.nodes[scene.segments[name].joined]
     clinical = clinical_motion(
@@ -251,9 +250,10 @@ def _lip_findings(patient: PatientModel, model: str) -> list[dict[str, str]]:
     """That separate lips do not touch, in a model without contact."""
     if not patient.lips or model.endswith("+S"):
         return []
-    found = Finding.warning(
-        "lips-without-contact",
+    found = Finding(
+        "lips-contact",
         f"the lips are separate, but model {model} has no contact between them",
+        severity="warning",
         where="[lips]",
         why="each lip follows its teeth, so the lips may pass through each other, which is "
         "impossible if they are one piece",

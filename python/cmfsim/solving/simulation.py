@@ -256,20 +256,17 @@ def _contact_findings(solution: Solution) -> list[dict[str, str]]:
     """That contact stopped above its tolerance, with figures that no face would show."""
     findings = []
     if not solution.contact_converged:
-        found = Finding.warning(
+        found = Finding(
             "contact-stopped",
             f"contact stopped after {solution.contact_iterations} steps with gaps of "
             f"{solution.contact_gap:.1e} mm and nodes {solution.contact_unbalanced:.1e} mm out of "
             "balance",
             where="contact",
-            why="this exceeds the tolerance, but is too small to be visible in the face",
-            fix="allow more contact_iterations or a larger contact_tolerance, or smooth the "
-            "surface",
         )
         findings.append(told(found))
     if not solution.touching_converged:
-        found = Finding.warning(
-            "touching-stopped",
+        found = Finding(
+            "contact-stopped",
             f"one-sided contact stopped after {solution.touching_rounds} rounds with tissue "
             f"{solution.penetration:.1e} mm deep in other tissue or bone",
             where="contact",

@@ -78,14 +78,10 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
         )
     else:
         facts[0] += " in the predicted skin"
-    return Finding.warning(
+    return Finding(
         "skin-torn",
         ", and ".join(facts),
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        why="no skin stretches or folds like this: the face there is wrong, usually because bone "
-        "moves far next to fixed tissue, or because jaws pull lips apart that are one piece",
-        fix="look at the face there and check the plan; next to the end of the tissue, move its "
-        "plane away ([region]); between the lips, set contact = true in [lips]",
     )
 
 

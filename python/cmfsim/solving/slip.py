@@ -71,15 +71,11 @@ def slip_finding(scene: Scene, displacements: ArrayLike) -> Finding | None:
             worst = f"{slip[at]:.1f} mm on {name!r} at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
     if count == 0:
         return None
-    return Finding.warning(
+    return Finding(
         "contact-slipped-far",
         f"{count} sliding {'node' if count == 1 else 'nodes'} slipped further than bones moved, at "
         f"most {worst} before the operation",
         where="contact",
-        why="tissue slipped round an edge of the bone; the plan may have another equilibrium, "
-        "in which the face nearby is different",
-        fix="compare the face nearby with that of a slightly smaller motion, or end the sliding "
-        "region before the edge ([node_kinds])",
     )
 
 

@@ -110,35 +110,31 @@ def repair_surface(
     >>> open_tet = cmfsim.SurfaceData(corners, [[0, 1, 2], [0, 3, 1], [0, 2, 3]])
     >>> closed, findings = cmfsim.repair_surface(open_tet, "tet")
     >>> len(closed.triangles), [finding.code for finding in findings]
-    (4, ['surface-turned', 'surface-closed'])
+    (4, ['surface-repaired', 'surface-open'])
     """
     options = options or RepairOptions()
     findings: list[Finding] = []
 
-    def note(code: str, what: str, why: str) -> None:
-        findings.append(
-            Finding.note(code, what, where=name, why=why, fix="look at the result; nothing to do")
-        )
+    def note(what: str, why: str) -> None:
+        findings.append(Finding("surface-repaired", what, where=name, why=why))
 
     vertices = surface.vertices
     triangles = surface.triangles.astype(np.int64)
     check_extent(vertices)
     vertices, triangles, n_welded = _welded(vertices, triangles, options.weld_distance)
     if n_welded:
-        note(
-            "surface-welded", f"{n_welded} vertices were merged with others", "they concealed edges"
-        )
+        note(f"{n_welded} vertices were merged with others", "they concealed edges")
     triangles, n_flat, n_again = _without_flat(vertices, triangles)
     if n_flat or n_again:
         what = f"{n_flat} triangles without area and {n_again} repeated ones are removed"
-        note("surface-cleaned", what, "they have no normal, or their volume counts twice")
+        note(what, "they have no normal, or their volume counts twice")
     if not len(triangles):
         raise CaseInputError(f"{name}: no triangle with an area is left")
 
     triangles, dropped = _without_debris(vertices, triangles, options.keep_share)
     if dropped:
         what = f"{dropped} small pieces are dropped (below {options.keep_share:.0%} of the largest)"
-        note("surface-debris", what, "debris would become islands of bone or skin")
+        note(what, "debris would become islands of bone or skin")
     triangles, n_turned = _outward(vertices, triangles)
     if options.outer_wall:
         triangles, wall = _without_inner_wall(vertices, triangles)
@@ -146,7 +142,7 @@ def repair_surface(
             findings.append(_wall_finding(name, wall))
     if n_turned:
         what = f"{n_turned} of {len(triangles)} triangles are flipped"
-        note("surface-turned", what, "normals that point inwards swap inside and outside")
+        note(what, "normals that point inwards swap inside and outside")
     if options.close_borders:
         caps = []
         for loop in border_loops(vertices, edges_of(triangles)):
@@ -172,10 +168,9 @@ def _cap_finding(name: str, length: float, centre: Floats, bulge: float) -> Find
     flat = bulge <= FLAT_SHARE * length
     place = ", ".join(f"{x:.1f}" for x in centre)
     return Finding(
+        "surface-open",
+        f"a border of {length:.1f} mm (at most {bulge:.1f} mm from a plane) is closed by a cap",
         severity="note" if flat else "warning",
-        code="surface-closed",
-        what=f"a border of {length:.1f} mm (at most {bulge:.1f} mm from a plane) is closed by a "
-        "cap",
         where=f"{name} at ({place})",
         why="only a closed surface has an inside and an outside"
         + ("" if flat else "; this cap is far from flat, so its shape is only a guess"),
@@ -210,14 +205,12 @@ def _without_inner_wall(vertices: Floats, triangles: Integers) -> tuple[Integers
 
 
 def _wall_finding(name: str, share: float) -> Finding:
-    return Finding.warning(
+    return Finding(
         INNER_WALL,
         f"the {name} has an inner wall, which encloses {share:.0%} of the outer one's volume; the "
         "outer wall alone is used",
+        severity="warning",
         where=name,
-        why="a skin saved as a shell (Hollow tool, threshold of the skin alone) has two walls, and "
-        "bone inside the inner one would lie outside the skin",
-        fix="look at the skin; export it as a solid if the wrong wall was kept",
     )
 
 

@@ -34,9 +34,6 @@ PRINTED = 0.05
 LEAST_TURN = 1e-3
 # A landmark within this of a segment's vertices lies on the segment, mm.
 ON_SEGMENT = 3.0
-# Where teeth or chin are looked for on a surface without landmarks, mm: half the width of the
-# midline strip, and the height of the edge of the segment.
-MIDLINE, EDGE = 10.0, 10.0
 # Where surgeons measure a segment: landmarks (`cmfsim.SKULL_LANDMARKS`), with what lies there.
 INCISORS = ("supradentale", "upper incisors")
 LOWER_INCISORS = ("infradentale", "lower incisors")
@@ -160,8 +157,9 @@ def clinical_motion(
 
     The point is that of the segment's landmark (maxilla and midface: supradentale; mandible and
     mandible_body: infradentale, else pogonion; chin: pogonion, else menton; rami: gonion); without
-    it, a point found on the segment's surface; the middle of the surface for other segments, unless
-    one of these landmarks lies on it; else the centre of the turn.
+    it, the front lower end of the segment's extent (rami: the rear lower one); the middle of its
+    extent for other segments, unless one of these landmarks lies on it; else the centre of the
+    turn.
 
     Parameters
     ----------
@@ -352,34 +350,29 @@ def _reference(
     if points is None or not len(points):
         return None, ""
     if sites:
-        return _guessed(*_on_surface(base, points))
+        return _end(base, points)
     for name, words in dict.fromkeys(site for known in SITES.values() for site in known):
         if name in landmarks:
             place = np.asarray(landmarks[name], dtype=np.float64)
             if np.linalg.norm(points - place, axis=1).min() <= ON_SEGMENT:
                 return place, f"{words} ({name})"
-    return _guessed(points.mean(axis=0), "middle of its surface")
+    return _end(base, points)
 
 
-def _guessed(point: Floats, place: str) -> tuple[Floats, str]:
-    """A point that no landmark names: surfaces of other fineness give another, so it is stated."""
-    return point, f"{place}, a guess at ({', '.join(f'{x:.1f}' for x in point)})"
+def _end(base: str, points: Floats) -> tuple[Floats, str]:
+    """A point at the ends of a segment, where no landmark names one, and in words with its place.
 
-
-def _on_surface(base: str, points: Floats) -> tuple[Floats, str]:
-    """Teeth, chin or angle of a jaw, as far as the shape of its surface tells."""
+    Ends hardly depend on how fine a surface is, so every command states the same point; a vertex
+    that is chosen, or a mean of vertices, would be another on each surface.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    point = 0.5 * (low + high)
+    words = "middle of its extent"
     if base.startswith("ramus"):
-        return points[
-            np.argmax(points[:, 1] - points[:, 2])
-        ], "angle of the mandible (on its surface)"
-    if base == "chin":
-        return points[np.argmin(points[:, 1])], "foremost point of the chin (on its surface)"
-    middle = points[np.abs(points[:, 0] - np.median(points[:, 0])) <= MIDLINE]
-    points = middle if len(middle) else points
-    if base in {"maxilla", "midface"}:
-        edge = points[points[:, 2] <= points[:, 2].min() + EDGE]
-        return edge[np.argmin(edge[:, 1])], "front of its lower edge, where the incisors are"
-    # The front of a mandible in the midline, without its condyles.
-    front = points[points[:, 1] <= points[:, 1].min() + 2.0 * EDGE]
-    edge = front[front[:, 2] >= front[:, 2].max() - EDGE]
-    return edge[np.argmin(edge[:, 1])], "front of its upper edge, where the incisors are"
+        point[1:] = high[1], low[2]
+        words = "rear lower end of its extent, near the angle"
+    elif base in SITES:
+        point[1:] = low[1], low[2]
+        near = "incisors" if base in {"maxilla", "midface"} else "chin"
+        words = f"front lower end of its extent, near the {near}"
+    return point, f"{words}, at ({', '.join(f'{x:.1f}' for x in point)})"

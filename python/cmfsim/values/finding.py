@@ -1,21 +1,29 @@
 """Findings: what a person should know before trusting a case."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, InitVar, dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 from cmfsim.values.checks import as_text, check_one_of
+from cmfsim.values.finding_table import FINDING_KINDS, FORMER_CODES, filled
 
 __all__ = ["SEVERITIES", "Finding", "OnFindings"]
 
 SEVERITIES = ("error", "warning", "note")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Finding:
     """A fact to know before you trust a case.
 
-    `Finding.error`, `Finding.warning` and `Finding.note` make one.
+    Severity, fact, reason and remedy that are not given are those of the code
+    (`cmfsim.values.finding_table`).
+
+    Parameters
+    ----------
+    facts : mapping of str to object, optional
+        What is filled in where the texts of the code have names in braces.
 
     Attributes
     ----------
@@ -32,52 +40,50 @@ class Finding:
     fix : str
         What to do.
 
+    Raises
+    ------
+    ValueError
+        A code that is not in the table without severity or fact; a severity that is not one of
+        `SEVERITIES`.
+
     Examples
     --------
     >>> import cmfsim
-    >>> found = cmfsim.Finding.warning("ct-spacing-coarse", "slices are 5 mm apart", where="head/")
-    >>> found.severity, found.where
-    ('warning', 'head/')
+    >>> found = cmfsim.Finding("dicom-uneven", "slices are 1 to 5 mm apart", where="head/")
+    >>> found.severity, found.where, found.fix
+    ('warning', 'head/', 'use a reconstruction with evenly spaced slices if there is one')
     """
 
-    severity: str
+    severity: str = field(default="", kw_only=True)
     code: str
-    what: str
+    what: str = ""
+    _: KW_ONLY
     where: str = ""
     why: str = ""
     fix: str = ""
+    facts: InitVar[Mapping[str, object]] = MappingProxyType({})
 
-    def __post_init__(self) -> None:
-        check_one_of("severity", self.severity, SEVERITIES)
+    def __post_init__(self, facts: Mapping[str, object]) -> None:
         as_text("finding code", self.code)
+        if (kind := FINDING_KINDS.get(self.code)) is not None:
+            texts = {"what": kind.meaning, "why": kind.why, "fix": kind.fix}
+            for name, text in texts.items():
+                if not getattr(self, name):
+                    object.__setattr__(self, name, filled(text, facts))
+            if not self.severity:
+                object.__setattr__(self, "severity", kind.severity)
+        check_one_of("severity", self.severity, SEVERITIES)
         as_text("finding", self.what)
 
     @classmethod
-    def error(
-        cls, code: str, what: str, *, where: str = "", why: str = "", fix: str = ""
-    ) -> "Finding":
-        """A finding that ends the work."""
-        return cls(severity="error", code=code, what=what, where=where, why=why, fix=fix)
-
-    @classmethod
-    def warning(
-        cls, code: str, what: str, *, where: str = "", why: str = "", fix: str = ""
-    ) -> "Finding":
-        """A finding because of which the result may be wrong."""
-        return cls(severity="warning", code=code, what=what, where=where, why=why, fix=fix)
-
-    @classmethod
-    def note(
-        cls, code: str, what: str, *, where: str = "", why: str = "", fix: str = ""
-    ) -> "Finding":
-        """A finding for information."""
-        return cls(severity="note", code=code, what=what, where=where, why=why, fix=fix)
-
-    @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> "Finding":
-        """The finding stored in a file as plain values; other names in it are ignored."""
+        """The finding stored in a file as plain values; other names in it are ignored.
+
+        A former code becomes the one that is used now.
+        """
         known = ("severity", "code", "what", "where", "why", "fix")
-        return cls(**{name: values[name] for name in known if name in values})
+        given = {name: values[name] for name in known if name in values}
+        return cls(**{**given, "code": FORMER_CODES.get(given["code"], given["code"])})
 
 
 # What is called with new findings as a stage notices them.

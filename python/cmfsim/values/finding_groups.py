@@ -10,19 +10,19 @@ __all__ = ["FindingGroup", "counted", "grouped"]
 
 # What several findings of one code have in common. Others are stated by the worst of them.
 TITLES: Mapping[str, str] = {
-    "muscle-cut-off": "{n} muscles partly outside the tissue",
-    "muscle-does-not-fit": "{n} muscles do not fit into the tissue",
-    "muscle-inside-out": "{n} muscle surfaces were inside out and were flipped",
+    "muscle-does-not-fit": "{n} muscles partly outside the tissue",
     "muscle-missed": "{n} muscles contain no sample of the tissue and do not affect it",
-    "muscle-open": "{n} muscle surfaces are not closed",
-    "muscle-sheet": "{n} muscles are sheets, whose outline hardly determines their fibre direction",
     "muscle-volume-changed": "{n} muscles changed in volume as they were moved into the tissue",
+    "muscle-sheet": "{n} muscles are sheets, whose outline hardly determines their fibre direction",
     "landmark-far": "{n} landmarks are far from their surface",
-    "surface-closed": "{n} surfaces were open and were closed",
     "surface-open": "{n} surfaces are open",
 }
 # A size within the text of a finding: the larger, the worse.
 SIZE = re.compile(r"(\d+(?:[.,]\d+)?)\s?(%|mm\b|°)")
+# What two findings of one wording may differ in.
+FIGURES = re.compile(r"[\d.,−-]+")
+# Findings of one code that state different facts, such as two parts that are cut off, in a line.
+MOST_WORDINGS = 3
 # Characters of a finding's text in a line.
 MOST_TEXT = 300
 
@@ -58,18 +58,24 @@ class FindingGroup:
     def line(self) -> str:
         """What they state, as one line of text; names in it are those of files."""
         worst = self.worst
-        what = worst.what if len(worst.what) <= MOST_TEXT else f"{worst.what[:MOST_TEXT]}…"
-        place = f" ({worst.where})" if worst.where and worst.where not in what else ""
-        if len(self.findings) == 1:
-            return f"{what}{place}"
         count = len(self.findings)
-        if self.code not in TITLES:
-            return f"{what}{place}; and {count - 1} more of this kind [{self.code}]"
+        if self.code not in TITLES or count == 1:
+            stated = self._wordings()[:MOST_WORDINGS]
+            line = "; ".join(_stated(finding) for finding in stated)
+            more = count - len(stated)
+            return f"{line}; and {more} more of this kind [{self.code}]" if more else line
         size = _size(worst)[1]
         title = TITLES[self.code].format(n=count)
         if size and worst.where:
             return f"{title} (largest: {worst.where} {size})"
-        return f"{title} (such as: {what})"
+        return f"{title} (such as: {_shortened(worst.what)})"
+
+    def _wordings(self) -> list[Finding]:
+        """The worst finding of each wording, figures apart; the worst of all first."""
+        kinds: dict[str, list[Finding]] = {}
+        for finding in (self.worst, *self.findings):
+            kinds.setdefault(FIGURES.sub("", finding.what), []).append(finding)
+        return [FindingGroup(tuple(found)).worst for found in kinds.values()]
 
 
 def grouped(findings: Iterable[Finding]) -> list[FindingGroup]:
@@ -89,6 +95,17 @@ def counted(findings: Iterable[Finding]) -> str:
         for severity in SEVERITIES
         if (count := severities.count(severity))
     )
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= MOST_TEXT else f"{text[:MOST_TEXT]}…"
+
+
+def _stated(finding: Finding) -> str:
+    """The fact and its place, unless the fact names it."""
+    what = _shortened(finding.what)
+    place = f" ({finding.where})" if finding.where and finding.where not in what else ""
+    return f"{what}{place}"
 
 
 def _size(finding: Finding) -> tuple[float, str]:

@@ -54,14 +54,12 @@ def moduli_unusual(named: Mapping[str, "FatModuli | MuscleModuli"], where: str) 
         return []
     low, high = USUAL_YOUNG
     return [
-        Finding.warning(
+        Finding(
             "moduli-unusual",
             f"no soft tissue has these moduli: {', '.join(found)}",
+            severity="warning",
             where=where,
-            why=f"published Young's moduli lie within {low:g} to {high:g} MPa, Poisson's ratios "
-            f"within {USUAL_POISSON:g} to 0.5",
-            fix="check digits and unit: moduli are in MPa, so 10 kPa is 0.01; Poisson's ratio of "
-            "fat is about 0.46, not 0.046",
+            facts={"low": low, "high": high, "least": USUAL_POISSON},
         )
     ]
 

@@ -153,6 +153,15 @@ class PatientModel(Frozen):
         scene = replace(self.scene, plan=plan_given, fixed=fixed, segments=segments)
         return replace(self, scene=scene, findings=findings, summary=summary)
 
+    def segment_vertices(self, name: str) -> Floats:
+        """The vertices that state a segment's motion, (v, 3) mm: of a given bone that is not cut.
+
+        The surface of a segment itself is as coarse as its voxels.
+        """
+        given = None if self.summary.get("osteotomies") else self.anatomy.surfaces.get(name)
+        found = given or next(s.surface for s in self.segments if s.name == name)
+        return found.vertices
+
     @cached_property
     def face(self) -> SurfaceData | None:
         """The skin of the whole head in full detail, as it was given or as the image shows it.

@@ -98,43 +98,35 @@ class ProposedLandmarks:
         count = len(typical)
         yield from _following(sites)
         if count and count == len(sites):
-            yield Finding.note(
+            yield Finding(
                 "landmarks-proposed",
                 f"{count} landmarks were found automatically; none was placed by hand; expected "
                 f"error {typical[count // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
                 where="landmarks",
-                why="cuts, muscles, the region and the lips are placed from them",
-                fix='"cmfsim landmarks case.toml" writes them with a picture: check them in 3D '
-                "Slicer and name the files under [landmarks]",
             )
         if self.doubtful_jaw:
             verdict = "is none" if self.impossible_jaw else "is doubtful"
-            yield Finding.warning(
-                "jaw-impossible" if self.impossible_jaw else "jaw-doubtful",
+            yield Finding(
+                "jaw-doubtful",
                 f"the part taken for the mandible {verdict}: {self.doubtful_jaw}",
                 where="landmarks.skull",
-                why="landmarks of jaws and teeth are on it, and segments are cut from it",
-                fix="place the landmarks of the skull by hand and name the file under [landmarks]: "
-                "the jaws are then separated by them",
             )
         for kind, own in (("skull", self.skull), ("skin", self.skin)):
             for name, site in own.items():
                 if site.doubt:
                     x, y, z = site.point
-                    yield Finding.warning(
+                    yield Finding(
                         "landmark-doubtful",
                         f"{name} ({kind}) at ({x:.1f}, {y:.1f}, {z:.1f}) is doubtful: {site.doubt}",
                         where=f"landmarks.{kind}",
-                        why="everything placed from it inherits its error",
-                        fix='check it in the picture of "cmfsim landmarks", and place it by '
-                        "hand if it is wrong",
                     )
         for kind, missing in (("skull", self.missing_skull), ("skin", self.missing_skin)):
             for reason in dict.fromkeys(missing.values()):
                 names = [name for name, why in missing.items() if why == reason]
-                yield Finding.warning(
-                    "landmarks-missing",
+                yield Finding(
+                    "landmark-missing",
                     f"{len(names)} {kind} landmarks were not found: {', '.join(names)}: {reason}",
+                    severity="warning",
                     where=f"landmarks.{kind}",
                     why="they are omitted rather than guessed; anything that needs them is refused",
                     fix="place them by hand if the image shows them",
@@ -151,12 +143,9 @@ def _following(sites: Mapping[str, ProposedSite]) -> Iterator[Finding]:
         names = [f"{n} ({s.error:.1f} mm)" for n, s in sites.items() if s.origin == origin]
         if names:
             texts.append(f"{len(names)} were {words} (expected error): {', '.join(names)}")
-    yield Finding.note(
+    yield Finding(
         "landmarks-filled",
         f"{len(placed)} landmarks were placed by hand, and others follow them: "
         + ("; ".join(texts) or "none had to be moved"),
         where="landmarks",
-        why="cuts, muscles, the region and the lips are placed from all of them",
-        fix='check them on the page of "cmfsim landmarks case.toml --page", and place those that '
-        "are wrong",
     )

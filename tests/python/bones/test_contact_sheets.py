@@ -227,8 +227,8 @@ def test_a_sheet_that_is_not_the_bones_is_reported(jaw, tissue, sheet, classifie
         arches=ARCHES,
         contacts={"maxilla": shifted},
     )
-    assert "contact-sheet-far" in {f.code for f in found.findings}
-    assert "contact-sheet-far" not in {f.code for f in classified.findings}
+    assert "contact-sheet" in {f.code for f in found.findings}
+    assert "contact-sheet" not in {f.code for f in classified.findings}
 
 
 def test_nothing_moves_when_nothing_moves(classified, tissue, jaw, sheet):
@@ -296,7 +296,7 @@ def test_a_cut_leaves_no_end_on_a_sheet(jaw, sheet):
 def test_too_sharp_a_sheet_is_reported(jaw):
     """No relief makes crowns as flat as tets of 60 mm need."""
     made = arch_sheets(jaw[0], [jaw[1]], ARCHES, OPTIONS, 60.0)
-    assert [f.code for f in made.findings] == ["contact-sheet-sharp"]
+    assert [f.code for f in made.findings] == ["contact-sheet"]
     assert "30 mm" in made.findings[0].what
 
 
@@ -334,7 +334,7 @@ def test_arches_are_placed_from_the_teeth_that_the_image_shows(jaw):
         for n in names
     ]
     found = cmfsim.dental_arches(anatomy, segments)
-    assert [f.code for f in found.findings] == ["sliding-from-teeth"]
+    assert [f.code for f in found.findings] == ["sliding-landmarks"]
     wanted = arch_head.arch()
     upper, lower = found.by_jaw["upper"], found.by_jaw["lower"]
     assert np.linalg.norm(np.asarray(upper.tip) - wanted.tip) < 6.0
@@ -354,7 +354,7 @@ def test_arches_are_placed_from_the_teeth_that_the_image_shows(jaw):
     assert np.linalg.norm(np.asarray(same.by_jaw["upper"].tip) - upper.tip) < 1.5
     made = arch_sheets(skull, one, same, OPTIONS, 4.0)
     assert made.sheets == {}
-    assert [f.code for f in made.findings] == ["contact-sheet-both-arches"]
+    assert [f.code for f in made.findings] == ["contact-sheet"]
     # Without teeth and landmarks nothing slides, which is reported.
     bare = dataclasses.replace(anatomy, teeth=None)
     nothing = cmfsim.dental_arches(bare, segments)

@@ -91,7 +91,7 @@ def test_a_crumb_stays_with_the_bone_that_it_hangs_on():
     plane = cmfsim.CuttingPlane((0, 0, 20), (0, 0, 1))
     cut = cmfsim.free_cut("mandible", "top", (plane,))
     found = cmfsim.cut_bones({"mandible": level}, [cut])
-    assert [f.code for f in found.findings] == ["osteotomy-crumbs"]
+    assert [f.code for f in found.findings] == ["osteotomy-parts"]
     assert "separated from 'top': 1, 300 mm³" in found.findings[0].what
     assert np.asarray(found["top"].surface.vertices)[:, 0].max() < 17
     assert volume(found["top"]) == pytest.approx(10 * 10 * 10.5, rel=0.05)

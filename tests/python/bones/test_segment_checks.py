@@ -168,7 +168,7 @@ def test_a_moved_segment_without_a_node_is_an_error(tmp_path):
     head.replace("edge_length = 4.0", "edge_length = 12.0")
     head.toml += "\n[region]\nlower = 1475.0\n"
     case = Case.load(head.write(tmp_path))
-    with pytest.raises(cmfsim.CaseError, match=r"'mandible' moves, but no node.*touches-no-tissue"):
+    with pytest.raises(cmfsim.CaseError, match=r"'mandible' moves, but no node.*segment-no-tissue"):
         build_model(case, check=False)
 
 
@@ -223,7 +223,7 @@ def test_a_piece_beyond_the_mesh_that_nobody_named_is_a_warning(cut):
     )
     name = behind.name
     (finding,) = moved_without_nodes([behind], {name: forwards}, plan={})
-    assert (finding.severity, finding.code) == ("warning", "segment-touches-no-tissue")
+    assert (finding.severity, finding.code) == ("warning", "segment-no-tissue")
     with pytest.raises(cmfsim.CaseError, match=f"'{name}' moves, but no node"):
         moved_without_nodes([behind], {name: forwards}, plan={name: None})
     assert moved_without_nodes([behind], {name: np.eye(4)}, plan={name: None}) == ()

@@ -131,7 +131,7 @@ def test_colours_follow_the_terminal_and_no_color(monkeypatch):
     assert not in_colour(io.StringIO())
     monkeypatch.setenv("NO_COLOR", "1")
     assert not in_colour(Terminal())
-    finding = cmfsim.Finding.error("x", "something")
+    finding = cmfsim.Finding("x", "something", severity="error")
     assert "\x1b[31;1merror\x1b[0m" in cmfsim.doctor.findings_text([finding], colour=True)
 
 

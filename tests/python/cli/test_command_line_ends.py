@@ -90,7 +90,10 @@ def test_a_folder_without_a_case_is_named_in_full(tmp_path, monkeypatch, capsys)
 def test_a_folder_with_a_case_stands_for_it(case, monkeypatch, capsys):
     monkeypatch.chdir(case.parent)
     assert main(["doctor", ".", "--json", "-q"]) == 0
-    assert json.loads(capsys.readouterr().out)["case"] == "ellipsoids"
+    report = json.loads(capsys.readouterr().out)
+    assert report["case"] == "ellipsoids"
+    # Nothing is left to segment.
+    assert "not-segmented" not in {finding["code"] for finding in report["findings"]}
 
 
 def test_a_home_folder_that_nobody_has_is_bad_input(tmp_path, capsys):
@@ -411,5 +414,5 @@ def test_a_sagittal_split_leaves_no_mandible_to_plan(tmp_path, capsys):
     )
     assert main(["doctor", str(path), "-q"]) == 2
     said = capsys.readouterr().out
-    assert "[plan-unknown-segment]" in said
+    assert "[unknown-name]" in said
     assert "write [plan.mandible_body]" in said

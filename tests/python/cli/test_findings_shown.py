@@ -19,16 +19,15 @@ pytest.importorskip("jinja2")
 
 
 def cut_off(name, share):
-    return Finding.warning(
-        "muscle-cut-off", f"{share}% of {name} lies outside the mesh", where=name
-    )
+    what = f"{share}% of {name} lies outside the mesh"
+    return Finding("muscle-does-not-fit", what, severity="warning", where=name)
 
 
 MUSCLES = [cut_off(f"muscle_{i}", share) for i, share in enumerate((3.1, 12.0, 9.9, 11.0))]
 
 
 def test_findings_of_one_kind_are_one_line_with_count_and_worst():
-    findings = [*MUSCLES, cut_off("platysma", 40.2), Finding.note("x", "a note")]
+    findings = [*MUSCLES, cut_off("platysma", 40.2), Finding("x", "a note", severity="note")]
     groups = grouped([*findings, *findings])
     assert [len(group.findings) for group in groups] == [5, 1]
     assert groups[0].line == "5 muscles partly outside the tissue (largest: platysma 40.2 %)"
@@ -38,24 +37,33 @@ def test_findings_of_one_kind_are_one_line_with_count_and_worst():
 
 def test_errors_come_first_and_unknown_kinds_are_counted_too():
     findings = [
-        Finding.note("a", "n"),
-        Finding.warning("b", "thing lies 2.5 mm off", where="here"),
-        Finding.warning("b", "thing lies 12.5 mm off", where="there"),
-        Finding.error("c", "e"),
+        Finding("a", "n", severity="note"),
+        Finding("b", "thing lies 2.5 mm off", severity="warning", where="here"),
+        Finding("b", "thing lies 12.5 mm off", severity="warning", where="there"),
+        Finding("c", "e", severity="error"),
     ]
     lines = [group.line for group in grouped(findings)]
     assert lines == ["e", "thing lies 12.5 mm off (there); and 1 more of this kind [b]", "n"]
 
 
+def test_different_facts_of_one_code_are_each_stated():
+    """The chin and the forehead have one code; "1 more of this kind" would leave one out."""
+    parts = ["chin cut off by 4 mm", "forehead cut off by 9 mm", "chin cut off by 5 mm"]
+    (group,) = grouped([Finding("ct-cut-off", part, severity="warning") for part in parts])
+    assert group.line == (
+        "forehead cut off by 9 mm; chin cut off by 5 mm; and 1 more of this kind [ct-cut-off]"
+    )
+
+
 def test_warnings_are_printed_once_as_they_come_and_once_at_the_end(capsys):
     notices = Notices(quiet=True)
     notices.add(MUSCLES)
-    notices.add([*MUSCLES, Finding.note("x", "a note")])
+    notices.add([*MUSCLES, Finding("x", "a note", severity="note")])
     first = capsys.readouterr()
     assert first.out == ""
     assert first.err.count("warning") == 1
     assert "a note" not in first.err
-    notices.add([Finding.warning("y", "evil \x1b[2Jname", fix="rename it")])
+    notices.add([Finding("y", "evil \x1b[2Jname", severity="warning", fix="rename it")])
     notices.summarise("out/report.html")
     err = capsys.readouterr().err
     assert err.count("4 muscles partly outside the tissue") == 1
@@ -67,7 +75,7 @@ def test_warnings_are_printed_once_as_they_come_and_once_at_the_end(capsys):
 def test_nothing_doubtful_prints_nothing(capsys):
     Notices().summarise("out")
     quiet = Notices(quiet=True)
-    quiet.add([Finding.note("x", "a note")])
+    quiet.add([Finding("x", "a note", severity="note")])
     quiet.summarise("out")
     assert capsys.readouterr() == ("", "")
 
@@ -80,7 +88,7 @@ def noticed(tmp_path, monkeypatch):
         cmfsim.pipeline.predicting.model_of,
         cmfsim.pipeline.predicting.predict_patient,
     )
-    solved = Finding.warning("of-solving", "solving is doubtful")
+    solved = Finding("of-solving", "solving is doubtful", severity="warning")
 
     def model_of(case, options):
         found = build(case, options)
@@ -102,9 +110,8 @@ def noticed(tmp_path, monkeypatch):
 
     monkeypatch.setattr("cmfsim.pipeline.predicting.model_of", model_of)
     monkeypatch.setattr("cmfsim.pipeline.predicting.predict_patient", predict_patient)
-    doctor = Finding.warning(
-        "of-doctor", "the case is doubtful", where="case.toml:3", why="why", fix="fix it"
-    )
+    given = {"where": "case.toml:3", "why": "why", "fix": "fix it"}
+    doctor = Finding("of-doctor", "the case is doubtful", severity="warning", **given)
     found = cmfsim.doctor.Examination((doctor,), {})
     monkeypatch.setattr("cmfsim.cli.case_commands.examine", lambda *_, **__: found)
     head = HeadCase(rounds=2)
@@ -141,7 +148,7 @@ def test_predict_prints_warnings_before_its_figures_and_at_its_end(noticed, tmp_
     assert at == sorted(at)
     assert main([*words, "-q", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["findings"]
-    assert {"of-doctor", "muscle-cut-off", "of-solving"} <= {entry["code"] for entry in found}
+    assert {"of-doctor", "muscle-does-not-fit", "of-solving"} <= {entry["code"] for entry in found}
 
 
 def test_warnings_stand_above_the_figures_of_a_report_and_fold_out(noticed):

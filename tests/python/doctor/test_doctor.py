@@ -169,11 +169,11 @@ DEFECTS = {
     "centimetres": (lambda h: scaled(h, 0.1), "error", "surface-units"),
     "normalised": (normalised, "error", "surface-units"),
     "bone in metres": (lambda h: scaled(h, 0.001, ["mandible"]), "error", "surface-units"),
-    "ten times too large": (lambda h: scaled(h, 4.0), "error", "surface-size"),
+    "ten times too large": (lambda h: scaled(h, 4.0), "error", "surface-units"),
     "landmarks in metres": (
         lambda h: setattr(h, "skull", {n: p / 1000 for n, p in h.skull.items()}),
         "error",
-        "landmark-units",
+        "landmark-frame",
     ),
     "landmarks in RAS": (
         lambda h: setattr(h, "skull", {n: p * HALF_TURN for n, p in h.skull.items()}),
@@ -193,19 +193,19 @@ DEFECTS = {
     "one pair swapped": (
         lambda h: setattr(h, "skull", swapped(h.skull, ["gonion"])),
         "error",
-        "landmark-pair-swapped",
+        "left-right-swapped",
     ),
     "landmark 8 mm off": (lambda h: far_landmark(h, 8.0), "warning", "landmark-far"),
     "landmark 30 mm off": (lambda h: far_landmark(h, 30.0), "error", "landmark-far"),
     "skin turned inside out in part": (
         lambda h: h.change("skin", triangles=inconsistent),
         "warning",
-        "surface-inconsistent",
+        "surface-normals",
     ),
     "bone inside out": (
         lambda h: h.change("mandible", triangles=lambda t: t[:, ::-1]),
         "warning",
-        "surface-inward",
+        "surface-normals",
     ),
     "bone open": (
         lambda h: h.change("mandible", triangles=lambda t: t[30:]),
@@ -237,16 +237,16 @@ DEFECTS = {
     ),
     "skin with an island": (lambda h: with_debris(h, "skin"), "warning", "surface-islands"),
     "fork": (with_fork, "warning", "surface-non-manifold"),
-    "slivers": (with_slivers, "warning", "surface-slivers"),
+    "slivers": (with_slivers, "warning", "surface-degenerate"),
     "bone through skin": (
         lambda h: shifted(h, "cranium", [0, -30.0, 0]),
         "warning",
-        "bone-through-skin",
+        "bone-outside-skin",
     ),
     "bone elsewhere": (
         lambda h: h.change("mandible", vertices=lambda v: v + [400.0, 0, 0]),
         "error",
-        "bone-elsewhere",
+        "surface-frame",
     ),
     "bone in RAS": (
         lambda h: h.change("mandible", vertices=lambda v: v * HALF_TURN),
@@ -302,7 +302,7 @@ DEFECTS = {
     "unknown segment": (
         lambda h: h.replace("[plan.mandible]", "[plan.maxila]"),
         "error",
-        "plan-unknown-segment",
+        "unknown-name",
     ),
     "unknown bone": (
         lambda h: h.replace(
@@ -311,7 +311,7 @@ DEFECTS = {
             'name = "chin"\n\n[tissue]',
         ),
         "error",
-        "cut-unknown-bone",
+        "unknown-name",
     ),
     "depth behind landmarks that are missing": (
         lambda h: (
@@ -319,9 +319,9 @@ DEFECTS = {
             h.replace("[tissue]", "[region]\nposterior_depth = 5\n\n[tissue]"),
         ),
         "error",
-        "region-unplaced",
+        "landmark-missing",
     ),
-    "unknown preset": (lambda h: h.replace("kim2010", "kim2011"), "error", "tissue-preset"),
+    "unknown preset": (lambda h: h.replace("kim2010", "kim2011"), "error", "unknown-name"),
     "missing skin": (lambda h: h.replace("skin.ply", "face.ply"), "error", "file-missing"),
     "missing landmarks": (
         lambda h: h.replace("skull.mrk", "no.mrk"),
@@ -413,7 +413,7 @@ def test_landmarks_off_the_face_after_the_operation_are_said(tmp_path):
         moved = {name: place - [0.0, shift, 0.0] for name, place in places.items()}
         cmfsim.write_landmarks(tmp_path / "after.mrk.json", moved)
         found = [f.code for f in cmfsim.diagnose(cmfsim.Case.load(path))]
-        assert ("postoperative-landmarks-off" in found) == expected
+        assert ("landmarks-off" in found) == expected
 
 
 def test_an_unstated_landmark_frame_is_said(tmp_path):
@@ -424,9 +424,9 @@ def test_an_unstated_landmark_frame_is_said(tmp_path):
     text = (tmp_path / "skull.mrk.json").read_text(encoding="utf-8")
     path.write_text(text.replace('"coordinateSystem": "LPS",', ""), encoding="utf-8")
     head.replace("skull.mrk.json", "bare.mrk.json")
-    assert serious(tmp_path, head) == [("warning", "landmark-frame-unstated")]
+    assert serious(tmp_path, head) == [("warning", "frame-unstated")]
     head.replace("[landmarks]", '[landmarks]\nframe = "LPS"')
-    assert notes(tmp_path, head) == ["landmark-frame-unstated"]
+    assert notes(tmp_path, head) == ["frame-unstated"]
 
 
 @pytest.mark.parametrize(
@@ -447,7 +447,7 @@ def test_a_surface_that_cannot_be_read_is_one_error(content, tmp_path):
     before = sorted(p.name for p in tmp_path.iterdir())
     findings = cmfsim.diagnose(cmfsim.Case.load(path))
     codes = [f.code for f in findings if f.severity == "error"]
-    assert codes == ["surface-unreadable" if content else "file-missing"]
+    assert codes == ["input-unreadable" if content else "file-missing"]
     assert sorted(p.name for p in tmp_path.iterdir()) == before
 
 
@@ -457,7 +457,7 @@ def test_a_truncated_surface_is_unreadable(tmp_path):
     whole = (tmp_path / "skin.ply").read_bytes()
     (tmp_path / "skin.ply").write_bytes(whole[: len(whole) // 2])
     findings = cmfsim.diagnose(cmfsim.Case.load(path))
-    assert [f.code for f in findings] == ["surface-unreadable"]
+    assert [f.code for f in findings] == ["input-unreadable"]
 
 
 def test_nan_in_a_surface_is_named_with_its_row(tmp_path):
@@ -466,7 +466,7 @@ def test_nan_in_a_surface_is_named_with_its_row(tmp_path):
     (tmp_path / "skin.obj").write_text("v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", encoding="utf-8")
     path.write_text(path.read_text("utf-8").replace("skin.ply", "skin.obj"), encoding="utf-8")
     (finding,) = cmfsim.diagnose(cmfsim.Case.load(path))
-    assert finding.code == "surface-unreadable"
+    assert finding.code == "input-unreadable"
     assert "line 2: 'nan' is not finite" in finding.what
 
 
@@ -518,7 +518,7 @@ def test_a_transform_file_is_read_for_its_motion(tmp_path):
     np.savetxt(tmp_path / "jaw.txt", cmfsim.rigid_motion(translation=(0, 30, 0)))
     assert serious(tmp_path, head) == [("warning", "plan-far")]
     (tmp_path / "jaw.txt").write_text("1 2 3\n", encoding="utf-8")
-    assert serious(tmp_path, head) == [("error", "transform-unreadable")]
+    assert serious(tmp_path, head) == [("error", "input-unreadable")]
 
 
 def with_muscles(head, kept=None):
@@ -534,7 +534,7 @@ def with_muscles(head, kept=None):
 def muscle_findings(folder, head):
     """Severity, code and text of findings about muscles."""
     case = cmfsim.Case.load(head.write(folder))
-    codes = ("muscles-landmarks", "muscles-left-out", "template-landmarks-missing")
+    codes = ("template-landmarks", "muscles-left-out", "template-landmarks-missing")
     return [(f.severity, f.code, f.what) for f in check_muscles(gather(case)) if f.code in codes]
 
 
@@ -580,6 +580,18 @@ def image_case(folder, spacing):
     return head
 
 
+def test_the_command_states_that_it_has_not_segmented_an_image(tmp_path, capsys):
+    path = image_case(tmp_path, 2.5).write(tmp_path)
+    main(["doctor", str(path), "--json", "-q"])
+    (found,) = [
+        f for f in json.loads(capsys.readouterr().out)["findings"] if f["code"] == "not-segmented"
+    ]
+    assert found["severity"] == "note"
+    assert "cmfsim landmarks" in found["fix"]
+    # Of the other commands the work itself follows.
+    assert "not-segmented" not in {f.code for f in cmfsim.diagnose(cmfsim.Case.load(path))}
+
+
 def test_an_image_is_compared_with_its_landmarks_and_its_voxels_are_looked_at(tmp_path):
     """Fine and fitting: nothing; coarse, in another frame, of another patient, damaged: said."""
     head = image_case(tmp_path, 2.5)
@@ -592,7 +604,7 @@ def test_an_image_is_compared_with_its_landmarks_and_its_voxels_are_looked_at(tm
     assert serious(tmp_path, head) == [("error", "landmark-outside-image")]
     (tmp_path / "ct.nrrd").write_bytes(b"NRRD0004\n")
     head.skull = HeadCase().skull
-    assert serious(tmp_path, head) == [("error", "image-unreadable")]
+    assert serious(tmp_path, head) == [("error", "input-unreadable")]
 
 
 # The command.

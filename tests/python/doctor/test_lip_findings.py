@@ -11,7 +11,9 @@ def found(folder, lips, more=""):
     head = HeadCase()
     head.toml += f"\n[lips]\n{lips}\n{more}"
     findings = cmfsim.diagnose(cmfsim.Case.load(head.write(folder)))
-    return [(f.severity, f.code) for f in findings if f.code.startswith(("lip", "file"))]
+    return [
+        (f.severity, f.code) for f in findings if f.code.startswith(("lip", "file", "landmark-m"))
+    ]
 
 
 def test_lips_that_are_not_asked_for_are_not_checked(tmp_path):
@@ -21,17 +23,17 @@ def test_lips_that_are_not_asked_for_are_not_checked(tmp_path):
 @pytest.mark.parametrize(
     ("lips", "more", "expected"),
     [
-        ("contact = true", "", [("note", "lips-landmarks-few")]),
-        ('contact = true\nseam = "landmarks"', "", [("error", "lips-landmarks-missing")]),
+        ("contact = true", "", [("note", "landmark-missing")]),
+        ('contact = true\nseam = "landmarks"', "", [("error", "landmark-missing")]),
         (
             "contact = true",
             '[solver]\nmethod = "cholesky"\n',
-            [("error", "lips-method"), ("note", "lips-landmarks-few")],
+            [("error", "lips-contact"), ("note", "landmark-missing")],
         ),
         (
             "contact = true",
             "[node_kinds]\nsliding = false\n",
-            [("warning", "lips-attached"), ("note", "lips-landmarks-few")],
+            [("warning", "lips-contact"), ("note", "landmark-missing")],
         ),
     ],
 )

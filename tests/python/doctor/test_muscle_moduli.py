@@ -9,7 +9,7 @@ from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.muscles import check_muscles
 from head_case import HeadCase
 
-CODES = ("muscle-moduli", "moduli-unusual", "muscle-moduli-unknown", "fat-moduli")
+CODES = ("muscle-moduli", "moduli-unusual", "unknown-name", "moduli-unusual")
 OWN = """
 [muscles]
 preset = "kim2010"
@@ -103,7 +103,7 @@ def test_what_no_muscle_has_is_refused_with_line_and_key(tmp_path, before, after
 
 def test_an_unknown_muscle_is_an_error_with_the_nearest_names(tmp_path):
     (error, _) = findings(tmp_path, OWN.replace("masseter_L", "maseter_L"))
-    assert (error.severity, error.code) == ("error", "muscle-moduli-unknown")
+    assert (error.severity, error.code) == ("error", "unknown-name")
     assert "'maseter_L'" in error.what
     assert error.fix.startswith("use one of: masseter_L, masseter_R")
     assert "muscles.moduli.maseter_L" in error.where

@@ -18,7 +18,7 @@ NUMBERS = {
     "no centre": ("\ncentre = [3, -100, 1450]", "", "plan-far"),
     "no centre, near": ("angle = 2\naxis = [1, 0, 0]\ncentre = [3, -100, 1450]",
                         "angle = 0.5\naxis = [1, 0, 0]", "plan-no-centre"),
-    "centimetres": (TURN, "translation = [0, -0.4, 0.1]", "plan-small"),
+    "centimetres": (TURN, "translation = [0, -0.4, 0.1]", "plan-tiny"),
     "another order": (TURN, "translation = [-6, 0, 0]", "plan-sideways"),
     "both Le Fort": ("[plan.mandible]", f"{LE_FORT}\n[plan.mandible]", "cuts-both-le-fort"),
 }  # fmt: skip

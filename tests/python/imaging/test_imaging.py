@@ -225,9 +225,9 @@ def test_thresholds_must_ascend():
 def test_a_flipped_head_is_an_error_finding(head):
     whole = SegmentOptions(part_jaws=False)
     back = segment_head(head.image.with_values(head.image.values[:, ::-1].copy()), whole)
-    assert any(f.code == "ct-facing-back" and f.severity == "error" for f in back.findings)
+    assert any(f.code == "ct-flipped" and f.severity == "error" for f in back.findings)
     turned = segment_head(head.image.with_values(head.image.values[:, :, ::-1].copy()), whole)
-    assert any(f.code == "ct-upside-down" and f.severity == "error" for f in turned.findings)
+    assert any(f.code == "ct-flipped" and f.severity == "error" for f in turned.findings)
 
 
 def test_metal_spikes_do_not_leave_the_skin(head):
@@ -459,7 +459,7 @@ def test_the_real_jaws_are_parted_without_landmarks(coarse_phantom, reference):
 
 
 @needs_phantom
-@pytest.mark.parametrize(("axis", "code"), [(1, "ct-facing-back"), (2, "ct-upside-down")])
+@pytest.mark.parametrize(("axis", "code"), [(1, "ct-flipped"), (2, "ct-flipped")])
 def test_a_flipped_real_ct_is_found(coarse_phantom, axis, code):
     flipped = coarse_phantom.with_values(np.flip(coarse_phantom.values, axis))
     anatomy = segment_head(flipped, SegmentOptions(part_jaws=False))

@@ -130,7 +130,7 @@ def test_a_tilted_scan_keeps_each_value_at_its_place(tmp_path, turned):
 def test_a_tilt_that_positions_do_not_show_is_reported(tmp_path):
     write_series(tmp_path / "ct", [s.with_tags(t0018_1120="-18.5") for s in axial(noisy())])
     found = read_image_file(tmp_path / "ct")
-    (finding,) = [f for f in found.findings if f.code == "dicom-tilt-unclear"]
+    (finding,) = [f for f in found.findings if f.code == "dicom-tilted"]
     assert "-18.5°" in finding.what
     assert "0.0°" in finding.what
 
@@ -185,7 +185,7 @@ def test_a_copy_of_a_slice_is_skipped_and_reported(tmp_path):
     found = read_image_file(tmp_path / "ct")
     same(found, noisy())
     (finding,) = found.findings
-    assert finding.code == "dicom-copies"
+    assert finding.code == "dicom-skipped"
     assert "1.2.3_0008.dcm" in finding.what
 
 
@@ -310,7 +310,7 @@ def test_scouts_are_skipped_and_reported(tmp_path):
     found = read_image_file(tmp_path / "ct")
     same(found, noisy())
     (finding,) = found.findings
-    assert (finding.code, finding.severity) == ("dicom-scouts", "warning")
+    assert (finding.code, finding.severity) == ("dicom-skipped", "warning")
     assert "1.2.3_0000.dcm, 1.2.3_0009.dcm" in finding.what
 
 
@@ -346,14 +346,14 @@ def test_each_slice_has_its_own_scale(tmp_path):
 
 def test_a_scale_other_than_hu_is_reported(tmp_path):
     write_series(tmp_path / "ct", [s.with_tags(t0028_1054="MGML") for s in axial(noisy())])
-    assert "dicom-not-hu" in codes(read_image_file(tmp_path / "ct"))
+    assert "ct-not-hu" in codes(read_image_file(tmp_path / "ct"))
 
 
 def test_other_files_are_skipped_and_a_damaged_slice_is_not(tmp_path):
     write_series(tmp_path / "ct", axial(noisy()))
     (tmp_path / "ct" / "README").write_text("from the archive")
     found = read_image_file(tmp_path / "ct")
-    assert codes(found) == {"dicom-other-files"}
+    assert codes(found) == {"dicom-skipped"}
     last = tmp_path / "ct" / "1.2.3_0007.dcm"
     last.write_bytes(last.read_bytes()[:-40])
     refused(tmp_path / "ct", "1.2.3_0007.dcm", "cut short")
@@ -513,7 +513,7 @@ def test_slices_that_are_links_are_read_and_broken_links_reported(tmp_path):
     found = read_image_file(tmp_path / "ct")
     assert found.image.values.shape[2] == SHAPE[2] - 1
     (finding,) = found.findings
-    assert (finding.severity, finding.code) == ("warning", "dicom-other-files")
+    assert (finding.severity, finding.code) == ("warning", "dicom-skipped")
     assert "1.2.3_0007.dcm" in finding.what
     assert "datalad get" in finding.fix
 
@@ -541,7 +541,7 @@ def test_a_real_tilted_series_lies_where_its_slices_state():
     found = read_image_file(data_folder() / "ct_tilted")
     (tilt,) = [f for f in found.findings if f.code == "dicom-tilted"]
     assert "gantry tilt −18.5°" in tilt.what
-    assert "dicom-tilt-unclear" not in codes(found)
+    assert "dicom-tilted" not in codes(found)
     image = found.image
     # The first pixel of the last slice: an orthogonal stack puts it at y = 26.4, z = 868.0.
     assert image.lowest[:2] == pytest.approx([-123.5, -15.64], abs=0.01)
@@ -639,3 +639,17 @@ def test_nothing_rings_at_the_borders_of_bone_and_metal():
         axes = np.array([[cz, sz, 0.0], [-sz * c, cz * c, s]])
         made = of_slices(values, positions, axes, (0.8, 0.8), "x").values
         assert -1024 == made.min() < 1200 < made.max() <= 3071
+
+
+def test_pixels_shown_inverted_have_the_same_values_in_hu(tmp_path):
+    """PS3.3 C.7.6.3.1: MONOCHROME1 is about display, after the values were rescaled."""
+    image = smooth()
+    write_series(tmp_path / "plain", axial(image))
+    write_series(tmp_path / "shown", axial(image))
+    for path in (tmp_path / "shown").iterdir():
+        data = path.read_bytes()
+        assert data.count(b"MONOCHROME2") == 1
+        path.write_bytes(data.replace(b"MONOCHROME2", b"MONOCHROME1"))
+    plain, shown = (read_image_file(tmp_path / name) for name in ("plain", "shown"))
+    assert np.array_equal(plain.image.values, shown.image.values)
+    assert codes(shown) - codes(plain) == {"field-ignored"}

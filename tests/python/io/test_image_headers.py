@@ -270,10 +270,49 @@ def test_packed_voxels_are_held_against_their_checksum_and_length(tmp_path, kind
         packed = packed[:middle] + bytes([packed[middle] ^ 4]) + packed[middle + 1 :]
     path = tmp_path / "voxels"
     path.write_bytes(b"head" + packed)
-    with pytest.raises(ImageError, match="voxels"):
-        check_length("voxels", path, 4, VALUES.nbytes, kind)
+    layer = VALUES[:, :, 0].nbytes
+    given = (path, 4, VALUES.nbytes, layer, kind)
+    if change in {"tail", "long"}:
+        (finding,) = check_length(*given)
+        assert finding.what.startswith(f"{4 if change == 'tail' else 2} bytes after its voxels")
+    else:
+        with pytest.raises(ImageError, match="voxels"):
+            check_length(*given)
     path.write_bytes(b"head" + pack(VALUES.T.tobytes()))
-    check_length("voxels", path, 4, VALUES.nbytes, kind)
+    assert check_length(*given) == ()
+    # As many more as a slice has may be one that the header misses.
+    path.write_bytes(b"head" + pack(VALUES.T.tobytes() + bytes(layer)))
+    with pytest.raises(ImageError, match="longer than its header states"):
+        check_length(*given)
+
+
+@pytest.mark.parametrize("kind", ["raw", "gzip", "bzip2"])
+def test_a_nrrd_file_is_read_whatever_packs_it_and_with_bytes_after_it(tmp_path, kind):
+    pack = {"raw": bytes, "gzip": gzip.compress, "bzip2": bz2.compress}[kind]
+    path = write_nrrd(tmp_path / "a.nrrd", data=False, encoding=kind)
+    header = path.read_bytes()
+    apart = write_nrrd(tmp_path / "b.nhdr", data=False, encoding=kind, data_file="b.bin")
+    for tail, expected in ((b"", []), (b"\0\n", ["field-ignored"])):
+        path.write_bytes(header + pack(VALUES.T.tobytes()) + tail)
+        (tmp_path / "b.bin").write_bytes(pack(VALUES.T.tobytes()) + tail)
+        for file in (path, apart):
+            found = read_image_file(file)
+            assert np.array_equal(found.image.values, VALUES)
+            assert [f.code for f in found.findings] == expected
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_packed_voxels_of_a_meta_file_are_read_without_their_length(tmp_path, stated):
+    """Without it, ITK read the text of the header as the begin of the voxels: other values."""
+    packed = zlib.compress(VALUES.T.tobytes())
+    size = {"CompressedDataSize": str(len(packed))} if stated else {}
+    path = write_meta(tmp_path / "a.mha", data=False, CompressedData="True", **size)
+    header = path.read_bytes()
+    for tail, expected in ((b"", []), (b"\0\n", ["field-ignored"])):
+        path.write_bytes(header + packed + tail)
+        found = read_image_file(path)
+        assert np.array_equal(found.image.values, VALUES)
+        assert [f.code for f in found.findings] == expected
 
 
 # Files elsewhere -------------------------------------------------------------------------------
@@ -380,7 +419,7 @@ def test_a_sheared_sform_is_resampled_by_its_own_map(tmp_path, qform):
         )
     found = read_image_file(path)
     (finding,) = found.findings
-    assert finding.code == "image-sheared"
+    assert finding.code == "image-oblique"
     assert "16.7°" in finding.what
     assert _values_at(found.image, SHEARED, to_lps=(-1, -1, 1)) < 0.51
 
@@ -392,7 +431,7 @@ def test_a_sheared_nrrd_is_resampled_by_its_own_map(tmp_path, linear):
         **{"space directions": "(1,0,0) (0,1,0) (0,0.6,2)", "space origin": "(5,6,7)"},
     )
     found = read_image_file(path)
-    assert [f.code for f in found.findings] == ["image-sheared"]
+    assert [f.code for f in found.findings] == ["image-oblique"]
     assert _values_at(found.image, SHEARED) < 0.51
 
 
@@ -435,12 +474,12 @@ def test_units_of_a_nifti_are_applied_to_spacing_and_place(tmp_path, units, scal
 def test_what_a_file_does_not_state_is_reported(tmp_path):
     straight = [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 2, 7]]
     assert codes(write_nifti(tmp_path / "a.nii", units=0, rows=straight)) == ["image-unit-unstated"]
-    assert codes(write_nifti(tmp_path / "b.nii", sform=0)) == ["image-frame-unstated"]
+    assert codes(write_nifti(tmp_path / "b.nii", sform=0)) == ["frame-unstated"]
     bare = {"space": None, "space directions": None, "space origin": None, "spacings": "1 1 2"}
     found = read_image_file(write_nrrd(tmp_path / "c.nrrd", **bare))
-    assert [f.code for f in found.findings] == ["image-frame-unstated"]
+    assert [f.code for f in found.findings] == ["frame-unstated"]
     np.testing.assert_allclose(found.image.spacing, [1.0, 1.0, 2.0])
-    assert codes(write_nrrd(tmp_path / "d.nrrd", space="scanner-xyz")) == ["image-frame-unstated"]
+    assert codes(write_nrrd(tmp_path / "d.nrrd", space="scanner-xyz")) == ["frame-unstated"]
 
 
 @pytest.mark.parametrize(

@@ -76,9 +76,7 @@ def test_an_unstated_frame_is_said_and_never_guessed_in_silence(tmp_path, caplog
     path = saved(tmp_path, bare, "points.fcsv")
     found = read_landmark_file(path)
     assert (found.frame, found.stated) == ("RAS", False)
-    assert [(f.severity, f.code) for f in found.findings] == [
-        ("warning", "landmark-frame-unstated")
-    ]
+    assert [(f.severity, f.code) for f in found.findings] == [("warning", "frame-unstated")]
     with caplog.at_level(logging.WARNING):
         cmfsim.read_landmarks(path)
     assert "does not state its frame" in caplog.text

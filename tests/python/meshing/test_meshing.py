@@ -85,7 +85,7 @@ def test_two_bodies_stay_two_and_both_are_there():
     assert bodies(made.mesh) == 1
     assert made.report.dropped_parts == 1
     assert 250.0 < made.report.dropped_volume < 600.0
-    assert [f.code for f in made.findings] == ["mesh-specks-dropped"]
+    assert [f.code for f in made.findings] == ["tissue-not-held"]
     assert "removed       1 parts" in made.report.as_text()
 
 

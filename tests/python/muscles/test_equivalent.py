@@ -44,7 +44,7 @@ def test_a_box_along_z_has_its_volume_and_its_direction():
     assert np.allclose(mixture.fibre[held], [0.0, 0.0, 1.0], atol=1e-9)
     assert not mixture.fibre[~held].any()
     assert np.array_equal(mixture.muscle_fraction("muscle_0"), mixture.fraction)
-    assert any(f.code == "muscle-cut-off" for f in mixture.findings)
+    assert any(f.code == "muscle-does-not-fit" for f in mixture.findings)
     with pytest.raises(KeyError, match="muscle_0"):
         mixture.muscle_fraction("masseter_L")
 
@@ -148,8 +148,8 @@ def test_findings_name_what_is_odd_about_a_muscle():
     mixture = cmfsim.equivalent_material(block(), [good, inside_out, opened, outside])
     found = {(f.where, f.code) for f in mixture.findings}
     assert {
-        ("muscle_1", "muscle-inside-out"),
-        ("muscle_2", "muscle-open"),
+        ("muscle_1", "surface-repaired"),
+        ("muscle_2", "surface-open"),
         ("muscle_3", "muscle-missed"),
     } <= found
     assert not any(where == "muscle_0" for where, _ in found)
@@ -270,7 +270,7 @@ def test_open_atlas_muscles_are_bridged():
     points = np.random.default_rng(3).uniform(low, high, (200_000, 3))
     core = cmfsim.Surface(surface.vertices, surface.triangles)
     winding = core.winding_number(points)
-    sign = -1.0 if any(f.code == "muscle-inside-out" for f in mixture.findings) else 1.0
+    sign = -1.0 if any(f.code == "surface-repaired" for f in mixture.findings) else 1.0
     inside = sign * winding > 0.5
     expected = inside.mean() * np.prod(high - low)
     spread = np.sqrt(inside.mean() * (1 - inside.mean()) / len(points)) * np.prod(high - low)

@@ -150,7 +150,7 @@ def test_landmarks_that_cross_fold_the_muscles_and_it_is_said(template):
     moved = template.musculature["masseter_L"].surface.vertices
     determinants = np.linalg.det(muscles.warp.jacobian(moved))
     assert muscles.folds["masseter_L"] == (determinants <= 0.0).sum()
-    (finding,) = [f for f in muscles.findings if f.code == "template-folds"]
+    (finding,) = [f for f in muscles.findings if f.code == "correspondence-folds"]
     assert finding.severity == "warning"
 
 
@@ -158,7 +158,7 @@ def test_a_displaced_landmark_disagrees_with_the_others(template, patient):
     patient = {**patient, "zygomatic_arch_L": patient["zygomatic_arch_L"] + [0, 15, 0]}
     muscles = template.morph(patient)
     assert muscles.leave_one_out.worst == "zygomatic_arch_L"
-    (finding,) = [f for f in muscles.findings if f.code == "template-landmarks-disagree"]
+    (finding,) = [f for f in muscles.findings if f.code == "landmark-disagrees"]
     assert ": zygomatic_arch_L 1" in finding.what
 
 
@@ -268,7 +268,7 @@ def test_the_atlas_gives_named_closed_muscles_with_its_licence(atlas):
             other = cmfsim.check_surface(other, crossings=False)
             assert abs(other.volume / report.volume - 1.0) < 0.05, muscle.name
             assert report.lowest[0] > other.lowest[0]
-    mirrored = {f.where for f in atlas.findings if f.code == "bodyparts3d-mirrored"}
+    mirrored = {f.where for f in atlas.findings if f.code == "bodyparts3d-parts"}
     assert mirrored == {"levator_anguli_oris_R", "depressor_anguli_oris_R", "corrugator_L"}
 
 

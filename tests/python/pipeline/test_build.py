@@ -521,7 +521,7 @@ def test_the_doctor_is_asked_once_or_not_at_all(ellipsoids, monkeypatch, small_m
 
     def diagnose(case, models=None):
         asked.append((case, models))
-        return (cmfsim.Finding.note("said-once", "something"),)
+        return (cmfsim.Finding("said-once", "something", severity="note"),)
 
     def examine(case, models=None):
         return cmfsim.doctor.Examination(diagnose(case, models), {})

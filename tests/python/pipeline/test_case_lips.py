@@ -164,8 +164,8 @@ def test_a_prediction_without_contact_warns_that_lips_may_pass_through_each_othe
         name: [found["code"] for found in cmfsim.predict_patient(some, "H").summary["findings"]]
         for name, some in (("separate", model), ("whole", whole))
     }
-    assert "lips-without-contact" in codes["separate"]
-    assert "lips-without-contact" not in codes["whole"]
+    assert "lips-contact" in codes["separate"]
+    assert "lips-contact" not in codes["whole"]
 
 
 def test_lips_press_on_each_other_and_do_not_pass(coarse):
@@ -255,7 +255,7 @@ def test_lips_do_not_enter_each_other_when_the_mandible_rises(coarse):
     touching = result.summary["touching"]
     # Coarse lips may end with a node that meets two facets by turns: the result then warns.
     warned = [f["code"] for f in result.summary.get("findings", [])]
-    assert touching["converged"] or "touching-stopped" in warned
+    assert touching["converged"] or "contact-stopped" in warned
     assert touching["pressed"] > 5
     assert touching["penetration"] < 0.1
     free = dataclasses.replace(coarse.scene, touching=(), obstacles=())

@@ -54,19 +54,19 @@ HARD = {
     "metal": (variants.with_metal, {"metal"}, (0.9, 1.1), (0.4, 3.0, 0.75)),
     "chin off": (
         lambda i: variants.cropped(i, 2, low=352.0),
-        {"ct-cut-bottom"},
+        {"ct-cut-off"},
         (0.5, 0.95),
         (0.3, 1.0, None),
     ),
     "forehead off": (
         lambda i: variants.cropped(i, 2, high=455.0),
-        {"ct-cut-top"},
+        {"ct-cut-off"},
         (0.5, 1.0),
         (0.3, 1.0, 0.85),
     ),
     "nose off": (
         lambda i: variants.cropped(i, 1, low=-308.0),
-        {"ct-cut-front"},
+        {"ct-cut-off"},
         (0.9, 1.0),
         (0.3, 3.0, 0.9),
     ),
@@ -231,4 +231,4 @@ def test_open_and_closed_skin_give_the_same_tissue(from_surfaces):
     closed, opened = (from_surfaces[n][1]["mesh"]["volume"] for n in ("skin", "skin_open"))
     assert opened == pytest.approx(closed, rel=0.005)
     assert 0.5e6 < closed < 2.5e6
-    assert "surface-closed" in {f["code"] for f in from_surfaces["skin_open"][1]["findings"]}
+    assert "surface-open" in {f["code"] for f in from_surfaces["skin_open"][1]["findings"]}

@@ -11,6 +11,7 @@ import pytest
 import cmfsim
 import head_case
 from cmfsim.cli import main
+from cmfsim.doctor import examine
 from cmfsim.io.files import toml_module
 from cmfsim.pipeline.drafting import init_case
 from cmfsim.pipeline.drafting.case_lines import quoted
@@ -95,6 +96,28 @@ def test_a_slicer_transform_is_inverted_and_stated_in_words(head):
     text = text_of(head).replace("\n# ", " ")
     assert "It moves the mandible 4.0 mm forwards, 1.0 mm up" in text
     assert "4.0 mm backwards, 1.0 mm down" in text
+
+
+def test_init_doctor_and_predict_state_one_plan_alike(head):
+    """Without landmarks each stated it at a point of its own surface: three sets of numbers."""
+    for name in ("skull", "skin"):
+        (head / f"{name}.mrk.json").unlink()
+    turned = cmfsim.rigid_motion((0.0, -4.0, 1.0), 8.0, (1.0, 0.2, 0.1), (3.0, -100.0, 1450.0))
+    cmfsim.write_transform(head / "mandible.tfm", turned, direction="from-parent")
+    init_case(head)
+    path = head / "case.toml"
+    text = path.read_text(encoding="utf-8")
+    # As coarse as a mesh can be: the segment's own surface ends 0.4 mm behind the bone.
+    path.write_text(
+        text.replace("[output]", "[mesh]\nedge_length = 12\n\n[output]"), encoding="utf-8"
+    )
+    case = cmfsim.Case.load(path)
+    stated = examine(case).plan["mandible"]
+    assert "pitch −7.8°" in stated.text
+    assert f"moves the mandible {stated.text}" in text.replace("\n# ", " ")
+    solved = cmfsim.predict(case, model="H", check=False).summary["plan"]["mandible"]["clinical"]
+    assert solved["text"].replace(f" [{solved['source']}]", "") == stated.text
+    assert np.allclose(solved["point"], stated.point, atol=1e-9)
 
 
 def without_comment(path):

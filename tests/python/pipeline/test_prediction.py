@@ -284,7 +284,7 @@ def test_a_study_keeps_what_is_finished_and_reports_what_fails(
 def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, monkeypatch):
     pytest.importorskip("jinja2")
     made = predictions["H"]
-    noticed = cmfsim.Finding.warning("inverted-tets", "3 of 9 tets are inverted", where="here")
+    noticed = cmfsim.Finding("inverted-tets", "3 of 9 tets are inverted", where="here")
     summary = {**made.result.summary, "findings": [dataclasses.asdict(noticed)]}
     result = dataclasses.replace(made.result, summary=summary)
     monkeypatch.setattr("cmfsim.solving.models.solved_scene", lambda *_: (result, None))

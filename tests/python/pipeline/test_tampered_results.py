@@ -37,7 +37,7 @@ def originals(prediction, evaluation, tmp_path_factory):  # noqa: F811
             )
         folder = tmp_path_factory.mktemp("results")
         noticed = dataclasses.asdict(
-            cmfsim.Finding.warning("x", "a thing", where="here", why="so", fix="do")
+            cmfsim.Finding("x", "a thing", severity="warning", where="here", why="so", fix="do")
         )
         summary = {**prediction.summary, "findings": [noticed], "note": "a note"}
         write(folder, dataclasses.replace(prediction, summary=summary), evaluation=evaluation)

@@ -191,7 +191,7 @@ def test_the_plan_that_init_proposes_is_accepted(tmp_path, bones):
     assert list(case.plan) == ["maxilla"]
     assert bool(case.osteotomies) == (bones != "cranium maxilla")
     if bones == "cranium mandible":
-        assert not [f for f in cmfsim.diagnose(case) if f.code == "plan-unknown-segment"]
+        assert not [f for f in cmfsim.diagnose(case) if f.code == "unknown-name"]
 
 
 # ------------------------------------------------------------------ pages about a case

@@ -3,43 +3,72 @@
 import importlib.util
 from pathlib import Path
 
+import pytest
 from finding_codes import package_findings
 
-from cmfsim.values.finding_table import FINDING_KINDS
+from cmfsim import Finding
+from cmfsim.values.finding_table import BLANK, FINDING_KINDS, FORMER_CODES
 
 ROOT = Path(__file__).parents[3]
-MADE = package_findings()
+SITES = package_findings()
+MADE = {site.code for site in SITES}
 
 
-def test_every_code_that_the_package_can_make_is_in_the_table():
-    assert sorted(set(MADE) - set(FINDING_KINDS)) == []
+def test_the_package_makes_the_codes_of_the_table_and_no_others():
+    assert set(FINDING_KINDS) == MADE
     # The reading of the source misses none of some that are made in different ways.
-    known = {"ct-upside-down", "surface-welded", "template-text", "template-file-missing",
-             "plan-through-bone", "postoperative-other-face"}  # fmt: skip
-    assert known <= set(MADE)
+    assert {"ct-flipped", "surface-inner-wall", "landmark-outside-image", "file-missing"} <= MADE
+    assert len(SITES) > 200
 
 
-def test_no_code_of_the_table_is_unused():
-    assert sorted(set(FINDING_KINDS) - set(MADE)) == []
+def test_a_site_states_a_severity_only_where_the_code_has_several():
+    for site in SITES:
+        stated = set(FINDING_KINDS[site.code].severity.split(" or "))
+        assert stated <= {"error", "warning", "note"}, site.code
+        # A site of two codes states the severity for both.
+        if "severity" not in site.given:
+            assert len(stated) == 1, site.place
+        elif len({other.code for other in SITES if other.place == site.place}) == 1:
+            assert len(stated) > 1, site.place
+            assert site.severities <= stated, site.place
 
 
-def test_every_code_has_its_severities_and_texts():
+def test_every_code_has_its_texts_and_no_site_repeats_them():
     for code, kind in FINDING_KINDS.items():
-        stated = set(kind.severity.split(" or "))
-        for severities, *_ in MADE[code]:
-            # Those of a variable are not in the source.
-            assert stated <= severities or severities <= stated, code
         assert all(len(text.strip("… ")) >= 8 for text in (kind.meaning, kind.why, kind.fix)), code
+    for site in SITES:
+        kind = FINDING_KINDS[site.code]
+        for name, text in (("what", kind.meaning), ("why", kind.why), ("fix", kind.fix)):
+            assert site.text(name) != text, f"{site.place}: {name}"
 
 
-def test_a_reason_or_remedy_without_figures_is_that_of_the_table():
-    for code, sites in MADE.items():
-        if len(sites) != 1:
-            continue
-        (_, _, why, fix) = sites[0]
-        for text, stated in ((why, FINDING_KINDS[code].why), (fix, FINDING_KINDS[code].fix)):
-            if text and "…" not in text and len(text) > 8:
-                assert stated == text.strip(" ,"), code
+def test_what_a_text_of_the_table_leaves_open_is_given_by_every_site():
+    for site in SITES:
+        kind = FINDING_KINDS[site.code]
+        texts = (("what", kind.meaning), ("why", kind.why), ("fix", kind.fix))
+        left = [text for name, text in texts if name not in site.given]
+        blanks = {name for text in left for name in BLANK.findall(text)}
+        assert blanks == site.facts, site.place
+        assert "…" not in "".join(left).replace('"…"', "").replace(", …)", ""), site.place
+
+
+def test_a_finding_takes_from_the_table_what_it_does_not_state():
+    found = Finding("unknown-name", "the plan moves 'chin'", facts={"names": "maxilla, mandible"})
+    assert (found.severity, found.fix) == ("error", "use one of: maxilla, mandible")
+    assert found.why == FINDING_KINDS["unknown-name"].why
+    # What is not given stays open; what is given stays.
+    assert Finding("unknown-name", "x").fix == "use one of: …"
+    assert Finding("unknown-name", "x", fix="{names}", severity="note").fix == "{names}"
+    with pytest.raises(ValueError, match="severity"):
+        Finding("surface-open", "severities of this code depend on the size")
+
+
+def test_results_with_former_codes_are_read_with_those_of_today():
+    assert not set(FORMER_CODES) & set(FINDING_KINDS)
+    assert set(FORMER_CODES.values()) <= set(FINDING_KINDS)
+    stored = {"severity": "warning", "code": "ct-cut-bottom", "what": "chin cut off", "why": "w"}
+    found = Finding.from_values(stored)
+    assert (found.code, found.what, found.why) == ("ct-cut-off", "chin cut off", "w")
 
 
 def test_the_page_is_what_the_script_writes():

@@ -78,7 +78,7 @@ def test_tooth_rows_that_rise_too_steeply_make_their_sites_doubtful():
 def test_a_jaw_that_cannot_be_one_is_named_so(change, why):
     found = proposed(change)
     assert why in found.impossible_jaw
-    assert [f.severity for f in found.findings if f.code == "jaw-impossible"] == ["warning"]
+    assert [f.severity for f in found.findings if f.code == "jaw-doubtful"] == ["warning"]
 
 
 @pytest.fixture

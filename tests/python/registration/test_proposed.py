@@ -178,7 +178,7 @@ def test_a_chin_that_the_image_cuts_off_is_missing_and_the_rest_is_not(person):
     assert {"menton", "pogonion", "supramentale"} <= set(partial.missing_skull)
     assert "bottom border" in partial.missing_skull["menton"]
     assert "pogonion" in partial.missing_skin
-    assert any(f.code == "landmarks-missing" and "menton" in f.what for f in partial.findings)
+    assert any(f.code == "landmark-missing" and "menton" in f.what for f in partial.findings)
     errors = _errors(partial.skull, head.skull_landmarks)
     assert len(errors) >= 22
     assert np.mean(list(errors.values())) < 2.0

@@ -114,28 +114,35 @@ def test_each_segment_is_measured_where_surgeons_measure_it():
         assert found.place.startswith(words_of_it)
 
 
-def test_without_landmarks_the_surface_tells_where_the_teeth_are():
-    """The lower front of an upper jaw, the upper front of a lower one, each in the midline."""
+def test_without_landmarks_a_motion_is_stated_at_an_end_of_the_segment():
+    """Front and below for jaws, behind and below for rami: the same on any triangulation."""
     x, y, z = np.meshgrid(np.arange(-30, 31, 3.0), np.arange(-60, 1, 3.0), np.arange(0, 31, 3.0))
     box = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     upper = cmfsim.clinical_motion("maxilla", np.eye(4), vertices=box)
-    assert upper.point[1] == -60
-    assert (np.abs(upper.point[[0, 2]]) <= 10).all()
+    assert upper.point.tolist() == [0.0, -60.0, 0.0]
+    assert "near the incisors, at (0.0, -60.0, 0.0)" in upper.place
     lower = cmfsim.clinical_motion("mandible", np.eye(4), vertices=box)
-    assert (lower.point[1], abs(lower.point[0]) <= 10, lower.point[2] >= 20) == (-60, True, True)
-    assert "where the incisors are" in lower.place
+    assert (lower.point.tolist(), "near the chin" in lower.place) == ([0.0, -60.0, 0.0], True)
     ramus = cmfsim.clinical_motion("ramus_left", np.eye(4), vertices=box)
-    assert ramus.point[1:].tolist() == [0.0, 0.0]
+    assert ramus.point.tolist() == [0.0, 0.0, 0.0]
+    # Four times as many points on the left: the mean of the vertices would be another.
+    left = box[box[:, 0] > 0.0]
+    dense = np.concatenate([box, left + [0.0, 0.1, 0.0], left + [0.0, 0.2, 0.0]])[:, :3]
+    dense = dense[dense[:, 1] <= 0.0]
+    for name in ("maxilla", "piece"):
+        found = [cmfsim.clinical_motion(name, np.eye(4), vertices=v).point for v in (box, dense)]
+        assert np.array_equal(*found)
 
 
 def test_a_motion_of_vertices_is_its_nearest_rigid_one_with_what_that_leaves():
     rng = np.random.default_rng(1)
     shape = cmfsim.SurfaceData(rng.uniform(-20, 20, (400, 3)), [[0, 1, 2]])
     here = np.asarray(shape.vertices)
-    matrix = cmfsim.rigid_motion((0, -5, 0), 3, (0, 0, 1), here.mean(axis=0))
+    middle = 0.5 * (here.min(axis=0) + here.max(axis=0))
+    matrix = cmfsim.rigid_motion((0, -5, 0), 3, (0, 0, 1), middle)
     there = here @ matrix[:3, :3].T + matrix[:3, 3]
     rigid = cmfsim.clinical_motion("piece", cmfsim.MovedSurface(shape, there))
-    assert "5.0 mm forwards at the middle of its surface, a guess at (" in rigid.text
+    assert "5.0 mm forwards at the middle of its extent, at (" in rigid.text
     noisy = there + rng.normal(0, 0.5, there.shape)
     found = cmfsim.clinical_motion("piece", cmfsim.MovedSurface(shape, noisy))
     assert found.residual == pytest.approx(0.5 * 3**0.5, rel=0.1)

@@ -68,7 +68,7 @@ def test_the_demo_brings_no_landmarks_and_states_how_they_were_found(folder):
     assert "46 landmarks were found automatically" in page
     assert "Measured from the closest point" in page
     evaluation = json.loads((folder / "out/metrics.json").read_text(encoding="utf-8"))
-    assert "regions-proposed" in {f["code"] for f in evaluation["findings"]}
+    assert "regions-none" in {f["code"] for f in evaluation["findings"]}
     # No distance depends on a landmark that nobody placed.
     methods = {entry["comparison"]["method"] for entry in evaluation["models"].values()}
     assert methods == {"closest"}

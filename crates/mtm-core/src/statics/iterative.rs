@@ -137,6 +137,11 @@ impl Iterative {
         }
     }
 
+    /// Whether the tissue's contrast is so large that estimates need a trial.
+    pub fn doubtful(&self) -> bool {
+        self.doubtful
+    }
+
     /// The matrix without constraints.
     pub fn matrix(&self) -> &BlockMatrix {
         &self.matrix
@@ -176,7 +181,7 @@ impl Iterative {
     ///
     /// The length of the tolerance is known before the solution: one cycle guesses it, and at contrasts near the
     /// limit of f64 it may guess far more than anything moves.
-    fn check_worth(&self, solution: &[[f64; 3]], solve: &Solve<'_>) -> Result<()> {
+    pub fn check_worth(&self, solution: &[[f64; 3]], solve: &Solve<'_>) -> Result<()> {
         let length = solution.iter().fold(solve.scale, |m, v| m.max(norm(*v)));
         let (value, limit) = (solve.effort.error_estimate, WORTH.max(self.tolerance) * length);
         if value <= limit {

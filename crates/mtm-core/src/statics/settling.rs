@@ -73,6 +73,13 @@ impl Unfactored {
         let state = sliding.solve(motions, first, &contact, interrupted, &mut body)?;
         // At least one step is always made, so there is a state.
         let rows = body.last.map_or_else(Vec::new, |last| last.to);
+        // A step that need not be exact estimates its own error, whatever the contrast.
+        if let Self::Iterative(iterative) = self
+            && iterative.doubtful()
+            && linked.share.is_none()
+        {
+            iterative.check_worth(&rows, body.solve)?;
+        }
         let effort = &mut body.solve.effort;
         effort.error_estimate = effort.error_estimate.max(left_by(&state));
         Ok(Settled { rows, contact: state, contact_seconds: clock.total() })

@@ -200,13 +200,12 @@ def _from_landmarks(
 
 def _far(distances: Mapping[str, float]) -> list[Finding]:
     return [
-        Finding.warning(
-            "lip-landmark-far",
+        Finding(
+            "lip-seam-doubtful",
             f"skin landmark {name} lies {away:.1f} mm from the seam between the lips that the skin "
             f"shows ({TRUSTED:g} mm at most are expected)",
             where="lips",
             why="one of the two is wrong, so the mouth may be cut in the wrong place",
-            fix="check the landmark, and the seam in node_kinds.png; give seam in [lips]",
         )
         for name, away in distances.items()
         if away > TRUSTED and name != "stomion"
@@ -222,8 +221,8 @@ def _outside(line: MouthLine, frame: MouthFrame, marks: Mapping[str, Floats]) ->
     if lower[2] < at[1] and at[0] < upper[2]:
         return []
     return [
-        Finding.warning(
-            "lip-seam-outside",
+        Finding(
+            "lip-seam-doubtful",
             f"the seam between the lips is at a height of {at.mean():.1f} mm over the middle of "
             f"the arches, the landmarks labiale_superius at {upper[2]:.1f} and labiale_inferius at "
             f"{lower[2]:.1f} mm: it should lie between them",
@@ -239,25 +238,20 @@ def _told(source: str, way: str) -> list[Finding]:
     if source != "landmarks" or way == "landmarks":
         return []
     return [
-        Finding.warning(
-            "lip-seam-from-landmarks",
+        Finding(
+            "lip-seam-doubtful",
             "the skin shows no gap or crease between the lips: the seam was placed from the skin "
             "landmarks of the mouth",
             where="lips",
             why="its position is accurate only to some millimetres",
-            fix="check it in node_kinds.png, or give seam in [lips]",
         )
     ]
 
 
 def _not_found(why: str) -> LipSeam:
-    finding = Finding.warning(
+    finding = Finding(
         "lip-seam-not-found",
         f"the lips were not separated: {why}",
         where="lips",
-        why="the upper and lower lip stay joined, and pull on each other when the jaws move apart",
-        fix="place the skin landmarks cheilion_L, cheilion_R, labiale_superius and "
-        "labiale_inferius and the skull landmarks of both arches, or give a surface between the "
-        "lips as seam in [lips]",
     )
     return LipSeam(None, "none", {"source": "none"}, (finding,))

@@ -101,24 +101,24 @@ def dental_arches(
 
 
 def _nothing_slides(missing: Sequence[str]) -> Finding:
-    return Finding.warning(
+    return Finding(
         "sliding-landmarks",
         f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing, and the "
         "image does not show teeth apart from bone",
+        severity="warning",
         where="landmarks",
-        why="lips and cheeks would be attached to the teeth",
         fix="place them, define regions, or set sliding = false",
     )
 
 
 def _from_teeth(missing: Sequence[str]) -> Finding:
-    return Finding.note(
-        "sliding-from-teeth",
+    return Finding(
+        "sliding-landmarks",
         f"landmarks {', '.join(missing)} are missing: the sliding regions were placed from the "
         "teeth that the image shows",
+        severity="note",
         where="landmarks",
         why="the depth of the vestibule is accurate only to about 3 mm",
-        fix="place the landmarks if lips or cheeks are important",
     )
 
 

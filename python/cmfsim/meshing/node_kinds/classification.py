@@ -356,12 +356,12 @@ def _noticed(
     points: Floats, kinds: NodeKinds, counts: Mapping[str, int], moved: Collection[str]
 ) -> list[Finding]:
     findings = [
-        Finding.warning(
-            "segment-without-nodes",
+        Finding(
+            "segment-no-tissue",
             f"no node is joined to {name!r}, which the plan moves "
             f"({counts[f'sliding on {name}']} slide on it)",
+            severity="warning",
             where=name,
-            why="its motion does not reach the tissue",
             fix="check the picture; increase bone_distance, or remove the segment from the plan",
         )
         for name in kinds.segments
@@ -371,10 +371,11 @@ def _noticed(
     spread = np.linalg.svd(held - held.mean(axis=0), compute_uv=False) if len(held) else [0.0, 0.0]
     if len(held) < HOLDING_NODES or spread[1] <= 1e-6 * spread[0]:
         findings.append(
-            Finding.error(
+            Finding(
                 "tissue-not-held",
                 f"{len(held)} nodes are fixed or joined: at least {HOLDING_NODES} not on one line "
                 "are needed",
+                severity="error",
                 where="node kinds",
                 why="the tissue could drift as a whole, so there is no unique solution",
                 fix="give fixed_planes (posterior), or increase bone_distance",

@@ -173,7 +173,7 @@ def _nearest(place: Floats, segments: Sequence[BoneSegment]) -> BoneSegment:
 
 
 def _by_vertex(skull: str) -> Finding:
-    return Finding.note(
+    return Finding(
         "septum-left-out",
         f"the nasal septum is not modelled: {skull} is followed vertex by vertex",
         where=f"segment {skull}",
@@ -184,11 +184,9 @@ def _by_vertex(skull: str) -> Finding:
 
 
 def _left_out(missing: Sequence[str]) -> Finding:
-    return Finding.note(
+    return Finding(
         "septum-left-out",
         f"the nasal septum is not modelled: {', '.join(missing)} "
         f"{'is' if len(missing) == 1 else 'are'} not among the landmarks",
         where="[landmarks]",
-        why="without its support, the tip of the nose follows the maxilla too far, mostly upwards",
-        fix="add these landmarks, or set septum = false in [node_kinds]",
     )

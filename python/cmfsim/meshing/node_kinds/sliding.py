@@ -65,14 +65,13 @@ def sliding_nodes(
 
 
 def _far_sheet(name: str, on_sheet: int, within: int) -> Finding:
-    return Finding.warning(
-        "contact-sheet-far",
+    return Finding(
+        "contact-sheet",
         f"of {within} nodes on {name!r} at the arch only {on_sheet} lie within {SHEET_DEPTH:g} mm "
         "of its contact sheet; the others are joined",
+        severity="warning",
         where=f"segment {name}",
         why="lips and cheeks would be attached to the teeth there",
-        fix="check the landmarks of the arch and the bone in anatomy.png, or set "
-        'contact_surface = "bone" in [node_kinds]',
     )
 
 

@@ -324,31 +324,25 @@ def _summed(done: Mapping[str, FittedMuscle], name: str) -> float:
 def _findings(done: Mapping[str, FittedMuscle]) -> Iterator[Finding]:
     before, after = (_summed(done, f"outside_{when}") for when in ("before", "after"))
     furthest = max(done, key=lambda name: done[name].largest_move)
-    yield Finding.note(
+    yield Finding(
         "muscles-fitted",
         f"muscles were moved into the tissue: {before:.0%} of their volume was in bone, in air "
         f"or outside the skin, now {after:.0%}; the muscle that moved most is {furthest}, by up "
         f"to {done[furthest].largest_move:.1f} mm",
         where="muscles",
-        why="landmarks are on the skull, so they do not show how thick the tissue is",
-        fix="nothing to do; fit = false in [muscles] keeps muscles where the landmarks place them",
     )
     for name, muscle in done.items():
         if muscle.outside_after > STILL_OUTSIDE:
-            yield Finding.note(
+            yield Finding(
                 "muscle-does-not-fit",
                 f"{muscle.outside_after:.0%} of {name} lies in bone, in air or outside the skin, "
                 f"{muscle.outside_before:.0%} before it was moved",
                 where=name,
-                why="the tissue is thinner there than the muscle; that part has no tets",
-                fix="check this muscle; landmarks near it may be misplaced",
             )
         if abs(muscle.volume_change) > VOLUME_CHANGE:
-            yield Finding.note(
+            yield Finding(
                 "muscle-volume-changed",
                 f"the volume of {name} changed by {muscle.volume_change:+.0%} as it was moved into "
                 "the tissue",
                 where=name,
-                why="the tissue is thinner there than the muscle, or thicker",
-                fix="check this muscle; landmarks near it may be misplaced",
             )

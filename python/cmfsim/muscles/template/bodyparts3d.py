@@ -7,7 +7,7 @@ this package; `WHERE` states where to download them.
 import hashlib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,10 +52,11 @@ MIRROR_VOLUME_SHARE = 0.05
 
 # Measured on these files: 49002 runs forward on its way down, behind and 2.4 mm inside 49005, as
 # the deep part does. Names follow the ids all the same, so that they can be looked up.
-_EXCHANGED_NAMES = Finding.note(
-    "bodyparts3d-names",
+_EXCHANGED_NAMES = Finding(
+    "bodyparts3d-parts",
     "the parts called superficial lie behind and inside those called deep: the atlas seems to have "
     "exchanged them",
+    severity="note",
     where="masseter_superficial, masseter_deep (FMA49001 to FMA49005)",
     why="only the names are affected: each part keeps its position and direction",
     fix="remember this when you interpret the names anatomically",
@@ -192,7 +193,16 @@ def _verified(folder: Path, *, must_be_known: bool) -> list[Finding]:
             f"{folder.name}: {what}; {fix}, or import without verification (--any-files)"
         )
     why = "other releases have different coordinates, and files may have been damaged"
-    return [Finding.warning("bodyparts3d-other-file", what, where=folder.name, why=why, fix=fix)]
+    return [
+        Finding(
+            "bodyparts3d-parts",
+            what,
+            severity="warning",
+            where=folder.name,
+            why=why,
+            fix=fix,
+        )
+    ]
 
 
 def _part(folder: Path, concept: str) -> _Part:
@@ -205,10 +215,11 @@ def _part(folder: Path, concept: str) -> _Part:
     if not is_sound:
         findings = (
             *findings,
-            Finding.warning(
-                "bodyparts3d-broken",
+            Finding(
+                "bodyparts3d-parts",
                 f"{len(repaired.borders)} borders and {len(repaired.non_manifold)} forked edges "
                 "remain",
+                severity="warning",
                 where=concept,
                 why="generalised winding numbers bridge small gaps; the edge of the muscle is "
                 "blurred",
@@ -233,13 +244,13 @@ def _both_sides(
     good, bad = (left, right) if left_is_better else (right, left)
     sides = ("left", "right") if left_is_better else ("right", "left")
     mirrored = _mirrored(good.surface, landmarks)
-    finding = Finding.note(
-        "bodyparts3d-mirrored",
+    finding = Finding(
+        "bodyparts3d-parts",
         f"the {sides[1]} one ({bad.concept}: {bad.volume:.0f} mm³, {bad.damage[2]} pieces) is "
         f"mirrored from the {sides[0]} one ({good.concept}: {good.volume:.0f} mm³)",
+        severity="note",
         where=f"{pair.name}_{'R' if left_is_better else 'L'}",
         why="part of it is missing from its file",
-        fix="nothing to do; check the muscle",
     )
     surfaces = (good.surface, mirrored) if left_is_better else (mirrored, good.surface)
     return surfaces, [finding]
@@ -264,14 +275,4 @@ def _mirrored(surface: SurfaceData, landmarks: Mapping[str, Floats]) -> SurfaceD
 
 def _renamed(findings: tuple[Finding, ...], name: str) -> list[Finding]:
     """Findings about a file as findings about a muscle."""
-    return [
-        Finding(
-            severity=f.severity,
-            code=f.code,
-            what=f.what,
-            where=f"{name} ({f.where})",
-            why=f.why,
-            fix=f.fix,
-        )
-        for f in findings
-    ]
+    return [replace(f, where=f"{name} ({f.where})") for f in findings]

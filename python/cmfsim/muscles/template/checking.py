@@ -105,21 +105,9 @@ def _listed(names: list[str]) -> str:
 
 def _check_terms(template: TemplateData) -> Iterator[Finding]:
     if not template.attribution:
-        yield Finding.warning(
-            "template-attribution",
-            "attribution is not stated",
-            where=template.name,
-            why="most licences require attribution",
-            fix='write attribution = "…" in template.toml',
-        )
+        yield Finding("template-source", "attribution is not stated", where=template.name)
     if not template.source:
-        yield Finding.warning(
-            "template-source",
-            "source is not stated",
-            where=template.name,
-            why="its origin is unknown",
-            fix='write source = "…" in template.toml',
-        )
+        yield Finding("template-source", "source is not stated", where=template.name)
 
 
 def _check_sites(template: TemplateData) -> Iterator[Finding]:
@@ -128,21 +116,20 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
     missing = [name for name in SKULL_LANDMARKS if name not in template.landmarks]
     extra = [name for name in names if name not in SKULL_LANDMARKS]
     if missing:
-        yield Finding.warning(
+        yield Finding(
             "template-landmarks-missing",
             f"{len(missing)} of the {len(SKULL_LANDMARKS)} usual landmarks are missing: "
             f"{_listed(missing)}",
             where=template.name,
-            why="near them, muscles follow landmarks that are further away",
             fix="place them on the skull reference",
         )
     undefined = [name for name in extra if name not in template.definitions]
     if extra:
         yield Finding(
-            severity="warning" if undefined else "note",
-            code="template-landmarks-extra",
-            what=f"{len(extra)} landmarks have names defined by this template: {_listed(extra)}"
+            "landmark-extra",
+            f"{len(extra)} landmarks have names defined by this template: {_listed(extra)}"
             + (f"; without a definition: {_listed(undefined)}" if undefined else ""),
+            severity="warning" if undefined else "note",
             where=template.name,
             why="they can be used only for patients with landmarks of the same names",
             fix="describe their positions under [landmarks.definitions], or use the usual names",
@@ -150,8 +137,8 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
     points = np.array(list(template.landmarks.values()))
     pairs = _coincident(points)
     for one, other in pairs:
-        yield Finding.error(
-            "template-landmarks-coincide",
+        yield Finding(
+            "template-landmarks",
             f"{names[one]} and {names[other]} lie in the same place",
             where=template.name,
             why="no map can send one point to two places",
@@ -160,12 +147,11 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) < 4 or spread[-1] <= PLANE_SHARE * spread[0]:
         found = f"there are {len(points)}" if len(points) < 4 else "all are in one plane"
-        yield Finding.error(
-            "template-landmarks-flat",
+        yield Finding(
+            "template-landmarks",
             f"four landmarks that do not lie in a plane are needed: {found}",
             where=template.name,
             why="the map to a patient is undefined in the third direction",
-            fix="place more landmarks",
         )
 
 
@@ -181,8 +167,8 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
     swapped = wrong_sides(template.landmarks)
     if swapped:
         everything = len(swapped) == len(pairs)
-        yield Finding.error(
-            "template-landmarks-swapped",
+        yield Finding(
+            "left-right-swapped",
             "left and right are swapped in "
             + ("every pair" if everything else f"{len(swapped)} pairs")
             + f": {_listed(swapped)}",
@@ -197,8 +183,8 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
     points = np.array(list(template.landmarks.values()))
     for name, distance in zip(template.landmarks, _distances(skull, points), strict=True):
         if distance > LANDMARK_DISTANCE:
-            yield Finding.warning(
-                "template-landmark-off-skull",
+            yield Finding(
+                "template-off",
                 f"{name} lies {distance:.1f} mm from the skull reference (at most "
                 f"{LANDMARK_DISTANCE:g})",
                 where=template.name,
@@ -212,9 +198,10 @@ def _check_skull(template: TemplateData) -> Iterator[Finding]:
     extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
     low, high = SKULL_EXTENT
     if not low <= extent <= high:
-        yield Finding.error(
-            "template-skull-size",
+        yield Finding(
+            "surface-units",
             f"the skull reference is {extent:.3g} mm long (a head has {low:g} to {high:g})",
+            severity="error",
             where=template.name,
             why="its unit is not mm, or it is not a skull",
             fix='state the unit of the files: units = "cm"',
@@ -227,9 +214,10 @@ def _check_partners(template: TemplateData) -> Iterator[Finding]:
     for muscle in template.muscles:
         ending = muscle.name[-2:] if muscle.name[-2:] in {"_L", "_R"} else ""
         if ending != ("" if muscle.side == "both" else f"_{muscle.side}"):
-            yield Finding.error(
-                "template-side-name",
+            yield Finding(
+                "template-sides",
                 f"the side is {muscle.side!r}, the name ends in {ending or 'no side'!r}",
+                severity="error",
                 where=muscle.name,
                 why="muscles are addressed by names that state their side",
                 fix="end the name in _L or _R, or in neither for side both",
@@ -237,17 +225,17 @@ def _check_partners(template: TemplateData) -> Iterator[Finding]:
         elif ending:
             partner = muscle.name[:-1] + ("R" if muscle.side == "L" else "L")
             if partner not in kinds:
-                yield Finding.warning(
-                    "template-partner-missing",
+                yield Finding(
+                    "template-sides",
                     f"there is no {partner}",
+                    severity="warning",
                     where=muscle.name,
-                    why="a muscle on one side only pulls the face to that side",
-                    fix="add it, mirrored if necessary",
                 )
             elif muscle.side == "L" and kinds[partner] != muscle.kind:
-                yield Finding.warning(
-                    "template-partner-kind",
+                yield Finding(
+                    "template-sides",
                     f"it is a {muscle.kind}, {partner} a {kinds[partner]}",
+                    severity="warning",
                     where=muscle.name,
                     why="fibres would differ between the sides",
                     fix="give both the same kind",
@@ -260,13 +248,11 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
         return
     nearest = float(_distances(skull, muscle.surface.vertices).min())
     if nearest > MUSCLE_DISTANCE:
-        yield Finding.warning(
-            "template-far-from-skull",
+        yield Finding(
+            "template-off",
             f"its distance from the skull is never below {nearest:.0f} mm (at most "
             f"{MUSCLE_DISTANCE:g})",
             where=muscle.name,
-            why="it has another frame or unit than the skull, or is not a muscle of the face",
-            fix="convert both to one frame",
         )
     yield from _check_course(muscle)
 
@@ -274,35 +260,34 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
 def _check_muscle_surface(muscle: MuscleSurface) -> Iterator[Finding]:
     report = check_surface(muscle.surface)
     if report.volume < 0.0:
-        yield Finding.error(
-            "template-inside-out",
+        yield Finding(
+            "surface-normals",
             f"it encloses {report.volume:.0f} mm³: normals point inwards",
+            severity="error",
             where=muscle.name,
-            why="inside and outside are swapped",
-            fix="flip its triangles (cmfsim.repair_surface)",
         )
     if not report.is_closed:
         length = sum(loop.length for loop in report.borders)
-        yield Finding.warning(
-            "template-open",
+        yield Finding(
+            "surface-open",
             f"{len(report.borders)} borders, {length:.1f} mm long",
+            severity="warning",
             where=muscle.name,
             why="near a gap, the winding number changes gradually from 1 to 0 instead of abruptly",
             fix="close it (cmfsim.repair_surface)",
         )
     if len(report.non_manifold) or report.inconsistent:
-        yield Finding.warning(
-            "template-not-manifold",
+        yield Finding(
+            "surface-non-manifold",
             f"{len(report.non_manifold)} edges of more than two triangles, {report.inconsistent} "
             "between triangles that face opposite ways",
             where=muscle.name,
-            why="the inside is ambiguous there",
-            fix="repair it (cmfsim.repair_surface)",
         )
     if report.crossings is not None and len(report.crossings):
-        yield Finding.note(
-            "template-crosses-itself",
+        yield Finding(
+            "surface-crossing",
             f"{len(report.crossings)} pairs of triangles intersect",
+            severity="note",
             where=muscle.name,
             why="winding numbers above ½ count as inside, so only folds of the surface are "
             "affected",
@@ -319,8 +304,8 @@ def _check_course(muscle: MuscleSurface) -> Iterator[Finding]:
         outside = body.winding_number(line) < 0.5
         away = float(_distances(body, line)[outside].max(initial=0.0))
         if away > COURSE_DISTANCE:
-            yield Finding.warning(
-                "template-course-outside",
+            yield Finding(
+                "template-off",
                 f"fibre line {number} leaves it by {away:.1f} mm (at most {COURSE_DISTANCE:g})",
                 where=muscle.name,
                 why="the line may belong to another muscle",
@@ -337,10 +322,9 @@ def _check_sides(template: TemplateData) -> Iterator[Finding]:
             continue
         across = middles[muscle.name] - middles[partner]
         if across < 0.0:
-            yield Finding.error(
-                "template-muscles-swapped",
+            yield Finding(
+                "left-right-swapped",
                 f"it lies {-across:.0f} mm to the right of {partner}",
                 where=muscle.name,
-                why="left and right are swapped",
                 fix="swap the names, or correct the frame: x grows to the patient's left",
             )

@@ -249,13 +249,10 @@ def muscles_left_out(names: Sequence[str], reason: str) -> Finding:
     """The warning that muscles are left out."""
     listed = ", ".join(names[:MOST_NAMES])
     listed += f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-    return Finding.warning(
+    return Finding(
         "muscles-left-out",
         f"{len(names)} muscles are left out: {listed}: {reason}",
         where="landmarks",
-        why="their place in this head is unknown; the tissue there is that of fat",
-        fix="place menton, gonion_L and gonion_R for muscles of the lower jaw, nasion, "
-        "zygomatic_arch_L and zygomatic_arch_R for those of the cranium",
     )
 
 
@@ -278,7 +275,7 @@ def missing_landmarks(
     listed += f" and {len(missing) - MOST_NAMES} more" if len(missing) > MOST_NAMES else ""
     few = len(used) < FEW_LANDMARKS
     return (
-        Finding.warning(
+        Finding(
             "template-landmarks-missing",
             f"{len(missing)} of the template's {len(template.landmarks)} landmarks are missing: "
             f"{listed}; muscles are placed by the other {len(used)}",
@@ -288,7 +285,6 @@ def missing_landmarks(
             if few
             else "muscles near the missing landmarks follow their neighbours; with only six "
             "landmarks, well spread, the predicted skin changes by about 0.3 mm",
-            fix="place them, or use a homogeneous model",
         ),
     )
 
@@ -299,21 +295,16 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
         left_out = leave_one_out(matched.source, matched.target, matched.names)
     except LandmarkError as error:
         what = f"landmarks cannot be compared with one another: {error}"
-        why = "a misplaced landmark would go unnoticed"
-        finding = Finding.note(
-            "template-landmarks-few", what, where="landmarks", why=why, fix="place more"
-        )
-        return None, [finding]
+        return None, [Finding("template-landmarks-few", what, where="landmarks")]
     if not left_out.misplaced:
         return left_out, []
     distances = dict(zip(left_out.names, left_out.distances, strict=True))
     away = [f"{name} {distances[name]:.1f} mm" for name in left_out.misplaced]
     listed = ", ".join(away[:MOST_NAMES]) + (", …" if len(away) > MOST_NAMES else "")
-    finding = Finding.warning(
-        "template-landmarks-disagree",
+    finding = Finding(
+        "landmark-disagrees",
         f"{len(away)} landmarks are far from where the others place them: {listed}",
         where="landmarks",
-        why="each pulls nearby muscles along, and makes its neighbours look misplaced",
         fix="check the first one in both heads; place it again or omit it, and morph again",
     )
     return left_out, [finding]
@@ -348,8 +339,8 @@ def _folds(
 def _fold_finding(folds: Mapping[str, int], worst: tuple[float, str, Floats]) -> Finding:
     smallest, name, place = worst
     where = ", ".join(f"{x:.1f}" for x in place)
-    return Finding.warning(
-        "template-folds",
+    return Finding(
+        "correspondence-folds",
         f"the map turns {sum(folds.values())} vertices of {len(folds)} muscles inside out, most "
         f"severely in {name} (Jacobian {smallest:.2g})",
         where=f"template, at ({where}) mm",

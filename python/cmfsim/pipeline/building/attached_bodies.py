@@ -50,12 +50,11 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     place = mesh.nodes[tets[dropped]].reshape(-1, 3).mean(axis=0)
     speck = volume < SPECKS
     finding = Finding(
-        severity="note" if speck else "warning",
-        code="tissue-not-held",
-        what=f"{int(loose.sum())} bodies of tissue of {volume:.3g} mm³ in total touch no bone "
+        "tissue-not-held",
+        f"{int(loose.sum())} bodies of tissue of {volume:.3g} mm³ in total touch no bone "
         "and were removed",
+        severity="note" if speck else "warning",
         where=f"mesh, about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
-        why="nothing determines their motion",
         fix="nothing to do: they are specks outside the face"
         if speck
         else "check skin and bone nearby; a larger bone threshold or closing may have cut them off",

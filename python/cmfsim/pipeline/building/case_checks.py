@@ -138,7 +138,7 @@ def untouched(
         beside = ((vertices > low) & (vertices < high)).all(axis=1).any()
         what = (
             f"segment {name!r} moves, but no node of the tissue is joined to it or slides on it "
-            "(segment-touches-no-tissue)"
+            "(segment-no-tissue)"
         )
         where = case.where(f"plan.{name}")
         fix = (
@@ -147,11 +147,11 @@ def untouched(
         if name in case.plan or name in cut_segments(case) or beside:
             raise CaseInputError(f"{where}: {what}: the face would not follow it; {fix}")
         findings.append(
-            Finding.warning(
-                "segment-touches-no-tissue",
+            Finding(
+                "segment-no-tissue",
                 f"{what}; it is outside the meshed tissue, and the case does not mention it",
+                severity="warning",
                 where=where,
-                why="its motion does not reach the face",
                 fix="if it belongs to the face, widen [region]",
             )
         )

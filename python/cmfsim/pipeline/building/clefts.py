@@ -49,15 +49,12 @@ def without_clefts(
     if not inside.any():
         return mesh, kinds, ()
     volume = float(mesh.volumes[inside].sum())
-    finding = Finding.note(
+    finding = Finding(
         "clefts-left-out",
         f"{int(inside.sum())} tets of {volume:.0f} mm³ in total are in the clefts between "
         "segments and were removed: their distances from two segments add up to less than "
         f"{width:g} mm",
         where=f"segments {', '.join(sorted(moved))}",
-        why="there is air between the tooth rows, and at a cut the tissue is lifted off the "
-        "bone; tets stretched across would be inverted and hold the bones back",
-        fix="set cleft in [mesh] to another width, or to 0 to keep all tissue",
     )
     return *_without(mesh, kinds, inside), (finding,)
 
@@ -90,15 +87,12 @@ def without_crushed(
         return mesh, kinds, ()
     corners = mesh.nodes[mesh.tets[crushed]].reshape(-1, 3)
     low, high = (", ".join(f"{x:.0f}" for x in end) for end in (corners.min(0), corners.max(0)))
-    finding = Finding.note(
+    finding = Finding(
         "crushed-left-out",
         f"{int(crushed.sum())} tets of {float(mesh.volumes[crushed].sum()):.0f} mm³ in total would "
         f"keep less than {CRUSHED:.0%} of their volume between segments that move towards each "
         "other, and were removed",
         where=f"between ({low}) and ({high}) mm",
-        why="bones leave this tissue no room; its tets would be inverted and push the rest aside",
-        fix="check that the plan does not move bones into each other; kinematics linear, or cleft "
-        "0 in [mesh], keeps all tissue",
     )
     return *_without(mesh, kinds, crushed), (finding,)
 

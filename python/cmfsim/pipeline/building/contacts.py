@@ -180,10 +180,11 @@ def _mostly(inside: NDArray[np.bool_], bone: NDArray[Any]) -> bool:
 
 
 def _bears_both(name: str) -> Finding:
-    return Finding.note(
-        "contact-sheet-both-arches",
+    return Finding(
+        "contact-sheet",
         f"{name!r} carries the upper and the lower teeth: tissue slides on the smoothed bone, "
         "because a single contact sheet cannot extend past the edges of both",
+        severity="note",
         where=f"segment {name}",
         why="lips and cheeks move with both jaws, which move together",
         fix="separate the jaws in the image or surfaces if only one of them moves",
@@ -191,11 +192,12 @@ def _bears_both(name: str) -> Finding:
 
 
 def _sharp(jaw: str, name: str, sheet: ContactSheet, edge_length: float) -> Finding:
-    return Finding.warning(
-        "contact-sheet-sharp",
+    return Finding(
+        "contact-sheet",
         f"the contact sheet of the {jaw} arch has a radius of curvature of {sheet.radius:.1f} mm "
         f"where tissue slides; {RADIUS_IN_EDGES * edge_length:g} mm, half an edge of the tets, "
         "are needed so that the tets can follow it",
+        severity="warning",
         where=f"segment {name}",
         why="sliding may need many iterations there, or not converge",
         fix="check the bone at this arch, or use a smaller edge_length in [mesh]",

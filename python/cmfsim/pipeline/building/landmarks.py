@@ -112,7 +112,7 @@ def found_landmarks(
         anatomy = _with_one_bone(anatomy)
         points["skull"] = {n: p for n, p in points["skull"].items() if not is_lower_site(n)}
         stages.add([_without_mandible(found.impossible_jaw)])
-        findings = tuple(f for f in findings if f.code != "jaw-impossible")
+        findings = tuple(f for f in findings if f.code != "jaw-doubtful")
     elif anatomy is not read:
         stages.drop({BY_SHAPE})
     stages.add(head.findings)
@@ -170,34 +170,25 @@ def _with_one_bone(anatomy: Anatomy) -> Anatomy:
 
 def _not_found(reason: str, count: int) -> Finding:
     if count:
-        return Finding.warning(
+        return Finding(
             "landmarks-not-completed",
             f"the case names {count} landmarks of the skull, and no others were found "
             f"automatically: {reason}",
             where="landmarks",
-            why="what the placed ones do not suffice for is left out or refused",
-            fix="place more landmarks by hand",
         )
-    return Finding.warning(
+    return Finding(
         "landmarks-not-found",
         f"the case names no landmarks, and none were found automatically: {reason}",
         where="landmarks",
-        why="the region is placed by the depth of the head, and the contact of the "
-        "teeth from the image alone",
-        fix="place the landmarks by hand and name the files under [landmarks]",
     )
 
 
 def _without_mandible(reason: str) -> Finding:
-    return Finding.warning(
+    return Finding(
         "mandible-left-out",
         f"the mandible is not separated from the skull, because the part taken for it is not one: "
         f"{reason}; the plan does not need it",
         where="bone",
-        why="lower teeth do not close on the moved upper ones, and muscles of the lower jaw are "
-        "placed without its landmarks",
-        fix="place infradentale, sub_m2_L and sub_m2_R by hand and name the file under "
-        "[landmarks], or give surfaces of both bones",
     )
 
 

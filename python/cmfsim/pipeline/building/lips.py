@@ -102,14 +102,7 @@ def separated_at_seam(
     except MeshError:
         if seam.source != "gap":
             raise
-        finding = Finding.note(
-            "lips-apart",
-            "the lips are apart in the image as far back as the teeth, so there was no tissue "
-            "to separate",
-            where="lips",
-            why="contact between them is still active",
-            fix="nothing to do",
-        )
+        finding = Finding("lips-apart", where="lips")
         return mesh, kinds, (finding,)
     return held_part(separated.mesh, _with_new_nodes(mesh, kinds, separated.parents))
 

@@ -56,13 +56,12 @@ def _vertex_findings(
     """Findings about a bone that is followed vertex by vertex."""
     if len(found.pieces) > 1:
         areas = ", ".join(f"{piece.area / 100.0:.0f}" for piece in found.pieces)
-        yield Finding.note(
+        yield Finding(
             "motion-pieces",
             f"{name} moved as {len(found.pieces)} rigid pieces within its surface, of {areas} cm²",
             where=where,
             why="each piece is followed along its normals; between pieces the vertices are "
             "followed as they are",
-            fix="nothing to do; check the picture of the plan",
         )
     if not (is_still or found.is_rigid):
         yield _bent_finding(name, where, found.fit)
@@ -70,25 +69,21 @@ def _vertex_findings(
         why = "bending explains less motion along the surface than the vertices show"
         yield _slip_finding(name, where, found.slip, "rms", why)
     if found.noise > 0.0:
-        yield Finding.note(
-            "motion-noisy",
+        yield Finding(
+            "motion-slip",
             f"the vertices of {name} moved with {found.noise:.2f} mm of noise, which is averaged "
             "out",
             where=where,
-            why="bone does not bend from one vertex to the next, and the noise would crumple the "
-            "tissue on it",
-            fix="nothing to do",
         )
 
 
 def _slip_finding(name: str, where: str, slip: float, measure: str, why: str) -> Finding:
     """Vertices of a fitted mesh that slid along the bone."""
-    return Finding.note(
+    return Finding(
         "motion-slip",
         f"the vertices of {name} slid along its surface by {slip:.1f} mm ({measure})",
         where=where,
         why=f"{why}, so the slip is that of the fitted mesh, not of the bone, and is subtracted",
-        fix="nothing to do",
     )
 
 
@@ -110,16 +105,14 @@ def _size_findings(
             "motion of the bone"
         )
     yield Finding(
-        severity="warning" if is_sure and change > SCALED else "note",
-        code="moved-scaled",
-        what=f"{name} is {fit.scale:.3g} times as large after the operation as before (95 % "
+        "moved-scaled",
+        f"{name} is {fit.scale:.3g} times as large after the operation as before (95 % "
         f"interval {low:.3f} to {high:.3f}, by its shape)",
+        severity="warning" if is_sure and change > SCALED else "note",
         where=where,
         why="bone does not grow during an operation, so the scans are calibrated or segmented "
         f"differently by {change:.1%}; the motion is that of the middle of the bone, without "
         f"the change of size{common}",
-        fix="check the voxel sizes of both scans and the thresholds of both segmentations, and "
-        "measure again",
     )
 
 
@@ -139,14 +132,12 @@ def _open_finding(name: str, where: str, way: OpenDirection, method: str) -> Fin
         if method == "shape"
         else "the starting value of the search, so this part of the motion may be wrong"
     )
-    return Finding.warning(
+    return Finding(
         "motion-open",
         f"the shape of {name} hardly determines {words}: eigenvalue ratio {way.ratio:.3f}, "
         f"{OPEN:g} is needed",
         where=where,
-        why=f"its motion in that direction is {left}",
-        fix="give a larger or less symmetric part of the bone that includes teeth, or give the "
-        "motion as numbers in [plan]",
+        facts={"left": left},
     )
 
 
@@ -158,14 +149,10 @@ def _bent_finding(name: str, where: str, fit: ShapeFit | None) -> Finding:
         else f"its best rigid motion, at the best size, leaves {np.quantile(fit.off, 0.95):.1f} "
         "mm (95th percentile)"
     )
-    return Finding.warning(
+    return Finding(
         "motion-bent",
         f"{name} has a different shape after the operation: {left}",
         where=where,
-        why="bone does not bend during an operation; each vertex is followed along the normal of "
-        "the bone, and along the bone as far as bending explains it",
-        fix="if a piece was cut, make it a separate segment in [[osteotomies]]; otherwise check "
-        "both segmentations and the picture of the plan",
     )
 
 
@@ -176,15 +163,12 @@ def _removed_finding(name: str, where: str, patch: RemovedBone, severity: str) -
         "its vertices are not used" if severity == "warning" else ("it was not used for the motion")
     )
     return Finding(
-        severity=severity,
-        code="bone-removed",
-        what=f"{patch.area:.0f} mm² of {name} about ({at}) mm are missing after the operation, "
+        "bone-removed",
+        f"{patch.area:.0f} mm² of {name} about ({at}) mm are missing after the operation, "
         f"by up to {patch.depth:.1f} mm: this counts as removed bone, not as motion",
+        severity=severity,
         where=where,
-        why="bone that is ground away does not pull the tissue over it; that tissue follows the "
-        f"rest of the segment; {used}",
-        fix="check the bone there; if it was pushed in (fracture, impaction), define that part "
-        "as a separate bone",
+        facts={"used": used},
     )
 
 
@@ -215,11 +199,9 @@ def _stray_finding(name: str, where: str, patch: StrayPatch, *, is_still: bool) 
         )
     # A smaller scan after the operation cuts off the skull nearly always, which moves nothing.
     return Finding(
+        "achieved-piece-off",
+        what,
         severity="note" if is_still and not patch.has_bone else "warning",
-        code="achieved-piece-off",
-        what=what,
         where=where,
-        why="the piece was not used for the motion but moves with the rest of the segment, so "
-        "the face over it may be wrong by that distance",
         fix=fix,
     )

@@ -280,14 +280,13 @@ def _parted(
     named = {_numbered(segment.name, n): piece for n, piece in enumerate(pieces)}
     made = part_segment(segment, {name: piece.surface for name, piece in named.items()})
     findings.append(
-        Finding.note(
-            "motion-torn",
+        Finding(
+            "motion-pieces",
             f"{segment.name} moved as {len(made)} pieces: {', '.join(p.name for p in made)}",
             where=case.where(plan_key(case, segment.name)),
             why="neighbouring vertices moved apart by millimetres between them, so the bone was "
             "cut there: no tissue is joined to the gap, and each piece has its own contact "
             "surface",
-            fix="nothing to do; check the picture of the plan",
         )
     )
     return [(piece, named[piece.name]) for piece in made]

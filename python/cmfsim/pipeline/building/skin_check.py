@@ -70,12 +70,8 @@ def _tissue(anatomy: Anatomy, point: Floats, front: Floats, *, last: bool = Fals
 
 
 def _missing(what: str) -> Finding:
-    return Finding.warning(
+    return Finding(
         "skin-implausible",
         what,
         where="skin",
-        why="the level between air and tissue may have lost skin, or the image ends there: the "
-        "face is wrong there before it is moved",
-        fix="check the skin in the picture; try skin_threshold = -500 in [image], or use another "
-        "reconstruction of the scan",
     )

@@ -73,7 +73,7 @@ def _near_ends(
             how = (
                 "use a scan that extends further" if cut else f"move {key} in [region] further away"
             )
-            yield Finding.warning(
+            yield Finding(
                 "segment-near-end",
                 f"{segment.name}, which moves, "
                 + (
@@ -107,13 +107,11 @@ def _loose_ends(
             area = 0.5 * float(twice[chosen].sum())
             if area <= CUT_AREA:
                 continue
-            yield Finding.warning(
+            yield Finding(
                 "tissue-ends-loose",
                 f"the tissue ends on the {name} border of the image over {area:.0f} mm², and "
                 "nothing is fixed there",
                 where=f"{name} border, {'xyz'[axis]} = {end[axis]:.1f} mm",
-                why="the missing tissue would hold the face back, so the face moves too far "
-                "near that border",
                 fix="use an image that shows the whole face"
                 + (
                     ", or bring the posterior plane inside it (posterior_depth in [region])"

@@ -414,7 +414,7 @@ def _scale(image: ImageData) -> tuple[float, float, float] | None:
 
 def _are_turned_labels(path: Path, findings: tuple[Finding, ...]) -> bool:
     """Whether a file on a turned grid has labels, which are none once they are resampled."""
-    if path.is_dir() or not any(f.code in {"image-oblique", "image-sheared"} for f in findings):
+    if path.is_dir() or not any(f.code == "image-oblique" for f in findings):
         return False
     try:
         return are_labels(read_labels(path).labels[0])

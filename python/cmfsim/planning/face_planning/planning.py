@@ -251,9 +251,7 @@ class _Space:
         self.free = [name for name in dict.fromkeys(named) if name not in search.follows]
         if not self.free:
             raise CaseInputError("every segment follows another, so nothing is free to move")
-        skull = planning.patient.landmarks.get("skull", {})
-        surfaces = {s.name: s.surface.vertices for s in planning.patient.segments}
-        self.skull, self.surfaces = skull, surfaces
+        self.patient = planning.patient
         self.points = {name: self.stated(name, np.eye(4)).point for name in self.free}
         # The motion of the follower relative to its leader: the final bite.
         self.bites = {
@@ -262,7 +260,12 @@ class _Space:
         }
 
     def stated(self, name: str, motion: Floats) -> ClinicalMotion:
-        return clinical_motion(name, motion, landmarks=self.skull, vertices=self.surfaces.get(name))
+        return clinical_motion(
+            name,
+            motion,
+            landmarks=self.patient.landmarks.get("skull"),
+            vertices=self.patient.segment_vertices(name),
+        )
 
     def numbers_of_reference(self) -> Floats:
         rows = [self.stated(name, self.reference[name]) for name in self.free]

@@ -177,13 +177,11 @@ def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) 
     closest, _, _ = there.closest(fewer.vertices)
     away = float(np.linalg.norm(closest - fewer.vertices, axis=1).max())
     findings.append(
-        Finding.note(
+        Finding(
             "page-simplified",
             f"{name} has {count} triangles; the page draws it with "
             f"{len(fewer.triangles)}, at most {away:.2f} mm away",
             where=name,
-            why="a page with all triangles is slow to open and to send",
-            fix="nothing to do: predictions use all triangles",
         )
     )
     return fewer
@@ -256,11 +254,10 @@ def _carried(part: str, skin: SurfaceData, points: Floats) -> dict[str, NDArray[
 
 def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
     skull = planning.patient.landmarks.get("skull", {})
-    surfaces = {segment.name: segment.surface for segment in planning.patient.segments}
     boxes = segment_boxes(planning)
     found = []
     for name, centre in zip(planning.segments, planning.columns.centres, strict=True):
-        points = segment_points(name, skull, surfaces[name].vertices)
+        points = segment_points(name, skull, planning.patient.segment_vertices(name))
         found.append(
             {
                 "name": name,

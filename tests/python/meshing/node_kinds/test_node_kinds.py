@@ -276,7 +276,7 @@ def test_what_holds_nothing_is_said(head):
     )
     found = cmfsim.classify_nodes(nodes, triangles, anatomy, away, moved=["maxilla"], options=tiny)
     assert [(f.severity, f.code) for f in found.findings] == [
-        ("warning", "segment-without-nodes"),
+        ("warning", "segment-no-tissue"),
         ("error", "tissue-not-held"),
     ]
     assert cmfsim.segment_data(found.kinds, segments) == {}
