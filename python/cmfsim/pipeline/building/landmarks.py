@@ -90,11 +90,8 @@ def found_landmarks(
             stages.add([_not_found(str(error), len(skull))])
             return Head(case, placed, anatomy)
         head = unproposed_head(anatomy, str(error))
-    apart = _apart(head.landmarks, skull)
-    _check_jaw_of_placed(case, head.landmarks, skull, apart)
-    if any(size > DISAGREE for size in apart.values()):
-        listed = ", ".join(f"{name} by {size:.0f} mm" for name, size in apart.items())
-        reason = f"those found differ from those placed by hand: {listed}"
+    reason = _contradiction(case, head.landmarks, skull)
+    if reason:
         stages.add([_not_found(reason, len(skull))])
         return Head(case, placed, anatomy)
     found = filled_landmarks(head, read_placed_sites(case)) if placed else head.landmarks
@@ -126,6 +123,16 @@ def needs_lower_jaw(case: Case) -> bool:
         return True
     names = [*case.plan, *(n for cut in case.osteotomies for n in (*cut.segments, cut.bone or ""))]
     return any(jaw_of(name) == "lower" for name in names)
+
+
+def _contradiction(case: Case, found: ProposedLandmarks, skull: Mapping[str, Floats]) -> str:
+    """Why found sites are of no use beside placed ones; empty if they are."""
+    apart = _apart(found, skull)
+    _check_jaw_of_placed(case, found, skull, apart)
+    if all(size <= DISAGREE for size in apart.values()):
+        return ""
+    listed = ", ".join(f"{name} by {size:.0f} mm" for name, size in apart.items())
+    return f"those found differ from those placed by hand: {listed}"
 
 
 def _apart(found: ProposedLandmarks, skull: Mapping[str, Floats]) -> dict[str, float]:
