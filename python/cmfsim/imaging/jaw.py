@@ -122,8 +122,8 @@ def part_jaws(
     if _occlusal_points(given) is None:
         try:
             head = fitted_to(work, bone, skin, given)
-        except LandmarkError as reason:
-            return Jaws(None, None, None, (_not_parted(str(reason)),))
+        except LandmarkError as error:
+            return Jaws(None, None, None, (_not_parted(str(error)),))
         findings.append(_guessed())
     box = _box(work, bone, given) if head is None else model_box(work, head)
     domain = np.asfortranarray(bone.mask[box])
