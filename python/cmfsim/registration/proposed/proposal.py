@@ -122,6 +122,8 @@ def landmarks_from(
     lost = gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given")
     of_skin = SitesOfKind("skin", judged("skin", on_skin, pose, max(likeness)), lost, by_skin)
     all_skull, missing_skull = with_model(of_skull, fitted, pose.size)
+    added = {name: site for name, site in all_skull.items() if name not in of_skull.sites}
+    all_skull |= weakened(added, evidence, pose.size)
     all_skin, missing_skin = with_model(of_skin, fitted, pose.size)
     return ProposedLandmarks(
         all_skull,
