@@ -139,8 +139,8 @@ def part_jaws(
         if _one_row(given) is None:
             try:
                 head = fitted_to(work, bone, skin, given)
-            except LandmarkError as reason:
-                return Jaws(None, None, None, (_not_parted(str(reason)),))
+            except LandmarkError as error:
+                return Jaws(None, None, None, (_not_parted(str(error)),))
             against = _against(
                 {n: p for (kind, n), p in head.sites.items() if kind == "skull"}, given
             )

@@ -13,7 +13,7 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedSite
 
-__all__ = ["MissingSites", "judged", "missing_sites"]
+__all__ = ["IMAGE_ENDS", "MissingSites", "judged", "missing_sites"]
 
 # Expected error of a site on a head unlike any template, mm: what docs/landmarks.md reports of two
 # real heads, rounded up; sites not named, and heads like a template.
@@ -35,6 +35,8 @@ _ERRORS: Mapping[str, float] = MappingProxyType(
     }
 )
 USUAL_ERROR, ALIKE_ERROR = 2.0, 1.0
+# How the reason of a site begins that the image does not show.
+IMAGE_ENDS = "the image ends there"
 # Left and right differ by so much in few faces, mm of the average head.
 MOST_UNEVEN = 6.0
 # A point so near to where the image ends may lie on the cut instead of on bone, and one a little
@@ -100,7 +102,7 @@ def missing_sites(
         else:
             cut = _cut_at(skull[name], cuts, AT_CUT)
             if cut is not None:
-                gone[name] = f"the image ends there ({cut.name} border)"
+                gone[name] = f"{IMAGE_ENDS} ({cut.name} border)"
     _below_a_cut_chin(skull, cuts, pose, gone)
     there = {name: place for name, place in skull.items() if name not in gone}
     off = misfits(_own(there, pose), _own(skin, pose))
@@ -110,7 +112,7 @@ def missing_sites(
         if name not in skin:
             lost[name] = "the skin around it was not recognised"
         elif (cut := _cut_at(skin[name], cuts, AT_CUT)) is not None:
-            lost[name] = f"the image ends there ({cut.name} border)"
+            lost[name] = f"{IMAGE_ENDS} ({cut.name} border)"
         elif (support := next((n for n in SUPPORT.get(name, ()) if n in gone), None)) is not None:
             lost[name] = gone[support]
         elif name.startswith(ABOVE_CHIN) and off["skull"].get("pogonion", 0.0) > IMPOSSIBLE:
@@ -141,7 +143,7 @@ def _below_a_cut_chin(
     left = bottom[0].inside(skull["infradentale"]) / pose.size
     for name, least in (("supramentale", TO_FOLD), ("pogonion", TO_CHIN), ("menton", TO_CHIN)):
         if left < least:
-            gone.setdefault(name, "the image ends there (bottom border)")
+            gone.setdefault(name, f"{IMAGE_ENDS} (bottom border)")
 
 
 def _cut_at(point: Floats, cuts: Sequence[CutPlane], depth: float) -> CutPlane | None:

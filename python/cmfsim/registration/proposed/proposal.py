@@ -8,6 +8,7 @@ import numpy as np
 
 from cmfsim._core import Surface
 from cmfsim.errors import LandmarkInputError
+from cmfsim.registration.proposed.by_model import SitesOfKind, with_model
 from cmfsim.registration.proposed.detection import (
     Detected,
     HeadSurfaces,
@@ -47,8 +48,6 @@ LIKENESS = 0.8
 MIRRORED = 0.3
 # Rounds of finding sites and levelling the head by them.
 LEVEL_ROUNDS = 2
-# Sites of the cranium without which what was found is no head.
-LEAST_SITES = 12
 
 
 def landmarks_from(
@@ -100,7 +99,6 @@ def landmarks_from(
     likeness = [_likeness(template, parts.upper, pose, templates) for template in templates]
     found = _corrected(found, templates, likeness)
     skull = _evened({name: p for name, p in found.skull.items() if not name.startswith("_")})
-    _check_head(skull)
     surface = {False: parts.upper, True: parts.lower or parts.upper}
     placed = _on_surface(skull, pose, surface)
     on_skin = (
@@ -116,11 +114,22 @@ def landmarks_from(
     placed = {name: placed[name] for name in SKULL_LANDMARKS if name in placed.keys() - gone.skull}
     on_skin = {name: on_skin[name] for name in SKIN_LANDMARKS if name in on_skin.keys() - gone.skin}
     sites = judged("skull", placed, pose, max(likeness))
+    if evidence.impossible or parts.lower is None:
+        # The model puts no site on a surface that is no jaw.
+        del surface[True]
+    of_skull = SitesOfKind("skull", weakened(sites, evidence, pose.size), gone.skull, surface)
+    by_skin = {} if skin is None else {False: skin}
+    lost = gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given")
+    of_skin = SitesOfKind("skin", judged("skin", on_skin, pose, max(likeness)), lost, by_skin)
+    all_skull, missing_skull = with_model(of_skull, fitted, pose.size)
+    added = {name: site for name, site in all_skull.items() if name not in of_skull.sites}
+    all_skull |= weakened(added, evidence, pose.size)
+    all_skin, missing_skin = with_model(of_skin, fitted, pose.size)
     return ProposedLandmarks(
-        weakened(sites, evidence, pose.size),
-        judged("skin", on_skin, pose, max(likeness)),
-        gone.skull,
-        gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given"),
+        all_skull,
+        all_skin,
+        missing_skull,
+        missing_skin,
         evidence.impossible,
         evidence.reason,
         separation_points(sites, pose, average.skull),
@@ -141,16 +150,6 @@ def _fitted(parts: HeadSurfaces) -> FittedHead:
     """The model of shape in all bone, divided or not, and the skin."""
     bones = [parts.upper, *([] if parts.lower is None else [parts.lower])]
     return fit_head(samples_of(joined_surface(bones), parts.skin))
-
-
-def _check_head(skull: Mapping[str, Floats]) -> None:
-    """Refuses what has no orbits, or too few sites of a cranium."""
-    cranial = [name for name in skull if not name.startswith(JAW_SITES)]
-    if len(cranial) < LEAST_SITES or not any(n.startswith("suborbital") for n in cranial):
-        raise LandmarkInputError(
-            f"{len(cranial)} sites of the cranium were found, {LEAST_SITES} and an orbit are "
-            "needed: the bones do not show a face, or are not in LPS; place the landmarks by hand"
-        )
 
 
 def _likeness(

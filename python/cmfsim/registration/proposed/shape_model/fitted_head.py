@@ -8,7 +8,13 @@ import numpy as np
 
 from cmfsim.errors import LandmarkInputError
 from cmfsim.registration.proposed.pose import Pose
-from cmfsim.registration.proposed.shape_model.fitting import MOST_GAP, Evidence, Known, refined
+from cmfsim.registration.proposed.shape_model.fitting import (
+    MOST_GAP,
+    SEEN_MARGIN,
+    Evidence,
+    Known,
+    refined,
+)
 from cmfsim.registration.proposed.shape_model.model import (
     CRANIUM,
     MANDIBLE,
@@ -110,6 +116,36 @@ class FittedHead:
         """Expected distance of each site from the true one, mm."""
         variances = np.diag(self.covariance).reshape(-1, 3).sum(axis=1)
         return dict(zip(SITES, np.sqrt(variances), strict=True))
+
+    def given(
+        self, points: Mapping[tuple[str, str], Floats], error: float
+    ) -> tuple[dict[tuple[str, str], Floats], dict[tuple[str, str], float]]:
+        """All sites and their expected errors, mm, if some are known: by the covariance alone.
+
+        Parameters
+        ----------
+        points : mapping of (kind, label) to (3,) float64, mm
+            In the patient's frame.
+        error : float, mm
+            Of each.
+        """
+        places = np.array([self.sites[site] for site in SITES]).ravel()
+        covariance = self.covariance
+        rows = [SITES.index(site) for site in points]
+        if rows:
+            taken = np.concatenate([np.arange(3 * row, 3 * row + 3) for row in rows])
+            away = np.array([*points.values()]).ravel() - places[taken]
+            among = covariance[np.ix_(taken, taken)] + error**2 / 3.0 * np.eye(len(taken))
+            gain = np.linalg.solve(among, covariance[taken]).T
+            places = places + gain @ away
+            covariance = covariance - gain @ covariance[taken]
+        sums = np.maximum(np.diag(covariance), 0.0).reshape(-1, 3).sum(axis=1)
+        moved = dict(zip(SITES, places.reshape(-1, 3), strict=True))
+        return moved, dict(zip(SITES, np.sqrt(sums).tolist(), strict=True))
+
+    def shows(self, point: Floats) -> bool:
+        """Whether the image shows a place of the patient's frame."""
+        return bool(self.samples.shows(point[None], SEEN_MARGIN)[0])
 
     @cached_property
     def fits(self) -> float:
