@@ -63,11 +63,12 @@ test-python: $(DEVELOP_STAMP)
 test-slow: $(DEVELOP_STAMP) ## run the tests that take minutes, such as README and docs typed from top to bottom
 	"$(PY)" -m pytest -m slow
 
-lint: lint-rust lint-python ## rustfmt, clippy, ruff, mypy, stubtest, the import rules and the licences
+lint: lint-rust lint-python ## rustfmt, clippy, rustdoc, ruff, mypy, stubtest, the import rules and the licences
 
 lint-rust: $(ENV_STAMP)
 	cargo fmt --all --check
 	cargo clippy --profile lint --workspace --all-targets $(CARGO_FLAGS) $(CORE_FEATURES) -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --profile lint --workspace --no-deps $(CARGO_FLAGS) $(CORE_FEATURES)
 
 lint-python: $(DEVELOP_STAMP)
 	"$(BIN)/ruff" check $(PYTHON_DIRS)

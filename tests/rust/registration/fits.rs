@@ -392,7 +392,7 @@ fn icp_says_what_stops_it() {
     let tree = PointTree::new(&points).unwrap();
     let plane = IcpOptions { method: Some(IcpMethod::Plane), ..base };
     let error = icp(&shifted, None, Fixed::Points(&tree), &plane, &|| false).unwrap_err();
-    assert!(matches!(error, MtmError::UnknownName { .. }));
+    assert!(matches!(error, MtmError::NotTogether { .. }));
     let one = PointTree::new(&points[..1]).unwrap();
     let error = icp(&shifted, None, Fixed::Points(&one), &base, &|| false).unwrap_err();
     assert!(matches!(error, MtmError::NotDetermined { .. }));

@@ -32,6 +32,7 @@ impl MtmError {
             | Self::OutOfRange { kind, .. }
             | Self::IndexOutOfRange { kind, .. }
             | Self::NotRigid { kind, .. }
+            | Self::NotTogether { kind, .. }
             | Self::UnknownName { kind, .. } => *kind,
             Self::DuplicateNode { .. }
             | Self::InvertedTet { .. }
@@ -50,6 +51,7 @@ impl MtmError {
             Self::ContactSurface { .. } | Self::ContactNotConverged { .. } => ErrorKind::Contact,
             Self::NotPositiveDefinite { .. }
             | Self::NotConverged { .. }
+            | Self::Overflow { .. }
             | Self::NoThreads { .. }
             | Self::OutOfMemory { .. } => ErrorKind::Solver,
             Self::TooFewPoints { .. }
@@ -69,6 +71,7 @@ impl MtmError {
             Self::ContactNotConverged { .. }
                 | Self::NotPositiveDefinite { .. }
                 | Self::NotConverged { .. }
+                | Self::Overflow { .. }
                 | Self::IcpNotConverged { .. }
                 | Self::OutOfMemory { .. }
                 | Self::NoThreads { .. }

@@ -387,6 +387,28 @@ pub enum MtmError {
     /// The caller asked to stop.
     #[error("interrupted by the caller")]
     Interrupted,
+    /// A choice that exists does not go with another one.
+    #[error("{what} is \"{found}\": {with} needs {needed}")]
+    NotTogether {
+        /// The choice.
+        what: &'static str,
+        /// Its value.
+        found: String,
+        /// What it does not go with.
+        with: &'static str,
+        /// The values that go with it.
+        needed: &'static str,
+        /// The family of the error.
+        kind: ErrorKind,
+    },
+    /// A result is too large for a number.
+    #[error("{what} is not finite: {why}")]
+    Overflow {
+        /// The result.
+        what: &'static str,
+        /// What makes it so large.
+        why: &'static str,
+    },
     /// A name is not one of those known.
     #[error("{what} \"{found}\" is unknown: use one of {known}")]
     UnknownName {

@@ -121,8 +121,8 @@ impl RigidMotion {
 ///
 /// # Errors
 /// [`MtmError::NotRigid`] with the error kind `kind` and the name `what` of the matrix: an entry that is not
-/// finite, a bottom row that differs from 0 0 0 1 by more than [`BOTTOM_ROW_TOLERANCE`], a reflection, or RᵀR
-/// that differs from I by more than [`RIGID_TOLERANCE`] (scale or shear), with the figure.
+/// finite, a bottom row that differs from 0 0 0 1 by more than `BOTTOM_ROW_TOLERANCE`, a reflection, or RᵀR
+/// that differs from I by more than `RIGID_TOLERANCE` (scale or shear), with the figure.
 pub fn rigid_matrix(what: &str, matrix: &[[f64; 4]; 4], kind: ErrorKind) -> Result<[[f64; 4]; 4]> {
     nearest_rigid(matrix).map_err(|problem| MtmError::NotRigid {
         what: what.to_owned(),

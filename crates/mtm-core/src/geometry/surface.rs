@@ -92,7 +92,7 @@ pub struct Closest {
 }
 
 impl Surface {
-    /// Surface with creases at [`CREASE_ANGLE`].
+    /// Surface with creases at `CREASE_ANGLE`.
     ///
     /// `vertices`: mm. `triangles`: indices into them, outward normals by the right-hand rule.
     /// Vertices that no triangle uses are allowed.

@@ -406,10 +406,11 @@ fn check(
         }
     }
     if options.method == Some(IcpMethod::Plane) && !is_surface {
-        return Err(MtmError::UnknownName {
-            what: "icp method for fixed points without a surface",
+        return Err(MtmError::NotTogether {
+            what: "icp method",
             found: "plane".to_owned(),
-            known: "point",
+            with: "a set of fixed points without a surface",
+            needed: "point",
             kind,
         });
     }

@@ -82,7 +82,7 @@ impl ThinPlateSpline {
     ///
     /// # Errors
     /// [`MtmError::Length`] for sets of different size, [`MtmError::TooFewPoints`] and
-    /// [`MtmError::OutOfRange`] for their number, coordinates beyond [`LARGEST_COORDINATE`](crate::error::LARGEST_COORDINATE) and a
+    /// [`MtmError::OutOfRange`] for their number, coordinates beyond `LARGEST_COORDINATE` and a
     /// negative smoothing, [`MtmError::NotFinite`], [`MtmError::CoincidentPoints`] and
     /// [`MtmError::FlatPoints`] for the source.
     pub fn new(source: Vec<[f64; 3]>, target: Vec<[f64; 3]>, smoothing: f64) -> Result<Self> {
@@ -132,9 +132,8 @@ impl ThinPlateSpline {
     /// Parallel; the result depends neither on the number of threads nor on the other points.
     ///
     /// # Errors
-    /// [`MtmError::NotFinite`] and, for a coordinate beyond
-    /// [`LARGEST_COORDINATE`](crate::error::LARGEST_COORDINATE),
-    /// [`MtmError::OutOfRange`] with the row.
+    /// [`MtmError::NotFinite`] and, for a coordinate beyond `LARGEST_COORDINATE`, [`MtmError::OutOfRange`] with the
+    /// row.
     pub fn warp(&self, points: &[[f64; 3]]) -> Result<Vec<[f64; 3]>> {
         check_coordinates("points", points)?;
         Ok(self.evaluate(points))

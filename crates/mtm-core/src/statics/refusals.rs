@@ -6,30 +6,33 @@ use crate::statics::solution::Solution;
 use crate::statics::solver::StaticSolver;
 
 impl StaticSolver {
-    /// Rejects kinematics and boundaries without a linear map from what drives the body to its displacements:
-    /// `kinematics` and `boundary` are what the error calls them.
-    pub(crate) fn check_linear(
-        &self,
-        kinematics: &'static str,
-        boundary: &'static str,
-    ) -> Result<()> {
+    /// Rejects kinematics and boundaries without a linear map from what drives the body to its displacements;
+    /// `result`: what such a map is needed for.
+    pub(crate) fn check_linear(&self, result: &'static str) -> Result<()> {
         if self.kinematics() != Kinematics::Linear {
-            return Err(MtmError::UnknownName {
-                what: kinematics,
-                found: self.kinematics().name().into(),
-                known: "linear (the others are no linear map; use solve)",
-                kind: ErrorKind::Solver,
-            });
+            return Err(self.not_linear(result));
         }
         if !self.node_kinds.touching().is_empty() {
-            return Err(MtmError::UnknownName {
-                what: boundary,
+            return Err(MtmError::NotTogether {
+                what: "boundary",
                 found: "touching pairs".into(),
-                known: "one without (contacts change with the plan; use solve)",
+                with: result,
+                needed: "none, since contacts change with the plan (solve takes them)",
                 kind: ErrorKind::Solver,
             });
         }
         Ok(())
+    }
+
+    /// The error for kinematics that are no linear map, which `result` needs.
+    pub(crate) fn not_linear(&self, result: &'static str) -> MtmError {
+        MtmError::NotTogether {
+            what: "kinematics",
+            found: self.kinematics().name().into(),
+            with: result,
+            needed: "linear, since the others are no linear map (solve takes them)",
+            kind: ErrorKind::Solver,
+        }
     }
 
     /// Rejects a starting solution of another mesh or boundary.

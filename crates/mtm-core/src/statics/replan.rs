@@ -49,7 +49,7 @@ impl StaticSolver {
         reference: Option<&Plan>,
         interrupted: Interrupt<'_>,
     ) -> Result<PlanOperator> {
-        self.check_linear("kinematics of a plan operator", "boundary of a plan operator")?;
+        self.check_linear("a plan operator")?;
         let mesh = self.tensors.mesh();
         let places = self.tensors.element_nodes().positions();
         let n = places.len();

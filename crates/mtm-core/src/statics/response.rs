@@ -49,10 +49,7 @@ impl StaticSolver {
         accuracy: f64,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
-        self.check_linear(
-            "kinematics of a first-order change",
-            "boundary of a first-order change",
-        )?;
+        self.check_linear("a first-order change")?;
         self.check_start(solution)?;
         self.check_accuracy(accuracy)?;
         let segments = self.node_kinds.segments();
@@ -137,10 +134,11 @@ impl StaticSolver {
         if accuracy > 0.0 && accuracy < 1.0 {
             return Ok(());
         }
-        Err(MtmError::UnknownName {
-            what: "accuracy of a first-order change",
-            found: accuracy.to_string(),
-            known: "a share above 0 and below 1",
+        Err(MtmError::OutOfRange {
+            what: "accuracy of a first-order change".into(),
+            index: 0,
+            value: accuracy,
+            allowed: "above 0 and below 1",
             kind: ErrorKind::Solver,
         })
     }

@@ -349,10 +349,11 @@ pub(crate) fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
 
 /// The error for a method that cannot solve for parts that touch.
 pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
-    MtmError::UnknownName {
-        what: "method for a boundary with touching pairs",
+    MtmError::NotTogether {
+        what: "method",
         found: method.name().into(),
-        known: "auto, pcg",
+        with: "a boundary with touching pairs",
+        needed: "auto or pcg",
         kind: ErrorKind::Solver,
     }
 }
@@ -361,10 +362,11 @@ pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
 /// factorisation.
 pub(crate) fn method_for_touching(options: &StaticOptions) -> Result<Method> {
     if options.kinematics != Kinematics::Linear {
-        return Err(MtmError::UnknownName {
-            what: "kinematics for a boundary with touching pairs",
+        return Err(MtmError::NotTogether {
+            what: "kinematics",
             found: options.kinematics.name().into(),
-            known: "linear",
+            with: "a boundary with touching pairs",
+            needed: "linear",
             kind: ErrorKind::Solver,
         });
     }

@@ -254,9 +254,9 @@ impl StaticSolver {
         let residual = self.residual(&forces, loads, (contact.as_ref(), &touch.forces), &b);
         let effort = solve.effort;
         if !(residual.is_finite() && effort.error_estimate.is_finite()) {
-            return Err(MtmError::NotPositiveDefinite {
-                node: 0,
-                detail: "the solution is not finite; the plan or the moduli overflow f64".into(),
+            return Err(MtmError::Overflow {
+                what: "the solution",
+                why: "the plan or the moduli are too large for f64",
             });
         }
         clock.lap("forces", true);
@@ -426,7 +426,7 @@ impl StaticSolver {
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
         let Mechanics::Linear(system) = &self.mechanics else {
-            unreachable!("plan operators of other kinematics are refused before they get here")
+            return Err(self.not_linear("a solve for columns"));
         };
         system
             .solve_columns(columns, accuracy, self.sliding.as_ref().zip(frozen), interrupted)

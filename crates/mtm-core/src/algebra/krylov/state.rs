@@ -8,7 +8,7 @@ use crate::error::{MtmError, Result, Shortfall};
 
 use super::operator::{Operator, Preconditioner};
 
-/// The solution of [`pcg`] and its accuracy.
+/// The solution of `pcg` and its accuracy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PcgOutcome {
     /// The solution, one row of three per block row, mm.

@@ -168,7 +168,7 @@ impl MuscleFibres {
     ///
     /// # Errors
     /// [`MtmError::Empty`] without a box; [`MtmError::NotFinite`] for a centre, axis or extent that is NaN or
-    /// infinite; [`MtmError::OutOfRange`] for axes that are not orthonormal within [`AXES_TOLERANCE`], and if a
+    /// infinite; [`MtmError::OutOfRange`] for axes that are not orthonormal within `AXES_TOLERANCE`, and if a
     /// half extent is negative or all are 0.
     pub fn from_boxes(boxes: Vec<OrientedBox>) -> Result<Self> {
         let kind = ErrorKind::Mesh;
@@ -268,7 +268,7 @@ impl MuscleFibres {
     }
 
     /// Whether the outline hardly determines the direction: a sheet without known lines, or a strap without
-    /// them whose two longest extents are nearly equal (above [`SHEET_RATIO`]).
+    /// them whose two longest extents are nearly equal (above `SHEET_RATIO`).
     pub fn is_sheet(&self) -> bool {
         if self.courses.is_some() {
             return false;

@@ -142,10 +142,11 @@ impl Equilibrium {
     ) -> Result<(Self, Method)> {
         let method = match options.method {
             Method::Relaxation => {
-                return Err(MtmError::UnknownName {
-                    what: "method with large rotations",
+                return Err(MtmError::NotTogether {
+                    what: "method",
                     found: options.method.name().into(),
-                    known: "auto, cholesky, pcg (relaxation needs linear kinematics)",
+                    with: "large deformation",
+                    needed: "auto, cholesky or pcg",
                     kind: ErrorKind::Solver,
                 });
             }
