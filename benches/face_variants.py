@@ -93,9 +93,10 @@ def data_folder() -> Path:
 
 
 def _turned(*angles: float) -> Variant:
+    x, y, z = angles
     return Variant(
-        lambda image: variants.turned(image, angles)[0],
-        lambda image: variants.turned(image, angles)[1],
+        lambda image: variants.turned(image, (x, y, z))[0],
+        lambda image: variants.turned(image, (x, y, z))[1],
     )
 
 
@@ -126,7 +127,9 @@ VARIANTS: Mapping[str, Variant] = {
     ),
     "nodding forwards by 25°": _turned(25.0, 0.0, 0.0),
     "nodding backwards by 25°": _turned(-25.0, 0.0, 0.0),
-    "round field of view, 16 cm": scan_variants.VARIANTS["cone beam, 160 mm of the head"],
+    "round field of view, 16 cm": Variant(
+        scan_variants.VARIANTS["cone beam, 160 mm of the head"].make
+    ),
     "cut above the brow": Variant(
         lambda i: variants.cropped(i, 2, high=float(_landmarks()["glabella"][2]) + 6.0)
     ),
@@ -134,7 +137,7 @@ VARIANTS: Mapping[str, Variant] = {
     "chin cut off": Variant(lambda i: _below(i, "menton", 25.0)),
     "one side": Variant(lambda i: variants.one_side(i, float(_landmarks()["nasion"][0]))),
     "no teeth": Variant(lambda i: variants.without_teeth(i, _landmarks())),
-    "brackets": scan_variants.VARIANTS["brackets and wire of steel"],
+    "brackets": Variant(scan_variants.VARIANTS["brackets and wire of steel"].make),
     "head holder": Variant(
         lambda i: variants.with_holder(variants.with_pillow(variants.without_couch(i, -107.0)))
     ),
@@ -188,7 +191,7 @@ def compared(
     moved = row["displacements"] @ back[:3, :3].T
     moves = np.linalg.norm(clean["displacements"], axis=1) > MOVES
     away, nearest = cKDTree(points).query(clean["points"][moves])
-    near = away < NEAR
+    near = np.less(away, NEAR)
     apart = np.linalg.norm(moved[nearest] - clean["displacements"][moves], axis=1)[near]
     if not len(apart):
         return {"mean": np.inf, "p95": np.inf, "covered": 0.0}
@@ -232,7 +235,7 @@ def _kept(cache: Path | None, name: str, edge: float, make: Callable[[], dict[st
     found = make()
     arrays = {k: v for k, v in found.items() if isinstance(v, np.ndarray)}
     plain = {k: v for k, v in found.items() if k not in arrays}
-    np.savez_compressed(path, plain=json.dumps(plain), **arrays)
+    np.savez_compressed(path, plain=json.dumps(plain), allow_pickle=False, **arrays)
     return found
 
 

@@ -80,7 +80,7 @@ def _rows(folder: Path, name: str) -> Iterator[str]:
         *((f"the same, {k} of the jaw placed", shifted, OF_JAW[:k], True) for k in range(1, 4)),
         ("none proposed, 7 placed", nothing, SEVEN, False),
     ):
-        head = ProposedHead(None, bones, skin, proposed)
+        head = ProposedHead(None, bones, skin, proposed)  # type: ignore[arg-type]  # is not used
         after = filled_landmarks(head, {key: (truth[key], SiteState()) for key in placed})
         sites = {("skull", n): s for n, s in after.skull.items()}
         sites |= {("skin", n): s for n, s in after.skin.items()}

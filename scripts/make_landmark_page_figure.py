@@ -38,7 +38,8 @@ def main() -> None:
         )
     gone = dict.fromkeys(REMOVED, "the image ends there (left border)")
     found = dataclasses.replace(found, skull=skull, missing_skull=gone)
-    content = head_content("ct_phantom", ProposedHead(None, bones, skin, found))
+    head = ProposedHead(None, bones, skin, found)  # type: ignore[arg-type]  # is not used
+    content = head_content("ct_phantom", head)
     browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         path = Path(folder) / "landmarks.html"
