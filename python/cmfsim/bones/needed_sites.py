@@ -10,10 +10,10 @@ from types import MappingProxyType
 import numpy as np
 
 from cmfsim.errors import LandmarkInputError
-from cmfsim.registration import REFERENCE_PLACES
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import is_lower_site
+from cmfsim.values.reference_places import REFERENCE_PLACES
 
 __all__ = ["NEEDED", "PLACING", "with_missing_sites"]
 

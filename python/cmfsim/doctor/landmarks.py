@@ -13,7 +13,6 @@ from cmfsim._core import Surface
 from cmfsim.doctor.places import direction_text, place_text, shift_text
 from cmfsim.errors import LandmarkError, RegistrationError
 from cmfsim.registration import (
-    REFERENCE_PLACES,
     common_shift,
     leave_one_out,
     mirror_agreement,
@@ -22,6 +21,7 @@ from cmfsim.registration import (
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.reference_places import REFERENCE_PLACES
 
 __all__ = [
     "LANDMARK_CODES",

@@ -13,11 +13,9 @@ from cmfsim.registration.consistency import (
 )
 from cmfsim.registration.folds import FoldReport, fold_report
 from cmfsim.registration.landmarks import LandmarkMatch, match_landmarks
-from cmfsim.registration.reference import REFERENCE_PLACES
 from cmfsim.registration.sides import side_vectors, wrong_sides
 
 __all__ = [
-    "REFERENCE_PLACES",
     "CommonShift",
     "FoldReport",
     "LandmarkAgreement",

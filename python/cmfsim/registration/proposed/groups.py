@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cmfsim.registration.reference import REFERENCE_PLACES
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES
+from cmfsim.values.reference_places import REFERENCE_PLACES
 
 __all__ = ["FAR_JAW", "JAW_SITES", "jaw_distance", "misfits"]
 
