@@ -74,6 +74,8 @@ SEED_RADIUS = 3.0
 ABOVE_JOINT = 20.0
 # Crowns and alveolar bone between these distances from the occlusal plane are seeds, mm.
 CROWN = (2.0, 16.0)
+# The same from the occlusal plane of the fitted model, whose sites are 3 to 5 mm off.
+MODEL_CROWN = (5.0, 16.0)
 # The occlusal plane lies this far from the sites of one row at incisors and molars, mm: 9 to 13 and
 # 11 to 20 in two skulls.
 TO_EDGES, TO_CUSPS = 10.0, 16.0
@@ -289,10 +291,7 @@ def _seeds(
     """1 mandible, 2 the rest, 0 to be flooded."""
     domain = bone.mask[box]
     seeds = np.zeros(domain.shape, dtype=np.int32, order="F")
-    x, y, z = (
-        (o + s * np.arange(n)).reshape([-1 if a == b else 1 for b in range(3)])
-        for a, (o, s, n) in enumerate(zip(work.origin, work.spacing, domain.shape, strict=True))
-    )
+    x, y, z = _axes(work, domain)
     seeds[:, :, (z > _joint_height(landmarks) + ABOVE_JOINT).ravel()] = 2
     if bone.cavity is not None:
         seeds[bone.cavity[box]] = 2
@@ -306,6 +305,15 @@ def _seeds(
     return seeds
 
 
+def _axes(work: Working, domain: Mask) -> tuple[Any, Any, Any]:
+    """The coordinates of a block along each axis, to be broadcast, mm."""
+    x, y, z = (
+        (o + s * np.arange(n)).reshape([-1 if a == b else 1 for b in range(3)])
+        for a, (o, s, n) in enumerate(zip(work.origin, work.spacing, domain.shape, strict=True))
+    )
+    return x, y, z
+
+
 def _model_seeds(
     work: Working, bone: Bone, head: FittedHead, given: Mapping[str, Floats], box: Block
 ) -> NDArray[np.int32]:
@@ -314,6 +322,9 @@ def _model_seeds(
     seeds = model_seeds(work, domain, head)
     if bone.cavity is not None:
         seeds[bone.cavity[box]] = 2
+    x, y, z = _axes(work, domain)
+    sites = {name: place for (kind, name), place in head.sites.items() if kind == "skull"}
+    _tooth_rows(seeds, sites, x, y, z, crown=MODEL_CROWN)
     _balls(seeds, domain, work, given, names=ON_CRANIUM, value=2)
     _balls(seeds, domain, work, given, names=ON_MANDIBLE, value=1)
     seeds[~domain] = 0
@@ -335,7 +346,13 @@ def _condyles(landmarks: Mapping[str, Floats]) -> dict[str, Floats]:
 
 
 def _tooth_rows(
-    seeds: NDArray[np.int32], landmarks: Mapping[str, Floats], x: Any, y: Any, z: Any
+    seeds: NDArray[np.int32],
+    landmarks: Mapping[str, Floats],
+    x: Any,
+    y: Any,
+    z: Any,
+    *,
+    crown: tuple[float, float] = CROWN,
 ) -> None:
     """Seeds above and below the occlusal plane, in front of the rami."""
     plane = _occlusal_points(landmarks) or _one_row(landmarks)
@@ -354,7 +371,7 @@ def _tooth_rows(
     x, y, part = x[row[0]], y[:, row[1]], seeds[row]
     height = normal[0] * (x - incisal[0]) + normal[1] * (y - incisal[1])
     height = height + normal[2] * (z - incisal[2])
-    upper = lower = CROWN
+    upper = lower = crown
     if _occlusal_points(landmarks) is None:
         # The row whose sites are known, and the other wherever the mouth's opening has it.
         is_upper = "supradentale" in landmarks
