@@ -292,7 +292,7 @@ def _jaws_joined(kind: str, segment: str) -> Finding:
     return Finding(
         "cut-of-joined-jaws",
         f"{segment!r} is cut from a skull whose jaws are not separated; it ends at the edges of "
-        "the upper teeth, and all bone below stays where it is",
+        "the upper teeth: bone below stays where it is, but the front of the rami may move with it",
         where=kind,
     )
 

@@ -483,7 +483,9 @@ def test_the_lower_jaw_stays_where_the_maxilla_is_cut_from_joined_jaws(head):
     assert "cut-of-joined-jaws" not in {finding.code for finding in parted.findings}
     piece, whole = (cut["maxilla"].level.values > 0.0 for cut in (found, parted))
     lower = mandible.values > 0.0
-    assert np.count_nonzero(piece & lower) < 0.03 * np.count_nonzero(lower)
+    # The front of the rami, beside the tuberosities of the atlas head, is within the cut.
+    limit = {"ct_phantom": 0.03, "atlas_head": 0.1}[head]
+    assert np.count_nonzero(piece & lower) < limit * np.count_nonzero(lower)
     assert np.count_nonzero(piece & whole) > 0.9 * np.count_nonzero(whole)
 
 

@@ -13,8 +13,9 @@ import cmfsim
 import real_heads
 from cmfsim.doctor import landmarks as checks
 from cmfsim.doctor.places import direction_text, shift_text
-from cmfsim.registration import REFERENCE_PLACES, mirror_agreement, swapped_names
+from cmfsim.registration import mirror_agreement, swapped_names
 from cmfsim.surfaces.levels import surface_of_level
+from cmfsim.values.reference_places import REFERENCE_PLACES
 from head_case import HeadCase
 
 SIDES = [sign * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]

@@ -55,7 +55,7 @@ def test_a_build_keeps_the_sites_of_the_files_and_fills_in_the_rest(case, anatom
     given, _ = read_case_landmarks(case)
     assert case.landmarks.proposed
     stages = Stages(BuildOptions())
-    head = found_landmarks(case, anatomy, stages, is_read=True, given=bool(given))
+    head = found_landmarks(case, anatomy, stages, given, is_read=True)
     for name in FEW:
         # On the surface, from which the average head's own points lie up to 0.2 mm.
         assert abs(head.skull[name] - average_head().skull[name]).max() < 0.3

@@ -40,8 +40,9 @@ COARSE_POINTS = 1200
 AGAIN = ((1.0, 400), (0.7, 400))
 # A point of the model fits where the patient's surface is nearer than this, mm of the average head.
 FITS = 4.0
-# Share of the visible face that must fit: heads of all kinds have 0.7 to 0.8, balls and tubes 0.4.
-LEAST_FIT, FACE_BACK, FACE_TOP = 0.55, 0.0, 60.0
+# Share of the visible face that must fit: heads have 0.7 to 0.8, a crude
+# one of a few ellipsoids 0.54, balls and tubes 0.4.
+LEAST_FIT, FACE_BACK, FACE_TOP = 0.48, 0.0, 60.0
 # A part of the face and the skull's base that the head's own frame is taken from, mm: back, up.
 FRAME_BACK, FRAME_TOP, FRAME_DISTANCE, FRAME_ROUNDS = 20.0, 70.0, 4.0, 10
 # Surfaces say little of where along them a site lies: relief finer than the modes, mm.
