@@ -529,8 +529,6 @@ fn what_does_not_fit_is_refused_by_name() {
     // A plan whose forces overflow f64 is an error, not a number that is none.
     let far = plan([("bone", Motion::Nodes(vec![[1e200, 0.0, 0.0]; 9]))]);
     assert!(ready.solve(&far, None, GO_ON).is_err());
-    let linear = solver(&tensors, &bounds, with_kinematics(Kinematics::Linear)).unwrap();
-    assert!(matches!(linear.solve(&far, None, GO_ON), Err(MtmError::Overflow { .. })));
 }
 
 #[test]
