@@ -9,10 +9,12 @@ from types import MappingProxyType
 
 import numpy as np
 
+from cmfsim._core import rigid_fit
 from cmfsim.errors import LandmarkInputError
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import is_lower_site
+from cmfsim.values.motion import carried
 from cmfsim.values.reference_places import REFERENCE_PLACES
 
 __all__ = ["NEEDED", "PLACING", "with_missing_sites"]
@@ -88,16 +90,16 @@ def with_missing_sites(
             + (f" and {len(asked) - 1} more ({', '.join(asked[1:])})" if asked[1:] else "")
             + ": place it, or give the planes of the cut"
         )
-    scale, turn, shift = _similarity(
-        np.array([reference[name] for name in known]), np.array([landmarks[n] for n in known])
-    )
+    average = np.array([reference[name] for name in known])
+    matrix = rigid_fit(average, [landmarks[name] for name in known], scale=True).matrix
+    back: Floats = np.linalg.inv(matrix).astype(np.float64)
     for name in missing:
         expected = reference[name]
         partner = {"_L": f"{name[:-2]}_R", "_R": f"{name[:-2]}_L"}.get(name[-2:], "")
         if partner in landmarks:
-            own = (landmarks[partner] - shift) @ turn / scale
+            own = carried(back, landmarks[partner])
             expected = expected + (own - reference[partner]) * [-1.0, 1.0, 1.0]
-        points[name] = scale * expected @ turn.T + shift
+        points[name] = carried(matrix, expected)
     return points, (_estimated(kind, missing, len(known)),)
 
 
@@ -116,13 +118,3 @@ def _spread(points: Sequence[Floats]) -> bool:
         return False
     offsets = np.array(points) - np.mean(points, axis=0)
     return bool(np.linalg.svd(offsets, compute_uv=False)[1] >= LEAST_SPREAD)
-
-
-def _similarity(source: Floats, target: Floats) -> tuple[float, Floats, Floats]:
-    """Scale, rotation and shift of the best similarity (Umeyama 1991)."""
-    one, other = source.mean(axis=0), target.mean(axis=0)
-    u, sizes, v = np.linalg.svd((target - other).T @ (source - one))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    turn = (u * signs) @ v
-    scale = float((sizes * signs).sum() / ((source - one) ** 2).sum())
-    return scale, turn, other - scale * turn @ one

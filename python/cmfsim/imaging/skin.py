@@ -178,7 +178,7 @@ def weak_tissue(hu: Volume, spacing: NDArray[np.float64], threshold: float) -> V
     top = np.minimum(ndimage().maximum_filter(smooth, size=size), SOFT)
     half = 0.5 * (AIR + top)
     # At an ordinary skin voxels between both levels are a shell, which no ball fits into; what is
-    # as dark on its own, such as foam, hangs on no brighter face.
+    # as dark on its own, such as foam, is not attached to a brighter face.
     gained = opened((front > half) & (front <= threshold) & (top > LEAST_TISSUE), THICK, spacing)
     above = tissue[:, : middle + 1]
     gained &= reached(gained | above, above)

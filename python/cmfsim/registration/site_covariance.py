@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
@@ -129,7 +130,7 @@ def site_covariance(proposal: ProposedLandmarks, bone: Floats) -> SiteDistributi
     if len(known) < LEAST_SITES:
         mean = mean + _guessed_shift(mean, bone)
     else:
-        linear, offset = _similarity(mean[known], found, stds)
+        linear, offset, _ = robust_similarity(mean[known], found, 1.0 / stds**2, HALF_DISTANCE)
         turn = np.kron(np.eye(len(mean)), linear)
         mean, covariance = mean @ linear.T + offset, turn @ covariance @ turn.T
     if not known:
@@ -227,22 +228,5 @@ def _conditional(
 
 
 def _aligned(points: Floats, onto: Floats) -> Floats:
-    linear, offset = _similarity(points, onto, np.ones(len(points)))
+    linear, offset, _ = robust_similarity(points, onto, np.ones(len(points)), HALF_DISTANCE)
     return points @ linear.T + offset
-
-
-def _similarity(p: Floats, r: Floats, stds: Floats) -> tuple[Floats, Floats]:
-    """The similarity from p to r (Umeyama 1991): doubtful and outlying ones count little."""
-    weight = 1.0 / stds**2
-    linear, offset = np.eye(3), np.zeros(3)
-    for _ in range(ROUNDS):
-        share = weight / weight.sum()
-        a, b = share @ p, share @ r
-        u, s, vt = np.linalg.svd((p - a).T @ ((r - b) * share[:, None]))
-        signs = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-        scale = float((s * signs).sum() / (share @ ((p - a) ** 2).sum(axis=1)))
-        linear = scale * vt.T @ np.diag(signs) @ u.T
-        offset = b - linear @ a
-        gap = np.linalg.norm(p @ linear.T + offset - r, axis=1)
-        weight = 1.0 / stds**2 / (1.0 + (gap / HALF_DISTANCE) ** 2)
-    return linear, offset

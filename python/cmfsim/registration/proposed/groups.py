@@ -4,14 +4,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.reference_places import REFERENCE_PLACES
 
 __all__ = ["FAR_JAW", "JAW_SITES", "jaw_distance", "misfits"]
 
-# The distance at which a site counts half in the fit, mm, and its rounds.
-HALF_DISTANCE, ROUNDS = 5.0, 30
+# The distance at which a site counts half in the fit, mm.
+HALF_DISTANCE = 5.0
 LEAST_SITES = 5
 # A jaw whose sites lie farther from where the cranium puts those of a closed mouth is none, mm of
 # the average head: an open mouth moves the chin by 30 mm, and the middle of all sites by 20.
@@ -73,22 +74,10 @@ def _distances(
 
 
 def _fit(sites: Mapping[str, Floats], reference: Mapping[str, Floats]) -> Similarity | None:
-    """The similarity from sites to an average head: linear part, offset, scale (Umeyama 1991)."""
+    """The similarity from sites to an average head: linear part, offset, scale."""
     names = [name for name in sites if name in reference]
     if len(names) < LEAST_SITES:
         return None
     p = np.array([sites[name] for name in names])
     r = np.array([reference[name] for name in names])
-    weight = np.ones(len(names))
-    linear, offset, scale = np.eye(3), np.zeros(3), 1.0
-    for _ in range(ROUNDS):
-        share = weight / weight.sum()
-        a, b = share @ p, share @ r
-        u, s, vt = np.linalg.svd((p - a).T @ ((r - b) * share[:, None]))
-        signs = np.array([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-        scale = float((s * signs).sum() / (share @ ((p - a) ** 2).sum(axis=1)))
-        linear = scale * vt.T @ np.diag(signs) @ u.T
-        offset = b - linear @ a
-        gap = np.linalg.norm(p @ linear.T + offset - r, axis=1)
-        weight = 1.0 / (1.0 + (gap / HALF_DISTANCE) ** 2)
-    return linear, offset, scale
+    return robust_similarity(p, r, np.ones(len(names)), HALF_DISTANCE)

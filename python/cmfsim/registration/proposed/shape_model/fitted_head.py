@@ -26,6 +26,7 @@ from cmfsim.registration.proposed.shape_model.model import (
 from cmfsim.registration.proposed.shape_model.samples import HeadSamples
 from cmfsim.registration.proposed.shape_model.search import found_poses
 from cmfsim.registration.proposed.shape_model.state import JAW_DEVIATIONS, POSE_UNITS, State
+from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 
 __all__ = ["FittedHead", "fit_head"]
@@ -178,12 +179,7 @@ class FittedHead:
         still = State(self.state.linear, self.state.offset, np.zeros(6), self.state.shape)
         fitted = still.out(still.points(self.model))[used]
         goal, area = own[used], self.model.areas[used]
-        weight = area
-        for _ in range(FRAME_ROUNDS):
-            linear, offset = _similarity(fitted, goal, weight)
-            gap = np.linalg.norm(fitted @ linear.T + offset - goal, axis=1)
-            weight = area / (1.0 + (gap / FRAME_DISTANCE) ** 2)
-        scale = float(np.cbrt(np.linalg.det(linear)))
+        linear, offset, scale = robust_similarity(fitted, goal, area, FRAME_DISTANCE, FRAME_ROUNDS)
         origin: Floats = -np.linalg.solve(linear, offset).astype(np.float64)
         return Pose(origin, linear / scale, 1.0 / scale, self.gap)
 
@@ -262,14 +258,3 @@ def _jaw_gap(model: HeadModel, evidence: Evidence) -> float:
 def _opened(state: State, angle: float) -> State:
     jaw = np.array([angle / JAW_DEVIATIONS[0], 0.0, 0.0, 0.0, 0.0, 0.0])
     return State(state.linear, state.offset, jaw, np.zeros_like(state.shape))
-
-
-def _similarity(source: Floats, target: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """The similarity from points to others, weighted (Umeyama 1991)."""
-    share = weight / weight.sum()
-    a, b = share @ source, share @ target
-    u, s, vt = np.linalg.svd((target - b).T @ ((source - a) * share[:, None]))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = float((s * signs).sum() / (share @ ((source - a) ** 2).sum(axis=1)))
-    linear = scale * u @ np.diag(signs) @ vt
-    return linear, b - linear @ a
