@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 import cmfsim
-from cmfsim.io.populations import PARTS
-from cmfsim.study.benchmark.bands import COVERAGE, calibrated_band
-from cmfsim.study.benchmark.markdown import table
-from cmfsim.study.benchmark.patients import far_from_models, patients_of
+from cmfsim.io.results.populations import PARTS
+from cmfsim.lab.benchmark.bands import COVERAGE, calibrated_band
+from cmfsim.lab.benchmark.patients import far_from_models, patients_of
+from cmfsim.lab.benchmark.tables.markdown import table
 
 # Quantiles of the coverage over splits that are printed.
 ENDS = (0.05, 0.95)

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import cmfsim
+from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.virtual.demo import write_demo_case
 from marked import publish
 
 Motions = Mapping[str, NDArray[np.float64] | cmfsim.MovedSurface]

@@ -22,7 +22,7 @@ from scipy import ndimage
 import cmfsim
 import ct_variants as variants
 from cmfsim.imaging import segment_head
-from cmfsim.io.images import read_image_file
+from cmfsim.io.images.image_files import read_image_file
 from cmfsim.pipeline.proposing import head_surfaces, read_template_head
 from cmfsim.registration.proposed import TemplateHead
 from cmfsim.values.image_data import ImageData

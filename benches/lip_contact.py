@@ -18,7 +18,7 @@ from pathlib import Path
 import cmfsim
 from cmfsim.errors import CmfsimError
 from cmfsim.evaluation import NO_CHANGE
-from cmfsim.virtual import PATIENTS
+from cmfsim.lab.virtual import PATIENTS
 from marked import publish
 
 REGIONS = ("upper lip", "lower lip", "face")

@@ -17,7 +17,7 @@ import numpy as np
 import cmfsim
 import ct_variants as variants
 from cmfsim.imaging import segment_head
-from cmfsim.io.images import read_image_file
+from cmfsim.io.images.image_files import read_image_file
 from cmfsim.values.image_data import ImageData
 from marked import publish
 

@@ -25,12 +25,12 @@ import numpy as np
 
 import cmfsim
 import oracles
-from cmfsim.io.curves import read_curves, write_curves
-from cmfsim.io.meshes import read_mesh
-from cmfsim.io.segmentations import read_labels, read_segmentation
-from cmfsim.io.slicer_bundles import unpack_bundle
-from cmfsim.io.slicer_scenes import read_slicer_scene
-from cmfsim.io.vtk import write_tets
+from cmfsim.io.images.segmentations import read_labels, read_segmentation
+from cmfsim.io.landmarks.curves import read_curves, write_curves
+from cmfsim.io.meshes.mesh_files import read_mesh
+from cmfsim.io.meshes.vtk.writing import write_tets
+from cmfsim.io.slicer.bundles import unpack_bundle
+from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
 
 __all__ = ["READERS", "Reader", "changed_in_silence", "plain"]
 

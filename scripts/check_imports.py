@@ -48,21 +48,29 @@ PYTHON: tuple[frozenset[str], ...] = tuple(
     for row in (
         "_core",
         "errors deferred",
-        "values",
+        "processes values",
         "io phantom registration surfaces",
         # The stages: none knows another.
         "bones evaluation imaging meshing muscles solving",
         "doctor pictures planning report",
         "pipeline",
-        "study virtual",
+        "drafting study",
+        "lab",
         "cli",
         "__init__ __main__",
     )
 )
-# Entries at the top of python/cmfsim, with `__init__.py` and `__main__.py`.
-MOST_PYTHON_ENTRIES = 24
 # Pairs of entries of which one imports the other, wherever the import stands; `__init__` is free.
-MOST_PYTHON_PAIRS = 110
+MOST_PYTHON_PAIRS = 124
+# Files and folders in one folder of the package, and the folders that may hold more: plain values,
+# one subject a file, and the modules of one page's script.
+MOST_ENTRIES = 12
+LARGE_FOLDERS: Mapping[str, int] = {
+    "": 26,
+    "values": 40,
+    "planning/page/scripts": 33,
+    "pipeline": 14,
+}
 # Outside packages that a module may import at its top: `import cmfsim` needs numpy alone.
 PYTHON_PACKAGES = frozenset({"numpy"})
 # A file is called after its subject.
@@ -197,14 +205,12 @@ def check_python(root: Path) -> Iterator[str]:
     package = root / "python/cmfsim"
     level = {name: number for number, row in enumerate(PYTHON) for name in row}
     files: dict[str, set[str]] = {}
-    entries: set[str] = set()
     pairs: set[tuple[str, str]] = set()
     # Packages that load their modules when these are asked for say them in the stub beside.
     for path in sorted([*package.rglob("*.py"), *package.rglob("__init__.pyi")]):
         place = path.relative_to(root)
         inside = path.relative_to(package).with_suffix("")
         name = inside.parts[0]
-        entries.add(name)
         if name not in level:
             yield f"{place}: add {name} to PYTHON in scripts/check_imports.py"
             continue
@@ -221,8 +227,7 @@ def check_python(root: Path) -> Iterator[str]:
         for line, module in _top_imports(tree):
             if module not in PYTHON_PACKAGES | {"cmfsim"} | sys.stdlib_module_names:
                 yield f"{place}:{line}: import {module} inside the function that needs it"
-    if len(entries) > MOST_PYTHON_ENTRIES:
-        yield f"python/cmfsim: {len(entries)} entries, at most {MOST_PYTHON_ENTRIES}"
+    yield from _full_folders(package)
     among = sum(1 for name, _ in pairs if name != "__init__")
     if among > MOST_PYTHON_PAIRS:
         yield f"python/cmfsim: {among} imports between entries, at most {MOST_PYTHON_PAIRS}"
@@ -230,6 +235,22 @@ def check_python(root: Path) -> Iterator[str]:
     graph = {f: {g for g in found if not f.startswith(f"{g}/")} for f, found in files.items()}
     for circle in _circles(graph):
         yield f"python/cmfsim: a circle of imports: {' → '.join(circle)}"
+
+
+def _full_folders(package: Path) -> Iterator[str]:
+    """The folders of the package with more entries than a reader holds in mind."""
+    for folder in sorted({path.parent for path in package.rglob("*") if _is_kept(path)}):
+        inside = folder.relative_to(package).as_posix().removeprefix(".")
+        count = len({path.stem for path in folder.iterdir() if _is_kept(path)})
+        most = LARGE_FOLDERS.get(inside, MOST_ENTRIES)
+        if count > most:
+            place = "/".join(filter(None, ("python/cmfsim", inside)))
+            yield f"{place}: {count} files and folders, at most {most}"
+
+
+def _is_kept(path: Path) -> bool:
+    """Whether a file or folder is one to read: neither compiled, nor a cache, nor a mark."""
+    return "__pycache__" not in path.parts and path.suffix not in {".so", ".pyd", ".typed"}
 
 
 def _file_of(package: Path, dotted: str) -> str:

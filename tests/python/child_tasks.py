@@ -9,7 +9,7 @@ import time
 import numpy as np
 
 from cmfsim import errors
-from cmfsim.io.child import Answer
+from cmfsim.processes.child import Answer
 
 
 def arrays(count):

@@ -40,18 +40,18 @@ LONGEST = (
     "pipeline/test_hard_heads.py",
     "cli/test_crash_safety.py",
     "pipeline/test_prediction.py",
-    "virtual/test_demo.py",
+    "lab/virtual/test_demo.py",
     "pipeline/test_case_lips.py",
     "pipeline/test_build.py",
     "study/test_study_outputs.py",
     "project/test_tutorials.py",
-    "virtual/test_population.py",
+    "lab/virtual/test_population.py",
     "doctor/test_landmark_places.py",
     "registration/test_jaw_evidence.py",
     "phantom/test_phantom.py",
     "bones/test_achieved.py",
     "pictures/test_labels.py",
-    "virtual/test_virtual_patients.py",
+    "lab/virtual/test_virtual_patients.py",
 )
 
 

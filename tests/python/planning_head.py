@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import cmfsim
+from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.virtual.demo import write_demo_case
 
 EDGE = 14.0
 

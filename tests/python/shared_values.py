@@ -15,9 +15,9 @@ import pytest
 
 import cmfsim
 import phantom_case
+from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.virtual.demo import write_demo_case
 
 try:
     import fcntl

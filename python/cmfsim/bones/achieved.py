@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface, rigid_fit
-from cmfsim.bones.coherent_motion import RigidPiece, coherent_motion
-from cmfsim.bones.matching import MatchOptions, lay_on
 from cmfsim.bones.motion import RemovedBone, missing_patches
-from cmfsim.bones.paired_surfaces import paired_shape
-from cmfsim.bones.shape_fit import ShapeFit
-from cmfsim.bones.stray_patches import StrayPatch, stray_patches
+from cmfsim.bones.pairs.coherent_motion import RigidPiece, coherent_motion
+from cmfsim.bones.pairs.matching import MatchOptions, lay_on
+from cmfsim.bones.pairs.paired_surfaces import paired_shape
+from cmfsim.bones.pairs.shape_fit import ShapeFit
+from cmfsim.bones.pairs.stray_patches import StrayPatch, stray_patches
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import (

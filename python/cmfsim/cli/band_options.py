@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from cmfsim.io import Case
-from cmfsim.io.calibrations import read_calibration
+from cmfsim.io.results.calibrations import read_calibration
 from cmfsim.values.band_options import BandOptions
 
 __all__ = ["add_band_options", "band_options"]

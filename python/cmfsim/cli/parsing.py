@@ -5,25 +5,23 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
-from cmfsim.cli import (
-    bench_command,
+from cmfsim.cli.band_options import add_band_options
+from cmfsim.cli.patients import (
     case_commands,
     demo_command,
     init_command,
     landmarks_command,
-    phantom_command,
     plan_command,
     scene_commands,
-    study_commands,
     template_commands,
     view_command,
 )
-from cmfsim.cli.band_options import add_band_options
-from cmfsim.cli.population_parsing import add_population_commands
+from cmfsim.cli.research import bench_command, phantom_command, study_commands
+from cmfsim.cli.research.population_parsing import add_population_commands
 from cmfsim.io import result_suffixes
+from cmfsim.lab.frontier import EDGES, FACTORS
 from cmfsim.muscles.template import WHERE
 from cmfsim.planning.replanning import CORRECTIONS
-from cmfsim.study.frontier import EDGES, FACTORS
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
 

@@ -12,17 +12,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from cmfsim.doctor.automatic_landmarks import check_automatic
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.lips import check_lips
-from cmfsim.doctor.moved_bones import check_moved
-from cmfsim.doctor.operation import check_cuts, check_plan, pieces_of, vertices_of
-from cmfsim.doctor.placement import check_placement
-from cmfsim.doctor.plan import state_plan
-from cmfsim.doctor.plan_size import SizedMotion, check_motion_size
-from cmfsim.doctor.postoperative import check_after
 from cmfsim.doctor.report import findings_text
+from cmfsim.doctor.sites.automatic_landmarks import check_automatic
+from cmfsim.doctor.sites.placement import check_placement
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
+from cmfsim.doctor.surgery.moved_bones import check_moved
+from cmfsim.doctor.surgery.operation import check_cuts, check_plan, pieces_of, vertices_of
+from cmfsim.doctor.surgery.plan import state_plan
+from cmfsim.doctor.surgery.plan_size import SizedMotion, check_motion_size
+from cmfsim.doctor.surgery.postoperative import check_after
 from cmfsim.doctor.tissue_ends import check_ends
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.values.clinical_motion import ClinicalMotion

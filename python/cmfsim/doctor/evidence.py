@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cmfsim._core import PRESETS, Surface
 from cmfsim.errors import CaseError, CmfsimError
 from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface_file
-from cmfsim.io.images import read_image_file
-from cmfsim.io.transforms import TransformFile, read_transform_file
+from cmfsim.io.images.image_files import read_image_file
+from cmfsim.io.slicer.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
 from cmfsim.surfaces.repair import INNER_WALL, RepairOptions, repair_surface
 from cmfsim.values.case_parts import CaseMotion, CaseSurfaces

@@ -1,10 +1,10 @@
 """A head CT to anatomy (paper 2.1), and registration of two scans of one head (paper 3)."""
 
-from cmfsim.imaging.alignment import VolumeAlignment, register_volumes
-from cmfsim.imaging.alignment_options import AlignmentOptions
 from cmfsim.imaging.head import segment_head
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.imaging.undeformed import undeformed_mask
+from cmfsim.imaging.two_scans.alignment import VolumeAlignment, register_volumes
+from cmfsim.imaging.two_scans.alignment_options import AlignmentOptions
+from cmfsim.imaging.two_scans.undeformed import undeformed_mask
 
 __all__ = [
     "AlignmentOptions",

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from cmfsim.imaging.bone import Bone
+from cmfsim.imaging.bones.bone import Bone
 from cmfsim.imaging.morphology import depth
-from cmfsim.imaging.skin import Skin
+from cmfsim.imaging.skins.skin import Skin
 from cmfsim.imaging.working_grid import COARSE, Working
 from cmfsim.values.finding import Finding
 

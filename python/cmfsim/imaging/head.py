@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import ImageInputError
-from cmfsim.imaging.air import air_level
-from cmfsim.imaging.attached import attached_findings
-from cmfsim.imaging.bone import Bone, bone_level, find_bone, teeth_level
+from cmfsim.imaging.bones.bone import Bone, bone_level, find_bone, teeth_level
+from cmfsim.imaging.bones.jaw import Jaws, part_jaws
+from cmfsim.imaging.bones.metal import find_metal, metal_within
 from cmfsim.imaging.coverage import view_findings
-from cmfsim.imaging.cupping import without_cupping
-from cmfsim.imaging.intensity import weak_bone
-from cmfsim.imaging.jaw import Jaws, part_jaws
-from cmfsim.imaging.metal import find_metal, metal_within
+from cmfsim.imaging.intensities.cupping import without_cupping
+from cmfsim.imaging.intensities.intensity import weak_bone
+from cmfsim.imaging.intensities.noise import without_noise
 from cmfsim.imaging.morphology import Mask, Volume
-from cmfsim.imaging.noise import without_noise
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.imaging.skin import Skin, find_skin
+from cmfsim.imaging.skins.air import air_level
+from cmfsim.imaging.skins.attached import attached_findings
+from cmfsim.imaging.skins.skin import Skin, find_skin
 from cmfsim.imaging.working_grid import Working, working_grid
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats, as_point

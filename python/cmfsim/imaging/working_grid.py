@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.field_of_view import RoundField, round_field
-from cmfsim.imaging.intensity import AIR, Calibration, calibration, saturation_of
-from cmfsim.imaging.modality import check_is_ct
+from cmfsim.imaging.intensities.intensity import AIR, Calibration, calibration, saturation_of
+from cmfsim.imaging.intensities.modality import check_is_ct
 from cmfsim.imaging.morphology import (
     Block,
     Mask,

@@ -1,20 +1,30 @@
 """Files and values: each format's reader beside its writer, one file per subject."""
 
-from cmfsim.io.case_changes import CaseChanges
-from cmfsim.io.case_files import Case, CaseOrPath, as_case
-from cmfsim.io.cohorts import Cohort
-from cmfsim.io.files import replacing
-from cmfsim.io.folders import finish_writing, replacing_files
-from cmfsim.io.images import read_image, write_image
-from cmfsim.io.landmarks import LandmarkFile, read_landmark_file, read_landmarks, write_landmarks
-from cmfsim.io.meshes import read_tet_mesh
-from cmfsim.io.metrics import write_metrics
-from cmfsim.io.models import write_model
-from cmfsim.io.plans import write_plan
-from cmfsim.io.predictions import read_parts, write_prediction
-from cmfsim.io.results import read_result, result_suffixes, write_result
-from cmfsim.io.scenes import read_plan, read_scene, write_scene
-from cmfsim.io.slicer_output import write_slicer_bundle
+import sys
+
+from cmfsim.io.cases.case_changes import CaseChanges
+from cmfsim.io.cases.case_files import Case, CaseOrPath, as_case
+from cmfsim.io.cases.cohorts import Cohort
+from cmfsim.io.cases.plans import write_plan
+from cmfsim.io.cases.scenes import read_plan, read_scene, write_scene
+from cmfsim.io.cases.variants import AS_GIVEN, Variant, Variants
+from cmfsim.io.files.folders import finish_writing, replacing_files
+from cmfsim.io.files.reading_writing import replacing
+from cmfsim.io.images.image_files import read_image, write_image
+from cmfsim.io.landmarks.landmark_files import (
+    LandmarkFile,
+    read_landmark_file,
+    read_landmarks,
+    write_landmarks,
+)
+from cmfsim.io.meshes import ply
+from cmfsim.io.meshes.mesh_files import read_tet_mesh
+from cmfsim.io.results.metrics import write_metrics
+from cmfsim.io.results.models import write_model
+from cmfsim.io.results.predictions import read_parts, write_prediction
+from cmfsim.io.results.result_files import read_result, result_suffixes, write_result
+from cmfsim.io.slicer.output import write_slicer_bundle
+from cmfsim.io.slicer.transforms import read_transform, write_transform
 from cmfsim.io.surfaces import (
     read_bone_pair,
     read_moved_surface,
@@ -22,8 +32,9 @@ from cmfsim.io.surfaces import (
     read_surface_file,
     write_surface,
 )
-from cmfsim.io.transforms import read_transform, write_transform
-from cmfsim.io.variants import AS_GIVEN, Variant, Variants
+
+# Scripts of others import this module under its former name.
+sys.modules[f"{__name__}.ply"] = ply
 
 __all__ = [
     "AS_GIVEN",

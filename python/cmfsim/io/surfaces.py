@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, UnpairedError
-from cmfsim.io.files import named, replacing
-from cmfsim.io.meshes import read_mesh
-from cmfsim.io.obj import write_obj
-from cmfsim.io.plain_mesh import Cells, PlainMesh
-from cmfsim.io.ply import write_ply
-from cmfsim.io.polygons import triangles_of
-from cmfsim.io.stl import write_stl
-from cmfsim.io.vtk import data_array, write_vtk
+from cmfsim.io.files.reading_writing import named, replacing
+from cmfsim.io.meshes.mesh_files import read_mesh
+from cmfsim.io.meshes.obj import write_obj
+from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
+from cmfsim.io.meshes.ply import write_ply
+from cmfsim.io.meshes.polygons import triangles_of
+from cmfsim.io.meshes.stl import write_stl
+from cmfsim.io.meshes.vtk.writing import data_array, write_vtk
 from cmfsim.values.case_parts import FRAMES, UNITS
 from cmfsim.values.checks import check_one_of
 from cmfsim.values.finding import Finding

@@ -6,9 +6,8 @@ the other side is its mirror image), y backwards, z up; the Frankfort plane is z
 
 import numpy as np
 
-from cmfsim.phantom.curves import Table, smooth_curve, turn_about
-from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import (
+from cmfsim.phantom.geometry.curves import Table, smooth_curve, turn_about
+from cmfsim.phantom.geometry.shapes import (
     Blend,
     Box,
     Egg,
@@ -19,6 +18,7 @@ from cmfsim.phantom.shapes import (
     Step,
     Tube,
 )
+from cmfsim.phantom.parameters import HeadParameters
 
 __all__ = ["skin_shape"]
 

@@ -6,10 +6,10 @@ from typing import Protocol
 
 import numpy as np
 
-from cmfsim.phantom.curves import Level
+from cmfsim.phantom.geometry.curves import Level
+from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp
 from cmfsim.phantom.grid import Field, to_surface
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.warp import FaceWarp, JawWarp
 from cmfsim.values.checks import Floats, frozen
 
 __all__ = ["find_skin_landmarks", "find_skull_landmarks"]

@@ -10,13 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import scan
-from cmfsim.phantom.curves import Level, smooth_max
+from cmfsim.phantom.geometry.curves import Level, smooth_max
+from cmfsim.phantom.geometry.shapes import Shape, Within
+from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp, JawWarped
 from cmfsim.phantom.grid import Field, level_grid, level_surface
 from cmfsim.phantom.head import HEAD_BOX, skin_shape
 from cmfsim.phantom.landmarks import find_skin_landmarks, find_skull_landmarks
 from cmfsim.phantom.muscles import Muscle, make_muscles
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import Shape, Within
 from cmfsim.phantom.skull import (
     airway_shape,
     brain_shape,
@@ -25,7 +26,6 @@ from cmfsim.phantom.skull import (
     metal_pieces,
     teeth_shape,
 )
-from cmfsim.phantom.warp import FaceWarp, JawWarp, JawWarped
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import (
     Floats,

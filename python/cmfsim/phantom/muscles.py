@@ -8,11 +8,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.phantom.courses import COURSES, Course, Row
-from cmfsim.phantom.curves import Level, smooth_curve, smooth_max
+from cmfsim.phantom.geometry.courses import COURSES, Course, Row
+from cmfsim.phantom.geometry.curves import Level, smooth_curve, smooth_max
+from cmfsim.phantom.geometry.shapes import REACH, Box, FlatTube
+from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
-from cmfsim.phantom.shapes import REACH, Box, FlatTube
-from cmfsim.phantom.warp import FaceWarp, JawWarp
 from cmfsim.values.checks import Floats, as_rows, frozen
 
 __all__ = ["Muscle", "Tissue", "make_muscles"]

@@ -7,9 +7,9 @@ encloses count as bone, as `Anatomy.bones` wants it; `brain_shape` and the like 
 
 import numpy as np
 
-from cmfsim.phantom.curves import smooth_curve, turn_about
+from cmfsim.phantom.geometry.curves import smooth_curve, turn_about
+from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, FlatTube, Step, Tube
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import Blend, Box, Egg, FlatTube, Step, Tube
 from cmfsim.values.checks import Floats
 
 __all__ = [

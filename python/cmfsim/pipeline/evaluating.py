@@ -23,10 +23,10 @@ from cmfsim.evaluation import (
     unmoved_regions,
 )
 from cmfsim.io import Case, CaseOrPath, as_case
-from cmfsim.io.metrics import EVALUATION_FILE
+from cmfsim.io.results.metrics import EVALUATION_FILE
 from cmfsim.pipeline.building.inputs import case_key
-from cmfsim.pipeline.building.postoperative import Postoperative, read_postoperative
 from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.building.surgery.postoperative import Postoperative, read_postoperative
 from cmfsim.pipeline.face_after import check_face_after, refuse_other_face
 from cmfsim.pipeline.face_regions import face_landmarks
 from cmfsim.pipeline.predicting import named_models, predictions_of

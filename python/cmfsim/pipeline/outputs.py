@@ -19,14 +19,15 @@ import numpy as np
 from cmfsim.errors import CmfsimError
 from cmfsim.evaluation import error_table
 from cmfsim.io import replacing, replacing_files
-from cmfsim.io.metrics import (
+from cmfsim.io.files.summaries import hashes_of, write_summary
+from cmfsim.io.results.metrics import (
     EVALUATION_FILE,
     REPORT_FILE,
     read_evaluation,
     read_evaluation_picture,
 )
-from cmfsim.io.prediction_schema import is_prediction_file
-from cmfsim.io.predictions import (
+from cmfsim.io.results.prediction_schema import is_prediction_file
+from cmfsim.io.results.predictions import (
     fill_prediction,
     is_result_file,
     predictions_of,
@@ -35,9 +36,8 @@ from cmfsim.io.predictions import (
     stale_results,
     write_timings,
 )
-from cmfsim.io.skin_errors import skin_errors_file, write_skin_errors
-from cmfsim.io.slicer_output import SLICER_FILE, write_slicer_bundle
-from cmfsim.io.summaries import hashes_of, write_summary
+from cmfsim.io.results.skin_errors import skin_errors_file, write_skin_errors
+from cmfsim.io.slicer.output import SLICER_FILE, write_slicer_bundle
 from cmfsim.pictures import (
     Picture,
     band_picture,

@@ -13,8 +13,8 @@ from pathlib import Path
 from types import TracebackType
 
 from cmfsim.errors import CaseError, CaseInputError
-from cmfsim.io.parallel import Worker
 from cmfsim.pictures.canvas import NO_OPENGL, Picture, pyvista_module, without_probe
+from cmfsim.processes.parallel import Worker
 
 __all__ = ["Painter", "draw_packed", "load"]
 

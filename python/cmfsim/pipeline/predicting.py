@@ -8,8 +8,8 @@ from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.building.case_model import model_of
 from cmfsim.pipeline.building.inputs import case_key, input_hashes, plan_key
-from cmfsim.pipeline.building.postoperative import Postoperative
 from cmfsim.pipeline.building.stages import BuildOptions, OnMuscles
+from cmfsim.pipeline.building.surgery.postoperative import Postoperative
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.band_options import BandOptions

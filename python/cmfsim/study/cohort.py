@@ -16,12 +16,12 @@ from typing import Any, BinaryIO
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseChanges, Cohort, finish_writing
-from cmfsim.io.cluster import on_cluster
-from cmfsim.io.folders import check_below, check_writable
-from cmfsim.io.metrics import AGAIN, read_evaluation
-from cmfsim.io.skin_errors import skin_errors_file
-from cmfsim.io.summaries import checked_file
+from cmfsim.io.files.folders import check_below, check_writable
+from cmfsim.io.files.summaries import checked_file
+from cmfsim.io.results.metrics import AGAIN, read_evaluation
+from cmfsim.io.results.skin_errors import skin_errors_file
 from cmfsim.pipeline.evaluating import evaluation_key
+from cmfsim.processes.cluster import on_cluster
 
 __all__ = ["CaseJob", "CaseOutcome", "StudyOptions", "StudyReport", "run_studies", "run_study"]
 

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
-from cmfsim.pipeline.building.muscles import with_muscles
 from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.building.tissue.muscles import with_muscles
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.case_parts import CaseMuscles

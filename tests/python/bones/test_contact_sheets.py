@@ -9,7 +9,7 @@ import arch_head
 import cmfsim
 import meshes
 from cmfsim.bones import contact_sheets, sheet_departure
-from cmfsim.pipeline.building.contacts import CaseContacts, arch_sheets
+from cmfsim.pipeline.building.tissue.contacts import CaseContacts, arch_sheets
 from cmfsim.surfaces.levels import surface_of_level
 from head_case import HeadCase
 

@@ -9,7 +9,7 @@ import cmfsim
 import meshes
 import real_heads
 from cmfsim.bones.achieved import measure_pair
-from cmfsim.bones.shape_fit import BLOCKS, fit_shape
+from cmfsim.bones.pairs.shape_fit import BLOCKS, fit_shape
 from pebbles import apart, moved, operated_bone, pebble, without
 
 MOTION = cmfsim.rigid_motion((1.0, -5.0, 2.0), 4.0, (1, 0.2, 0.3), (0, -30, 0))

@@ -9,7 +9,8 @@ import pytest
 import cmfsim
 import real_heads
 from angles import angle_between
-from cmfsim.bones import PROCEDURES, CutOptions, needed_sites
+from cmfsim.bones import PROCEDURES, CutOptions
+from cmfsim.bones.cuts import needed_sites
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 
 pytest.importorskip("skimage")

@@ -16,7 +16,7 @@ from cmfsim.bones import CutOptions, check_segments
 from cmfsim.io import Case
 from cmfsim.pipeline.building import case_checks
 from cmfsim.pipeline.building.case_model import build_model
-from cmfsim.pipeline.building.motions import PlannedBones
+from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.surfaces import levels as surfaces
 from head_case import HeadCase
 

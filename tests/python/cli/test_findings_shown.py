@@ -8,7 +8,7 @@ import pytest
 import cmfsim
 import cmfsim.pipeline.predicting
 from cmfsim.cli import main
-from cmfsim.cli.notices import Notices
+from cmfsim.cli.text.notices import Notices
 from cmfsim.report import case_document, render_page
 from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import counted, grouped
@@ -113,7 +113,7 @@ def noticed(tmp_path, monkeypatch):
     given = {"where": "case.toml:3", "why": "why", "fix": "fix it"}
     doctor = Finding("of-doctor", "the case is doubtful", severity="warning", **given)
     found = cmfsim.doctor.Examination((doctor,), {})
-    monkeypatch.setattr("cmfsim.cli.case_commands.examine", lambda *_, **__: found)
+    monkeypatch.setattr("cmfsim.cli.patients.case_commands.examine", lambda *_, **__: found)
     head = HeadCase(rounds=2)
     head.toml = head.toml.replace("edge_length = 4.0", "edge_length = 16.0")
     return head.write(tmp_path)

@@ -15,8 +15,8 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.cli.case_commands import case_of
-from cmfsim.io.tables import read_tables
+from cmfsim.cli.patients.case_commands import case_of
+from cmfsim.io.cases.tables import read_tables
 from cmfsim.pipeline.building.inputs import plan_key
 from cmfsim.pipeline.planning_page import page_state
 from head_case import HeadCase

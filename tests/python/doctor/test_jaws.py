@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.doctor.bone_overlap import BonePart, check_jaws, jaw_of
+from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of
 from cmfsim.pipeline.building.case_checks import jaws
-from cmfsim.pipeline.building.motions import PlannedBones
+from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.values.surface_data import joined_surface
 from head_case import HeadCase, icosphere
 from shared_values import coarse_demo_patient

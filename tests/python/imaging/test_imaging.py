@@ -10,7 +10,7 @@ import pytest
 import cmfsim
 import ct_variants as variants
 from cmfsim import ImageData, ImageError, SegmentOptions, segment_head
-from cmfsim.imaging import intensity
+from cmfsim.imaging.intensities import intensity
 from phantom_reference import check_face, dice, distances, face, parted_as, surface_points
 from phantom_reference import reference as reference_surfaces
 from synthetic_head import made_head

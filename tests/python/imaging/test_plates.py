@@ -13,7 +13,7 @@ from synthetic_head import made_head
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 pytest.importorskip("scipy.ndimage", reason="needs scipy")
 
-from cmfsim.imaging.plates import STEP, find_plates
+from cmfsim.imaging.skins.plates import STEP, find_plates
 
 DATA = Path(os.environ.get("CMFSIM_DATA", Path(__file__).parents[4] / "shared" / "data"))
 # A face of two ellipsoids: middles and half axes, mm; y points backwards.

@@ -9,7 +9,7 @@ import pytest
 import cmfsim
 import cmfsim.values.case_parts
 import cmfsim.values.case_region
-from cmfsim.io.toml_lines import line_of, toml_lines
+from cmfsim.io.files.toml_lines import line_of, toml_lines
 
 HEAD = 'format = "cmfsim-case"\nversion = 1\n'
 SURFACES = '[surfaces]\nskin = "skin.ply"\n[surfaces.bones]\nmandible = "jaw.stl"\n'

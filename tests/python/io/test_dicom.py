@@ -11,9 +11,9 @@ import pytest
 import cmfsim
 import ct_variants as variants
 from cmfsim import ImageData, ImageError
-from cmfsim.io.dicom import dicom_files, dicom_places
-from cmfsim.io.image_grids import of_slices
-from cmfsim.io.images import read_image_file
+from cmfsim.io.images.dicom.series import dicom_files, dicom_places
+from cmfsim.io.images.image_files import read_image_file
+from cmfsim.io.images.image_grids import of_slices
 from dicom_series import axial, tilted, write_classic_frames, write_enhanced, write_series
 from real_heads import data_folder
 

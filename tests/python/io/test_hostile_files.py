@@ -10,9 +10,9 @@ import pytest
 
 import cmfsim
 import meshes
-from cmfsim.io.archives import read_archive
-from cmfsim.io.tables import read_tables
-from cmfsim.io.template_archives import read_template_archive
+from cmfsim.io.cases.tables import read_tables
+from cmfsim.io.cases.template_archives import read_template_archive
+from cmfsim.io.files.archives import read_archive
 
 NODES, TETS = meshes.box((2, 2, 2), (4.0, 4.0, 4.0))
 LOW = meshes.nodes_where(NODES[:, 2] == 0.0)
@@ -148,13 +148,13 @@ def test_an_array_that_states_more_than_it_has_is_refused_before_memory_is_taken
 
 
 def test_what_unpacks_to_hundreds_of_times_its_size_is_refused(scene, monkeypatch):
-    monkeypatch.setattr("cmfsim.io.archives.FREE", 2**20)
+    monkeypatch.setattr("cmfsim.io.files.archives.FREE", 2**20)
     path = rewritten(scene, {"loads.npy": packed(np.zeros((2**18, 3)))})
     refused(lambda: cmfsim.read_scene(path), "array 'loads' unpacks to .* more are read of an arch")
 
 
 def test_archives_of_very_many_members_are_refused(scene, monkeypatch):
-    monkeypatch.setattr("cmfsim.io.archives.MAX_MEMBERS", 20)
+    monkeypatch.setattr("cmfsim.io.files.archives.MAX_MEMBERS", 20)
     path = rewritten(scene, {f"x{i}.npy": b"" for i in range(20)})
     refused(lambda: cmfsim.read_scene(path), "members")
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from cmfsim import ImageData, ImageError
-from cmfsim.io import images
-from cmfsim.io.image_headers import ImageHeader, check_length
-from cmfsim.io.images import read_image, read_image_file, write_image
-from cmfsim.io.metaimage import meta_header
-from cmfsim.io.nifti import read_nifti
-from cmfsim.io.nrrd import nrrd_header
+from cmfsim.io.images import image_files as images
+from cmfsim.io.images.image_files import read_image, read_image_file, write_image
+from cmfsim.io.images.image_headers import ImageHeader, check_length
+from cmfsim.io.images.metaimage import meta_header
+from cmfsim.io.images.nifti import read_nifti
+from cmfsim.io.images.nrrd import nrrd_header
 from real_heads import data_folder
 
 sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")

@@ -5,7 +5,7 @@ import pytest
 
 import cmfsim
 from cmfsim import ImageData, ImageError
-from cmfsim.io.images import read_image, read_image_file, write_image
+from cmfsim.io.images.image_files import read_image, read_image_file, write_image
 
 sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 SHAPE = (12, 10, 8)

@@ -11,7 +11,7 @@ import pytest
 
 import cmfsim
 import meshes
-from cmfsim.io.meshes import read_mesh
+from cmfsim.io.meshes.mesh_files import read_mesh
 from head_case import icosphere
 
 meshio = pytest.importorskip("meshio")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.io.segmentations import read_segmentation
-from cmfsim.io.slicer_bundles import unpack_bundle
-from cmfsim.io.slicer_scenes import read_slicer_scene
-from cmfsim.pipeline.drafting import init_case
+from cmfsim.drafting import init_case
+from cmfsim.io.images.segmentations import read_segmentation
+from cmfsim.io.slicer.bundles import unpack_bundle
+from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
 
 POINTS = np.array([[1.0, 2.0, 3.0], [4.0, 2.0, 3.0], [1.0, 6.0, 3.0]])
 LPS = POINTS * [-1.0, -1.0, 1.0]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.io.curves import read_curves, write_curves
-from cmfsim.io.templates import write_template
+from cmfsim.io.cases.templates import write_template
+from cmfsim.io.landmarks.curves import read_curves, write_curves
 from cmfsim.muscles.template import phantom_muscle
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -496,7 +496,7 @@ def test_a_failed_write_leaves_the_old_template_whole(small, folder, monkeypatch
     def fails(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("cmfsim.io.templates.write_curves", fails)
+    monkeypatch.setattr("cmfsim.io.cases.templates.write_curves", fails)
     with pytest.raises(OSError, match="disk full"):
         write_template(folder, with_muscles(small, name="other"))
     same(cmfsim.MuscleTemplate.load(folder), small)

@@ -10,7 +10,7 @@ import cmfsim
 from angles import angle_between
 from cmfsim import HeadParameters, PhantomHead, make_head
 from cmfsim.phantom import BONES, LABELS, PARAMETER_RANGES
-from cmfsim.phantom.courses import COURSES
+from cmfsim.phantom.geometry.courses import COURSES
 from cmfsim.phantom.grid import gradient_at, level_grid
 from cmfsim.phantom.scan import HOUNSFIELD
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.cli.study_commands import achieved_text
-from cmfsim.pipeline.building.motions import planned_bones
-from cmfsim.pipeline.building.postoperative import read_postoperative
+from cmfsim.cli.research.study_commands import achieved_text
+from cmfsim.pipeline.building.surgery.motions import planned_bones
+from cmfsim.pipeline.building.surgery.postoperative import read_postoperative
 from head_case import HeadCase, ellipsoid, icosphere
 from pebbles import slid
 

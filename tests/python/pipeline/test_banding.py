@@ -7,11 +7,11 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.io.predictions import read_prediction
+from cmfsim.io.results.predictions import read_prediction
+from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.pipeline import predicting
 from cmfsim.pipeline.outputs import write_results
 from cmfsim.surfaces.depth import tissue_depth
-from cmfsim.virtual.demo import write_demo_case
 from shared_values import COARSE_EDGE, coarse_demo_patient
 
 

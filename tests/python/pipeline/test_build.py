@@ -17,8 +17,9 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.cli import main
-from cmfsim.io import models
-from cmfsim.pipeline.building import assembly, case_model, tissue_mesh
+from cmfsim.io.results import models
+from cmfsim.pipeline.building import assembly, case_model
+from cmfsim.pipeline.building.tissue import tissue_mesh
 from head_case import HeadCase
 from shared_values import drawn_levels
 
@@ -495,7 +496,7 @@ def test_an_output_that_cannot_be_is_found_before_the_work(ellipsoids, monkeypat
     assert "would replace this input" in err
     assert (ellipsoids.parent / "skin.ply").read_bytes() == skin
     # As on a disk that is read-only: permissions do not tell root.
-    monkeypatch.setattr("cmfsim.io.folders.tempfile.mkdtemp", refuse)
+    monkeypatch.setattr("cmfsim.io.files.folders.tempfile.mkdtemp", refuse)
     code, _, err = run(*words, ellipsoids.parent / "closed")
     assert code == 1
     assert "the output folder is not writable" in err
@@ -527,7 +528,7 @@ def test_the_doctor_is_asked_once_or_not_at_all(ellipsoids, monkeypatch, small_m
         return cmfsim.doctor.Examination(diagnose(case, models), {})
 
     monkeypatch.setattr(case_model, "diagnose", diagnose)
-    monkeypatch.setattr("cmfsim.cli.case_commands.examine", examine)
+    monkeypatch.setattr("cmfsim.cli.patients.case_commands.examine", examine)
     monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
     monkeypatch.setattr(case_model, "_draw", lambda *_: [])
     for words, times in (((), 1), (("--no-doctor",), 0)):

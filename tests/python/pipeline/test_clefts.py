@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.pipeline.building.attached_bodies import held_part
-from cmfsim.pipeline.building.clefts import (
+from cmfsim.pipeline.building.surgery.attached_bodies import held_part
+from cmfsim.pipeline.building.tissue.clefts import (
     cleft_tets,
     crushed_tets,
     without_clefts,

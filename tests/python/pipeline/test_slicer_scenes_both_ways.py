@@ -11,8 +11,8 @@ import cmfsim
 import head_case
 import in_slicer
 from cmfsim.cli import main
-from cmfsim.io.slicer_output import write_slicer_bundle
-from cmfsim.pipeline.drafting import init_case
+from cmfsim.drafting import init_case
+from cmfsim.io.slicer.output import write_slicer_bundle
 
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")

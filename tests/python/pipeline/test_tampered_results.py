@@ -19,8 +19,8 @@ from test_stale_results import (  # noqa: F401 (fixtures)
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.io.metrics import EVALUATION_FILE, read_evaluation
-from cmfsim.io.predictions import read_prediction
+from cmfsim.io.results.metrics import EVALUATION_FILE, read_evaluation
+from cmfsim.io.results.predictions import read_prediction
 
 MUTANTS = 150
 HIDDEN = "of the reader alone"

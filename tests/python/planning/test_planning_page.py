@@ -24,7 +24,7 @@ import pytest
 import cmfsim
 import cmfsim.planning.page.content
 from cmfsim.cli import main
-from cmfsim.cli.plan_command import _correction_text
+from cmfsim.cli.patients.plan_command import _correction_text
 from cmfsim.planning.page.document import joined_scripts
 from cmfsim.planning.replanning import plan_distance
 from cmfsim.planning.replanning.expected_error import plan_near

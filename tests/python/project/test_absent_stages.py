@@ -21,7 +21,7 @@ MUSCLES = {
     "cmfsim.muscles.template",
     "cmfsim.values.template",
     "cmfsim.muscles.equivalent",
-    "cmfsim.pipeline.building.muscles",
+    "cmfsim.pipeline.building.tissue.muscles",
     "cmfsim.doctor.muscles",
 }
 IMAGING = {"cmfsim.imaging"}
@@ -31,7 +31,7 @@ STAGES = {
     "cmfsim.pipeline.building",
     "cmfsim.doctor",
     "cmfsim.evaluation",
-    "cmfsim.virtual",
+    "cmfsim.lab.virtual",
     "cmfsim.solving.inversion",
     "cmfsim.io",
     "cmfsim.meshing",
@@ -80,7 +80,7 @@ def test_importing_the_package_loads_none_of_its_stages():
         ("MuscleTemplate", "cmfsim.muscles.template"),
         ("equivalent_material", "cmfsim.muscles.equivalent"),
         ("segment_head", "cmfsim.imaging"),
-        ("with_muscles", "cmfsim.pipeline.building.muscles"),
+        ("with_muscles", "cmfsim.pipeline.building.tissue.muscles"),
     ],
 )
 def test_a_stage_is_loaded_when_it_is_asked_for(name, home):
@@ -112,7 +112,7 @@ def test_a_case_of_surfaces_without_muscles_loads_neither_muscles_nor_imaging(tm
     assert not found & {
         "cmfsim.bones.achieved",
         "cmfsim.evaluation",
-        "cmfsim.virtual",
+        "cmfsim.lab.virtual",
         "cmfsim.phantom",
     }
 

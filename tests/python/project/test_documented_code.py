@@ -17,9 +17,9 @@ import head_case
 import phantom_case
 from cmfsim.cli import main
 from cmfsim.cli.parsing import make_parser
-from cmfsim.io.files import toml_module
-from cmfsim.io.templates import write_template
-from cmfsim.pipeline.drafting import init_case
+from cmfsim.drafting import init_case
+from cmfsim.io.cases.templates import write_template
+from cmfsim.io.files.reading_writing import toml_module
 from scene_text import model, pack, shift, transform, write_scene
 
 pytest.importorskip("skimage")

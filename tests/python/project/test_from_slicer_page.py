@@ -9,7 +9,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli.parsing import make_parser
-from cmfsim.io.slicer_scenes import read_slicer_scene
+from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
 from scene_text import model, pack, shift, transform, write_scene
 
 pytest.importorskip("skimage")

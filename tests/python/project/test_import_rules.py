@@ -122,13 +122,17 @@ def test_a_circle_of_files_is_named(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_too_many_entries_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A reader holds so many files and folders in mind, and no more."""
     package = tmp_path / "python/cmfsim"
-    package.mkdir(parents=True)
-    for number in range(check_imports.MOST_PYTHON_ENTRIES + 1):
-        (package / f"entry{number}.py").touch()
+    for folder, most in (("", check_imports.LARGE_FOLDERS[""]), ("io", check_imports.MOST_ENTRIES)):
+        (package / folder).mkdir(parents=True, exist_ok=True)
+        for number in range(most + 1):
+            (package / folder / f"entry{number}.py").touch()
+    (package / "io/entry0.pyi").touch()
     assert check_imports.main(tmp_path) == 1
     printed = capsys.readouterr().out
-    most = check_imports.MOST_PYTHON_ENTRIES
-    assert f"python/cmfsim: {most + 1} entries, at most {most}" in printed
+    most = check_imports.MOST_ENTRIES
+    assert f"python/cmfsim/io: {most + 1} files and folders, at most {most}" in printed
+    most = check_imports.LARGE_FOLDERS[""]
+    assert f"python/cmfsim: {most + 2} files and folders, at most {most}" in printed
 
 
 def test_too_many_imports_between_entries_are_counted(

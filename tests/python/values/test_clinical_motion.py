@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import cmfsim
 from cmfsim.cli import main
 from cmfsim.pipeline.building.case_checks import plan_sizes
-from cmfsim.pipeline.building.motions import PlannedBones
+from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from head_case import HeadCase
 
 TYPED = "translation = [0, -4, 1]\nangle = 2\naxis = [1, 0, 0]\ncentre = [3, -100, 1450]"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.io.landmarks import read_landmarks
+from cmfsim.io.landmarks.landmark_files import read_landmarks
 from cmfsim.io.surfaces import read_surface
 from cmfsim.muscles.template.bodyparts3d_courses import atlas_course
 from cmfsim.muscles.template.bodyparts3d_parts import (

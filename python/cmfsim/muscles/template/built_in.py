@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from cmfsim.io.files import is_there
+from cmfsim.io.files.reading_writing import is_there
 
 __all__ = ["template_names", "template_path"]
 

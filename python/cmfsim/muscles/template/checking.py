@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.io.templates import survey_template
+from cmfsim.io.cases.templates import survey_template
 from cmfsim.muscles.template.built_in import template_path
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cmfsim.io.template_archives import mirrored_muscle
+from cmfsim.io.cases.template_archives import mirrored_muscle
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.phantom import Muscle, PhantomHead, make_head
 from cmfsim.surfaces.repair import RepairOptions, repair_surface

@@ -14,12 +14,12 @@ from cmfsim.io import Case
 from cmfsim.meshing.lips import seam_faces
 from cmfsim.meshing.node_kinds import segment_data
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
-from cmfsim.pipeline.building.landmarks import landmark_summary
-from cmfsim.pipeline.building.lips import lip_summary
-from cmfsim.pipeline.building.motions import PlannedBones
 from cmfsim.pipeline.building.parts import Head, Nodes
-from cmfsim.pipeline.building.skin_part import on_skin
+from cmfsim.pipeline.building.sites.landmarks import landmark_summary
+from cmfsim.pipeline.building.skin.lips import lip_summary
+from cmfsim.pipeline.building.skin.skin_part import on_skin
 from cmfsim.pipeline.building.stages import Stages
+from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.node_kinds import NODE_KINDS
 from cmfsim.values.patient_model import PatientModel

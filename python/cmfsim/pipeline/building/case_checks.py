@@ -7,12 +7,12 @@ import numpy as np
 
 from cmfsim._core import TetMesh
 from cmfsim.doctor import SizedMotion, check_motion_size
-from cmfsim.doctor.bone_overlap import BonePart, check_jaws, jaw_of
-from cmfsim.doctor.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
-from cmfsim.doctor.plan_size import nothing_moves
+from cmfsim.doctor.sites.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
+from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of
+from cmfsim.doctor.surgery.plan_size import nothing_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
-from cmfsim.pipeline.building.motions import PlannedBones
+from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding

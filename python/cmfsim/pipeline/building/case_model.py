@@ -18,7 +18,7 @@ from cmfsim.bones import (
     place_procedure,
 )
 from cmfsim.doctor import diagnose
-from cmfsim.doctor.landmarks import LANDMARK_CODES
+from cmfsim.doctor.sites.landmarks import LANDMARK_CODES
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseOrPath, as_case, write_model
 from cmfsim.meshing import tissue_level
@@ -26,18 +26,18 @@ from cmfsim.meshing.node_kinds import KindOptions, dental_arches, kind_options
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
 from cmfsim.pipeline.building.assembly import assembled
 from cmfsim.pipeline.building.case_checks import jaws, misplaced, plan_sizes
-from cmfsim.pipeline.building.contacts import mean_edge
 from cmfsim.pipeline.building.inputs import check_output, read_anatomy, read_case_landmarks
-from cmfsim.pipeline.building.landmarks import found_landmarks, is_to_be_found
-from cmfsim.pipeline.building.lips import find_seam
-from cmfsim.pipeline.building.motions import PlannedBones, planned_bones
-from cmfsim.pipeline.building.nodes import made_contacts, nodes_of
 from cmfsim.pipeline.building.parts import Head, MeshedTissue, Tissue
-from cmfsim.pipeline.building.postoperative import Postoperative
-from cmfsim.pipeline.building.site_checks import check_bones_of_sites, check_pieces
-from cmfsim.pipeline.building.skin_check import check_skin
+from cmfsim.pipeline.building.sites.landmarks import found_landmarks, is_to_be_found
+from cmfsim.pipeline.building.sites.site_checks import check_bones_of_sites, check_pieces
+from cmfsim.pipeline.building.skin.lips import find_seam
+from cmfsim.pipeline.building.skin.skin_check import check_skin
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
-from cmfsim.pipeline.building.tissue_mesh import region_of, tissue_mesh
+from cmfsim.pipeline.building.surgery.motions import PlannedBones, planned_bones
+from cmfsim.pipeline.building.surgery.postoperative import Postoperative
+from cmfsim.pipeline.building.tissue.contacts import mean_edge
+from cmfsim.pipeline.building.tissue.nodes import made_contacts, nodes_of
+from cmfsim.pipeline.building.tissue.tissue_mesh import region_of, tissue_mesh
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding, OnFindings
@@ -182,7 +182,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         if case.muscles is None:
             return _without_muscles(head, stages, kinds, options, tissue)[0]
         # A case without muscles loads nothing of them.
-        from cmfsim.pipeline.building.muscles import (  # noqa: PLC0415
+        from cmfsim.pipeline.building.tissue.muscles import (  # noqa: PLC0415
             NoMuscles,
             placed_muscles,
             with_muscles,

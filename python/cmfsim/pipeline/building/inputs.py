@@ -21,11 +21,11 @@ from cmfsim.io import (
     read_surface_file,
     read_transform,
 )
-from cmfsim.io.dicom import dicom_files
-from cmfsim.io.folders import check_below, check_writable
-from cmfsim.io.images import read_image_file
-from cmfsim.io.models import is_model_file
-from cmfsim.io.transforms import read_transform_file
+from cmfsim.io.files.folders import check_below, check_writable
+from cmfsim.io.images.dicom.series import dicom_files
+from cmfsim.io.images.image_files import read_image_file
+from cmfsim.io.results.models import is_model_file
+from cmfsim.io.slicer.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.anatomy import Anatomy

@@ -8,8 +8,8 @@ from cmfsim.io import Case
 from cmfsim.meshing import TissueRegion
 from cmfsim.meshing.lips import LipSeam
 from cmfsim.meshing.node_kinds import DentalArches
-from cmfsim.pipeline.building.contacts import CaseContacts
-from cmfsim.pipeline.building.lips import CaseLipContact
+from cmfsim.pipeline.building.skin.lips import CaseLipContact
+from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding

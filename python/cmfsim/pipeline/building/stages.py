@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from cmfsim.pipeline.building.postoperative import Postoperative
+from cmfsim.pipeline.building.surgery.postoperative import Postoperative
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.progress import Progress, no_progress

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.registration.proposed.groups import JAW_SITES
+from cmfsim.registration.proposed.definitions.groups import JAW_SITES
 from cmfsim.registration.proposed.judgement import IMAGE_ENDS
 from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead
 from cmfsim.values.checks import Floats

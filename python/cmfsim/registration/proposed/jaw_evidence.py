@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cmfsim.registration.proposed.groups import FAR_JAW, jaw_distance
+from cmfsim.registration.proposed.definitions.groups import FAR_JAW, jaw_distance
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.values.checks import Floats
 from cmfsim.values.proposed_landmarks import ProposedSite

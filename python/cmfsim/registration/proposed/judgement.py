@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.registration.proposed.groups import misfits
+from cmfsim.registration.proposed.definitions.groups import misfits
 from cmfsim.registration.proposed.limits import CutPlane
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.values.checks import Floats

@@ -9,14 +9,14 @@ import numpy as np
 from cmfsim._core import Surface
 from cmfsim.errors import LandmarkInputError
 from cmfsim.registration.proposed.by_model import SitesOfKind, with_model
-from cmfsim.registration.proposed.detection import (
+from cmfsim.registration.proposed.definitions.detection import (
     Detected,
     HeadSurfaces,
     biases,
     detect,
     is_lower,
 )
-from cmfsim.registration.proposed.groups import JAW_SITES
+from cmfsim.registration.proposed.definitions.groups import JAW_SITES
 from cmfsim.registration.proposed.jaw_evidence import (
     JawEvidence,
     jaw_evidence,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.virtual.demo import write_demo_case
 
 FORWARDS, BACK = (0.0, -5.0, 0.0), (0.0, 5.0, 0.0)
 

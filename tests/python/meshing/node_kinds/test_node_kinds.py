@@ -6,7 +6,7 @@ import pytest
 import cmfsim
 import meshes
 import real_heads
-from cmfsim.pipeline.building.contacts import arch_sheets
+from cmfsim.pipeline.building.tissue.contacts import arch_sheets
 
 BONE, SKIN, LEVEL, LAYERS = 20.0, 32.0, 3, 4
 CUT = -4.0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.meshing.node_kinds import septum
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.virtual.demo import write_demo_case
 from nose_ratios import ratios
 
 ADVANCE = 4.0

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.registration.proposed.average_head import average_head
-from cmfsim.registration.proposed.groups import JAW_SITES
+from cmfsim.registration.proposed.definitions.groups import JAW_SITES
 from cmfsim.registration.proposed.shape_model.smooth_modes import Kernel, SmoothModes
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS

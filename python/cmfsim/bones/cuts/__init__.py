@@ -1,0 +1,1 @@
+"""Cuts through bone: procedures, their planes, and the pieces that they leave."""

@@ -1,0 +1,386 @@
+"""The standard osteotomies, placed from skull landmarks by rules with named distances.
+
+The rules follow the usual surgical descriptions (Bell 1975 for Le Fort I, Tessier 1971 for Le Fort
+III, Trauner and Obwegeser 1957 with Dal Pont 1961 for the sagittal split, Trauner and Obwegeser
+1957 for the chin); the distances below stand in for what a surgeon sees in the image, and each can
+be changed. Left and right follow the names of the landmarks, never the sign of a coordinate.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.bones.cuts.needed_sites import with_missing_sites
+from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure
+from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.values.checks import Floats, as_number, check_one_of
+from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import SKULL_LANDMARKS
+
+__all__ = ["PROCEDURES", "place_procedure", "procedure_options"]
+
+# How far roots reach beyond the bone landmark of their arch, mm, after Wheeler's mean root lengths
+# (Nelson, Dental Anatomy): upper canine 17 with its neck 1 above that of the incisors, upper second
+# molar 11 above the alveolar bone point, lower canine 16 with its neck 1 below and 1 for its lean.
+UPPER_CANINE_REACH = 18.0
+UPPER_MOLAR_REACH = 11.0
+LOWER_CANINE_REACH = 18.0
+# The edges of the upper incisors and the cusps of the second molars below the landmarks of their
+# arch, mm: 12 to 13 and 11 to 20 in two skulls.
+UPPER_INCISOR_EDGE = 13.0
+UPPER_MOLAR_CUSP = 16.0
+# Crown of a lower central incisor, mm (Wheeler): infradentale lies this much under the bite.
+LOWER_INCISOR_CROWN = 9.0
+# A chin piece lower than this is hard to fix with a plate, mm; where the symphysis is short, the
+# clearance under the roots is reduced first, down to the least clearance.
+CHIN_HEIGHT = 8.0
+CHIN_LEAST_CLEARANCE = 1.0
+# The frontozygomatic suture lies this part of the way from the lower to the upper orbital rim.
+FRONTOZYGOMATIC_PART = 0.65
+
+# Defaults and allowed range of every option. Distances mm, angles degrees.
+_OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float]]] = MappingProxyType(
+    {
+        "le_fort_1": {
+            # Of the plane above the estimated root apices.
+            "height": (5.0, -10.0, 20.0),
+            # Turns the plane about the line of the molars; positive raises the front.
+            "tilt": (0.0, -30.0, 30.0),
+            # Turns the plane about the line from back to front; positive raises the left side.
+            "cant": (0.0, -30.0, 30.0),
+            # Of the pterygomaxillary junction behind the second molars' landmarks.
+            "posterior": (12.0, 2.0, 30.0),
+            # Of the buttress lateral to the second molars' landmarks; bone further out stays, so
+            # that the lower edge of the zygoma is not shaved.
+            "width": (12.0, 5.0, 40.0),
+        },
+        "le_fort_3": {
+            # Of the nasofrontal cut above (positive) or below nasion.
+            "height": (0.0, -10.0, 10.0),
+            # Of the top of the pterygomaxillary cut above the molars' landmarks.
+            "junction": (22.0, 5.0, 40.0),
+            "posterior": (12.0, 2.0, 30.0),
+            # Of the lateral orbital wall's cut behind the lateral orbital landmarks.
+            "wall": (6.0, 0.0, 20.0),
+            # Where the arch is cut, as a part of the way from lateral orbit to mid-arch.
+            "arch": (0.5, 0.0, 1.0),
+        },
+        "bsso": {
+            # Of the outer cut behind the second molars' landmarks, towards the angle.
+            "setback": (5.0, -15.0, 25.0),
+            # Between the split and a coronal cut; 0 cuts straight across.
+            "angle": (50.0, 0.0, 75.0),
+            # Of the inner horizontal cut above the bite, over the lingula.
+            "lingula": (10.0, 0.0, 30.0),
+        },
+        "genioplasty": {
+            # Of the cut below the estimated root apices of the lower front teeth.
+            "clearance": (5.0, -5.0, 20.0),
+            # Turns the cut about its front edge; positive lowers the back. Roots lean backwards.
+            "tilt": (5.0, -30.0, 30.0),
+            # How far back the chin may reach, behind (positive) the second molars' landmarks.
+            "posterior": (0.0, -40.0, 20.0),
+        },
+    }
+)
+PROCEDURES = tuple(_OPTIONS)
+_JAW = ("mandible_body", "mandible")
+_UPPER = ("midface", "cranium", "skull")
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Directions of a jaw: to the patient's left, to the front, and from chin to brow."""
+
+    left: Floats
+    front: Floats
+    up: Floats
+
+
+def procedure_options(kind: str) -> dict[str, float]:
+    """The options of a procedure with their defaults: distances in mm, angles in degrees.
+
+    Parameters
+    ----------
+    kind : str
+        "le_fort_1", "le_fort_3", "bsso" or "genioplasty".
+
+    Returns
+    -------
+    dict of str to float
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) An unknown procedure.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.procedure_options("le_fort_1")["height"]
+    5.0
+    """
+    check_one_of("procedure", kind, PROCEDURES)
+    return {name: default for name, (default, _, _) in _OPTIONS[kind].items()}
+
+
+def place_procedure(
+    kind: str,
+    landmarks: Mapping[str, ArrayLike],
+    options: Mapping[str, float] | None = None,
+) -> Procedure:
+    """The procedure with its planes placed from skull landmarks.
+
+    Le Fort I: a plane above the upper roots (height) through the piriform aperture, ending at a
+    coronal plane at the pterygomaxillary junction (posterior). Le Fort III: a plane from the
+    nasofrontal suture down to the pterygomaxillary junction, the lateral orbital walls below the
+    frontozygomatic sutures, and the arches. BSSO: on each side the ramus behind an oblique plane
+    that runs from the outer face behind the second molar to the inner face before the angle, and
+    above a level over the lingula. Genioplasty: a plane below the lower front roots, falling
+    backwards from the bite, ending below the second molars.
+
+    Parameters
+    ----------
+    kind : str
+        "le_fort_1", "le_fort_3", "bsso" or "genioplasty".
+    landmarks : mapping of str to (3,) float64, mm
+        Skull landmarks, LPS; left and right as labelled.
+    options : mapping of str to float, optional
+        Distances (mm) and angles (degrees) other than the defaults of `procedure_options`.
+
+    Returns
+    -------
+    Procedure
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) An unknown procedure or option, a value out of its range.
+    LandmarkError
+        (also `ValueError`) Landmarks missing or misplaced; names the procedure and at most three
+        landmarks that suffice. Single missing ones are estimated, with a finding.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.place_procedure("le_fort_1", landmarks, {"height": 4.0})  # doctest: +SKIP
+    """
+    chosen = _chosen_options(kind, options or {})
+    given = {n: _point(kind, n, place) for n, place in landmarks.items() if n in SKULL_LANDMARKS}
+    points, estimated = with_missing_sites(kind, given)
+    place = {
+        "le_fort_1": _le_fort_1,
+        "le_fort_3": _le_fort_3,
+        "bsso": _bsso,
+        "genioplasty": _genioplasty,
+    }[kind]
+    cuts, findings = place(points, chosen)
+    return Procedure(kind, cuts, chosen, (*estimated, *findings))
+
+
+def _chosen_options(kind: str, options: Mapping[str, float]) -> dict[str, float]:
+    chosen = procedure_options(kind)
+    for name, value in options.items():
+        if name not in chosen:
+            raise CaseInputError(f"{kind} has no option {name!r}: use {', '.join(chosen)}")
+        number = as_number(f"{kind} {name}", value)
+        _, low, high = _OPTIONS[kind][name]
+        if not low <= number <= high:
+            raise CaseInputError(f"{kind} {name} is {number:g}: {low:g} to {high:g} is allowed")
+        chosen[name] = number
+    return chosen
+
+
+def _point(kind: str, name: str, value: ArrayLike) -> Floats:
+    point = np.asarray(value, dtype=np.float64)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise LandmarkInputError(f"landmark {name!r} of {kind} is {value!r}: three numbers needed")
+    return point
+
+
+def _middle(points: Mapping[str, Floats], name: str) -> Floats:
+    return 0.5 * (points[f"{name}_L"] + points[f"{name}_R"])
+
+
+def _unit(kind: str, what: str, vector: Floats) -> Floats:
+    length = float(np.linalg.norm(vector))
+    # Landmarks of a jaw lie centimetres apart; under a millimetre two of them are the same point.
+    if length < 1.0:
+        raise LandmarkInputError(f"{kind}: {what} lie {length:.2g} mm apart: landmarks coincide")
+    return vector / length
+
+
+def _frame(
+    kind: str,
+    points: Mapping[str, Floats],
+    pairs: Sequence[str],
+    *,
+    tip: Floats,
+    back: Floats,
+    above: Floats,
+) -> _Frame:
+    """Left from the pairs, front from `back` to `tip`, up towards `above`; each at right angles."""
+    sides = sum((points[f"{n}_L"] - points[f"{n}_R"] for n in pairs), np.zeros(3))
+    left = _unit(kind, f"left and right {pairs[0]}", sides)
+    front = tip - back
+    front = _unit(kind, "front and back of the arch", front - (front @ left) * left)
+    up = above - (above @ left) * left
+    up = _unit(kind, "arch and the point above it", up - (up @ front) * front)
+    return _Frame(left, front, up)
+
+
+def _upper_frame(kind: str, points: Mapping[str, Floats]) -> _Frame:
+    left, right, tip = points["supra_m2_L"], points["supra_m2_R"], points["supradentale"]
+    # Towards the vertex, however the head nods: LPS is upright within 90°.
+    above = np.cross(left - tip, right - tip)
+    above = above * (np.sign(above[2]) or 1.0)
+    return _frame(
+        kind,
+        points,
+        ("supra_m2",),
+        tip=tip,
+        back=_middle(points, "supra_m2"),
+        above=above,
+    )
+
+
+def _lower_frame(kind: str, points: Mapping[str, Floats]) -> _Frame:
+    """Along the bite: from the rami at its height to the edges of the lower incisors."""
+    back, above = _middle(points, "occlusal_line"), points["infradentale"] - points["menton"]
+    names = ("occlusal_line", "sub_m2")
+    first = _frame(kind, points, names, tip=points["infradentale"], back=back, above=above)
+    tip = points["infradentale"] + LOWER_INCISOR_CROWN * first.up
+    return _frame(kind, points, names, tip=tip, back=back, above=above)
+
+
+def _turned(vector: Floats, towards: Floats, degrees: float) -> Floats:
+    """A unit vector turned towards another one at right angles to it."""
+    angle = math.radians(degrees)
+    return math.cos(angle) * vector + math.sin(angle) * towards
+
+
+def _le_fort_1(
+    points: Mapping[str, Floats], options: Mapping[str, float]
+) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
+    frame = _upper_frame("le_fort_1", points)
+    molars = _middle(points, "supra_m2")
+    tip = points["supradentale"] + (UPPER_CANINE_REACH + options["height"]) * frame.up
+    back = molars + (UPPER_MOLAR_REACH + options["height"]) * frame.up
+    ahead = tip - back
+    ahead = _unit(
+        "le_fort_1", "front and back of the plane", ahead - (ahead @ frame.left) * frame.left
+    )
+    down = np.cross(frame.left, ahead)
+    down = -down * np.sign(down @ frame.up)
+    # Raising the front turns the downward normal forwards; raising the left turns it leftwards.
+    down = _turned(down, ahead, options["tilt"])
+    down = _turned(down, frame.left, options["cant"])
+    planes = (
+        CuttingPlane(back, down, "Le Fort I"),
+        _junction(points, frame, options["posterior"]),
+        *(
+            CuttingPlane(
+                points[f"supra_m2_{side}"] + options["width"] * out, -out, f"zygoma {side}"
+            )
+            for side, out in (("L", frame.left), ("R", -frame.left))
+        ),
+    )
+    return (Cut("maxilla", (planes,), _UPPER, joined=_bite(points, frame)),), ()
+
+
+def _bite(points: Mapping[str, Floats], frame: _Frame) -> CuttingPlane:
+    """The plane through the edges of the upper teeth; what lies above it is of the upper jaw."""
+    tip = points["supradentale"] - UPPER_INCISOR_EDGE * frame.up
+    back = _middle(points, "supra_m2") - UPPER_MOLAR_CUSP * frame.up
+    normal = np.cross(frame.left, tip - back)
+    return CuttingPlane(tip, normal * np.sign(normal @ frame.up), "bite")
+
+
+def _junction(points: Mapping[str, Floats], frame: _Frame, posterior: float) -> CuttingPlane:
+    """The coronal plane at the pterygomaxillary junction; what lies before it moves."""
+    place = _middle(points, "supra_m2") - posterior * frame.front
+    return CuttingPlane(place, frame.front, "pterygomaxillary junction")
+
+
+def _le_fort_3(
+    points: Mapping[str, Floats], options: Mapping[str, float]
+) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
+    frame = _upper_frame("le_fort_3", points)
+    junction = _junction(points, frame, options["posterior"])
+    top = points["nasion"] + options["height"] * frame.up
+    bottom = junction.point + options["junction"] * frame.up
+    along = top - bottom
+    along = _unit("le_fort_3", "nasion and the junction", along - (along @ frame.left) * frame.left)
+    down = np.cross(frame.left, along)
+    # Into the face: forwards and down.
+    down = down * np.sign(down @ (frame.front - frame.up))
+    groups: list[tuple[CuttingPlane, ...]] = [(CuttingPlane(top, down, "nasofrontal"), junction)]
+    for side, outward in (("L", frame.left), ("R", -frame.left)):
+        upper, lower = points[f"supraorbital_{side}"], points[f"suborbital_{side}"]
+        rim, arch = points[f"lateral_orbit_{side}"], points[f"zygomatic_arch_{side}"]
+        suture = lower + FRONTOZYGOMATIC_PART * (upper - lower)
+        wall = rim - options["wall"] * frame.front
+        below = CuttingPlane(suture, -frame.up, f"frontozygomatic {side}")
+        beside = CuttingPlane(0.5 * (lower + rim), outward, f"orbit {side}")
+        groups.append((below, beside, CuttingPlane(wall, frame.front, f"lateral wall {side}")))
+        cut = rim + options["arch"] * (arch - rim)
+        lateral = CuttingPlane(rim, outward, f"beside the orbit {side}")
+        groups.append((below, lateral, CuttingPlane(cut, frame.front, f"arch {side}")))
+    bite = _bite(points, frame)
+    return (Cut("midface", tuple(groups), ("cranium", "skull"), joined=bite),), ()
+
+
+def _bsso(
+    points: Mapping[str, Floats], options: Mapping[str, float]
+) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
+    frame = _lower_frame("bsso", points)
+    middle = 0.5 * (points["infradentale"] + points["menton"])
+    cuts = []
+    for side, name, outward in (
+        ("L", "ramus_left", frame.left),
+        ("R", "ramus_right", -frame.left),
+    ):
+        molar, angle = points[f"sub_m2_{side}"], points[f"gonion_{side}"]
+        outer = molar + options["setback"] * _unit("bsso", f"sub_m2_{side}, gonion", angle - molar)
+        behind = _turned(-frame.front, outward, options["angle"])
+        bite = points[f"occlusal_line_{side}"] + options["lingula"] * frame.up
+        half = CuttingPlane(middle, outward, f"half {side}")
+        groups = (
+            (half, CuttingPlane(outer, behind, f"sagittal split {side}")),
+            (half, CuttingPlane(bite, frame.up, f"above the lingula {side}")),
+        )
+        cuts.append(Cut(name, groups, _JAW, "mandible_body"))
+    return tuple(cuts), ()
+
+
+def _genioplasty(
+    points: Mapping[str, Floats], options: Mapping[str, float]
+) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
+    frame = _lower_frame("genioplasty", points)
+    tip, menton = points["infradentale"], points["menton"]
+    symphysis = float((tip - menton) @ frame.up)
+    room = symphysis - LOWER_CANINE_REACH - CHIN_HEIGHT
+    wanted = options["clearance"]
+    clearance = min(wanted, max(room, CHIN_LEAST_CLEARANCE))
+    findings: tuple[Finding, ...] = ()
+    if clearance < wanted:
+        findings = (
+            Finding(
+                "chin-short",
+                f"the chin is {symphysis:.1f} mm high, so the cut passes {clearance:.1f} mm below "
+                f"the estimated roots instead of {wanted:.1f} mm",
+                where="genioplasty",
+            ),
+        )
+    front = tip - (LOWER_CANINE_REACH + clearance) * frame.up
+    below = _turned(-frame.up, frame.front, options["tilt"])
+    end = _middle(points, "sub_m2") - options["posterior"] * frame.front
+    planes = (
+        CuttingPlane(front, below, "genioplasty"),
+        CuttingPlane(end, frame.front, "behind the chin"),
+    )
+    return (Cut("chin", (planes,), _JAW),), findings

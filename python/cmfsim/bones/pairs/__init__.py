@@ -1,0 +1,1 @@
+"""The motion of a bone that is given before and after an operation."""

@@ -1,0 +1,310 @@
+"""Bone motions vertex by vertex, as rigid pieces, how bone bends, and bone that was removed.
+
+The jaw of a skull may be cut and moved within one surface. Each piece then moves rigidly, the mesh
+stretches between them, vertices of a fitted template slide along the bone, and those of resected
+bone are squeezed onto what is left. `coherent_motion` finds the pieces and tells these apart: what
+lies along the normals is seen in the scans and followed, what lies along the surface is followed as
+far as bending explains it, and only a patch that sank into its own piece, and did not move as one,
+counts as removed.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface
+from cmfsim.bones.motion import RemovedBone, missing_patches
+from cmfsim.bones.pairs.rigid_pieces import (
+    PASSES,
+    QUIET,
+    PairedBone,
+    median,
+    rigid_pieces,
+)
+from cmfsim.values.checks import Floats
+from cmfsim.values.frozen import Frozen
+from cmfsim.values.motion import carried
+from cmfsim.values.surface_data import MovedSurface
+
+__all__ = ["CoherentMotion", "RigidPiece", "coherent_motion"]
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# Next to other pieces vertices are followed as they are: the mesh stretches there. Shares of a
+# vertex's own piece over this length, mm, and between them; the first is reached 6.6 mm from a
+# border.
+BETWEEN = 4.0
+NEAR_ANOTHER, WELL_WITHIN = 0.95, 0.995
+# Unless the pieces take it less than this apart, mm.
+APART = 2.0
+# What varies over more than this length along the surface, mm, is judged for a piece as a whole.
+SLOW = 16.0
+# Neighbourhood over which noise is averaged, mm: bone does not bend within it.
+AVERAGED = 3.0
+# The weight of a vertex between pieces in such averages.
+LEAST_WEIGHT = 1e-6
+# The motion of a piece is known if the median deviation along its normals is below this, mm.
+KNOWN = 0.35
+# A patch of removed bone ends abruptly: this far around it, the median deviation of vertices is at
+# most this share of the largest in the patch. A bone that bends deviates all around.
+RING, RING_SHARE = 6.0, 0.35
+# Vertices further than this from where their surroundings went, mm, are none of these.
+OUT_OF_LINE = 0.75
+# A larger patch, mm², moved: no operation grinds away so much of a surface.
+MOST_REMOVED = 1500.0
+# Smaller ones, mm², are corners and rims.
+LEAST_PATCH = 20.0
+# A patch lies within a piece, away from others, if so much of its surroundings is of that piece;
+# its vertices lie well within.
+WITHIN = 0.9
+# What vertices slide along curved bone is no sign of missing bone: a patch is deeper than so many
+# times their slip, rms. For slip of two directions, that is the second times the median.
+SLID, TO_RMS = 1.5, 1.2
+# A piece of bone is at most this thick, mm: if it moved, its other side went outwards.
+THICK = 12.0
+# Of a patch that was ground off, nearly all went inwards; a piece of bone has two sides.
+INWARDS = -0.7
+
+
+@dataclass(frozen=True, eq=False)
+class RigidPiece(Frozen):
+    """A part of a bone that moved as one.
+
+    Attributes
+    ----------
+    matrix : (4, 4) float64, mm
+        Its rigid motion.
+    area : float, mm²
+    vertices : (n,) int64
+        Of the surface, that lie in it.
+    """
+
+    matrix: Floats
+    area: float
+    vertices: Integers
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with units in their names, as JSON holds them."""
+        return {"matrix": self.matrix.tolist(), "area_mm2": self.area}
+
+
+@dataclass(frozen=True, eq=False)
+class CoherentMotion:
+    """The motion of a bone in pieces.
+
+    Attributes
+    ----------
+    motion : MovedSurface
+        Without noise, slip and removed bone.
+    pieces : tuple of RigidPiece
+        The largest first.
+    removed : tuple of RemovedBone
+        The largest first.
+    slip : float, mm
+        How far vertices slid along the bone: the rms of what was taken off.
+    noise : float, mm
+        The rms of the noise that was averaged out; 0 where it is too small to matter.
+    """
+
+    motion: MovedSurface
+    pieces: tuple[RigidPiece, ...]
+    removed: tuple[RemovedBone, ...]
+    slip: float
+    noise: float
+
+
+def coherent_motion(motion: MovedSurface) -> CoherentMotion:
+    """The motion of a bone in rigid pieces.
+
+    Parameters
+    ----------
+    motion : MovedSurface
+        Without triangles that have no area (`sound_motion`).
+
+    Returns
+    -------
+    CoherentMotion
+
+    Raises
+    ------
+    BoundaryError
+        (also `ValueError`) scipy is missing.
+
+    Notes
+    -----
+    See `rigid_pieces` for the pieces. What deviates from them is slip as far as bending does not
+    explain it (Wiener's filter); bone is removed where the bone after lies off the place to which
+    the surroundings went.
+    """
+    paired = PairedBone(motion)
+    matrices, piece = rigid_pieces(paired)
+    deviation = _Deviation(paired, matrices, piece)
+    removed = _removed(paired, matrices, piece, deviation)
+    rest, noise = _denoised(paired, deviation.rest, removed, deviation.inner)
+    rest, slip = _followed(paired, rest, deviation, piece)
+    found = []
+    for number, matrix in enumerate(matrices):
+        mine = np.flatnonzero(piece == number)
+        found.append(RigidPiece(matrix, float(paired.areas[mine].sum()), mine))
+    return CoherentMotion(
+        MovedSurface(motion.surface, deviation.rigid + rest),
+        tuple(found),
+        removed,
+        slip,
+        noise,
+    )
+
+
+def _denoised(
+    paired: PairedBone, rest: Floats, gone: tuple[RemovedBone, ...], inner: Floats
+) -> tuple[Floats, float]:
+    """Deviations averaged over neighbours, those of removed bone like those round it.
+
+    Also the rms of the noise, mm; deviations with hardly any are returned as they are.
+    """
+    if gone:
+        rest = rest.copy()
+    for patch in gone:
+        inside = _inside(patch, len(rest))
+        ring = _ring(paired.here, inside, RING)
+        rest[inside] = np.average(rest[ring], axis=0, weights=paired.areas[ring])
+    smooth = paired.averaged_within(rest, inner + LEAST_WEIGHT, AVERAGED)
+    square = ((rest - smooth) ** 2).sum(axis=1)
+    noise = float(np.sqrt(np.average(square, weights=paired.areas * (inner + LEAST_WEIGHT))))
+    if noise <= QUIET:
+        return rest, 0.0
+    return rest + inner[:, None] * (smooth - rest), noise
+
+
+class _Deviation:
+    """How the vertices after lie off the rigid motion of their pieces."""
+
+    def __init__(self, paired: PairedBone, pieces: list[Floats], piece: Integers) -> None:
+        share = np.eye(len(pieces))[piece]
+        passing = paired.averaged(share, PASSES)
+        taken = np.stack([carried(matrix, paired.here) for matrix in pieces], axis=1)
+        self.rigid: Floats = (passing[:, :, None] * taken).sum(axis=1)
+        turns = np.array([matrix[:3, :3] for matrix in pieces])[piece]
+        self.normals: Floats = np.einsum("nij,nj->ni", turns, paired.normals)
+        # The share of its own piece round each vertex; and 1 well within a piece, 0 near another.
+        near = paired.averaged(share, BETWEEN)
+        self.own: Floats = near.max(axis=1)
+        inner = np.clip((self.own - NEAR_ANOTHER) / (WELL_WITHIN - NEAR_ANOTHER), 0, 1)
+        # How far apart the pieces round a vertex take it, mm.
+        own = taken[np.arange(len(piece)), piece]
+        apart = np.linalg.norm(taken - own[:, None], axis=2)
+        self.apart: Floats = np.where(near > 1.0 - WELL_WITHIN, apart, 0.0).max(axis=1)
+        self.inner: Floats = np.maximum(inner, 1.0 - np.minimum(self.apart / APART, 1.0))
+        self.rest: Floats = paired.there - self.rigid
+
+    def split(self, rest: Floats) -> tuple[Floats, Floats]:
+        """Deviations along the normals and along the surface, (n, 3) each."""
+        out = (rest * self.normals).sum(axis=1, keepdims=True) * self.normals
+        return out, rest - out
+
+    def squares(self, rest: Floats) -> tuple[Floats, Floats]:
+        """Deviations along the surface, and the squares of those along normal and surface."""
+        out, along = self.split(rest)
+        return along, np.column_stack([(out**2).sum(axis=1), (along**2).sum(axis=1)])
+
+
+def _followed(
+    paired: PairedBone, rest: Floats, deviation: _Deviation, piece: Integers
+) -> tuple[Floats, float]:
+    """Deviations without slip, and the rms of what was subtracted, mm.
+
+    A shell bends along its normals and hardly stretches, so the mean square of its deviations is at
+    most as large along the surface as along the normal; what exceeds that is slip. The share that
+    is kept is that of Wiener's filter: of what varies slowly for each piece, of the remainder place
+    by place.
+    """
+    weight = deviation.inner + LEAST_WEIGHT
+    slow = paired.averaged_within(rest, weight, SLOW)
+    along, squares = deviation.squares(slow)
+    means = np.stack([np.bincount(piece, paired.areas * weight * square) for square in squares.T])
+    taken = (1.0 - _kept(*means))[piece, None] * along
+    along, squares = deviation.squares(rest - slow)
+    taken += (1.0 - _kept(*paired.averaged_within(squares, weight, SLOW).T))[:, None] * along
+    taken *= deviation.inner[:, None]
+    slip = float(np.sqrt(np.average((taken**2).sum(axis=1), weights=paired.areas)))
+    return rest - taken, slip
+
+
+def _kept(normal: Floats, along: Floats) -> Floats:
+    """The share of deviations along the surface that is kept, of mean squares."""
+    kept: Floats = np.minimum(normal / np.maximum(along, 1e-12), 1.0)
+    return kept
+
+
+def _removed(
+    paired: PairedBone, pieces: list[Floats], piece: Integers, deviation: _Deviation
+) -> tuple[RemovedBone, ...]:
+    """The patches of bone that are gone from within their piece."""
+    surface = paired.motion.surface
+    after = Surface(paired.there, surface.triangles)
+    along = np.linalg.norm(deviation.split(deviation.rest)[1], axis=1)
+    slid = TO_RMS * np.sqrt(median(along**2, paired.areas))
+    # Bone is missing from where its surroundings went.
+    weight = deviation.inner
+    for _ in range(2):
+        slow = paired.averaged_within(deviation.rest, weight + LEAST_WEIGHT, SLOW)
+        out = ((deviation.rest - slow) * deviation.normals).sum(axis=1)
+        weight = deviation.inner * (np.abs(out) < OUT_OF_LINE)
+    # Only bone whose motion is known shows what is missing from it.
+    known = [
+        median(np.abs(out[piece == number]), paired.areas[piece == number]) <= KNOWN
+        for number in range(len(pieces))
+    ]
+    # Between pieces that moved apart the mesh is stretched or squeezed: vertices are followed.
+    together = deviation.apart <= 0.5 * APART
+    within = (deviation.own >= WELL_WITHIN) | together
+    found = []
+    for patch in missing_patches(surface, after, deviation.rigid + slow, shown=np.inf):
+        inside = _inside(patch, len(piece))
+        number = int(piece[patch.vertices[0]])
+        ring = _ring(paired.here, inside, RING)
+        if (
+            patch.area >= LEAST_PATCH
+            and patch.depth >= SLID * slid
+            and known[number]
+            and within[inside].all()
+            and (together | (piece == number))[ring].mean() >= WITHIN
+            and float(np.median(np.abs(out[ring]))) <= RING_SHARE * patch.depth
+            and _may_be_ground(paired, pieces[number], inside)
+            and not _has_another_side(paired, inside, out)
+        ):
+            found.append(patch)
+    return tuple(found)
+
+
+def _has_another_side(paired: PairedBone, patch: Mask, out: Floats) -> bool:
+    """Whether bone near a patch went outwards: the other side of a piece that moved."""
+    raised = _ring(paired.here, patch, THICK) & (out > OUT_OF_LINE)
+    return bool(paired.areas[raised].sum() >= 0.5 * paired.areas[patch].sum())
+
+
+def _inside(patch: RemovedBone, count: int) -> Mask:
+    """Which vertices lie in a patch."""
+    inside = np.zeros(count, dtype=bool)
+    inside[patch.vertices] = True
+    return inside
+
+
+def _ring(here: Floats, patch: Mask, reach: float) -> Mask:
+    """The vertices around a patch."""
+    box = (here >= here[patch].min(axis=0) - reach) & (here <= here[patch].max(axis=0) + reach)
+    ring: Mask = box.all(axis=1) & ~patch
+    return ring
+
+
+def _may_be_ground(paired: PairedBone, matrix: Floats, patch: Mask) -> bool:
+    """Whether a patch is small and went inwards all over."""
+    areas = paired.areas * patch
+    off = paired.there - carried(matrix, paired.here)
+    out = (off * (paired.normals @ matrix[:3, :3].T)).sum(axis=1)
+    return bool(
+        areas.sum() <= MOST_REMOVED and (areas * out).sum() <= INWARDS * (areas * np.abs(out)).sum()
+    )

@@ -1,0 +1,158 @@
+"""The motion between surfaces with the same triangles, judged by shape instead of by vertices.
+
+When a template is fitted to each scan, its vertices slide along the bone, and those of resected
+bone are squeezed onto the stump. Neither is motion. If the bone has the same shape before and
+after, moved and perhaps scaled, the rigid motion of that shape is the motion.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface, rigid_fit
+from cmfsim.bones.motion import RemovedBone, missing_patches
+from cmfsim.bones.pairs.along_surface import AlongSurface
+from cmfsim.bones.pairs.shape_fit import (
+    LEAST_SIGMA,
+    TO_SIGMA,
+    TUKEY,
+    ShapeFit,
+    fit_shape,
+    vertex_areas,
+)
+from cmfsim.bones.pairs.stray_patches import LEAST_STRAY, StrayPatch, stray_patches
+from cmfsim.errors import RegistrationError
+from cmfsim.values.checks import Floats
+from cmfsim.values.motion import carried
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["PairedShape", "paired_shape"]
+
+# A vertex lies on the post-operative bone if it is this near, mm: the surface of each of the two
+# scans is accurate to half a millimetre.
+LIES = 1.0
+# A patch off the bone is a piece that moved otherwise if its own vertices' rigid motion lays this
+# share of them this near to the bone after, mm: two and a half times noise of 0.3 mm. The end of a
+# bone, squeezed flat on to the stump, stands off it by its height. Crumbs at its rim do not count.
+OWN, OWN_SHARE = 0.75, 0.8
+# How much it bent is averaged over this length, mm: noise is not bending. Vertices that do not
+# count have the second weight.
+AVERAGED, LEAST_WEIGHT = 3.0, 1e-6
+# Rounds of weights for the motion to begin with: a fifth of the vertices that went 4 mm elsewhere
+# are left out by then.
+TRIM_ROUNDS = 20
+# The motion is that of one rigid bone if so much of the area lies on the bone after or was removed,
+# and so much lies on it. The rest are thin walls and rims of cuts.
+RIGID_SHARE, LEAST_LYING = 0.95, 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class PairedShape:
+    """A bone registered by shape to the same mesh after the operation.
+
+    Attributes
+    ----------
+    fit : ShapeFit
+    is_rigid : bool
+        Whether the bone moved rigidly, apart from a change of size and removed bone.
+    bent : (n,) float64, mm
+        How far the bone after lies off along the normals, on average over neighbours, with the
+        change of size removed: how it bent. 0 where it was removed.
+    slip : float, mm
+        How far vertices slid along the surface, median.
+    slid_free : (n, 3) float64, mm
+        The vertices after without slip and change of size: each where the rigid motion takes it,
+        and from there as far along the normal as the bone after lies off.
+    removed : tuple of RemovedBone
+    stray : tuple of StrayPatch
+    """
+
+    fit: ShapeFit
+    is_rigid: bool
+    bent: Floats
+    slip: float
+    slid_free: Floats
+    removed: tuple[RemovedBone, ...]
+    stray: tuple[StrayPatch, ...]
+
+
+def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
+    """The registration by shape of a bone to the same mesh after the operation.
+
+    Parameters
+    ----------
+    before, after : SurfaceData
+        The same triangles in the same order.
+
+    Raises
+    ------
+    RegistrationError
+        (also `ValueError`) Vertices that lie on one line; see `fit_shape` too.
+    MeshError
+        (also `ValueError`) A triangle without area after.
+    """
+    here, there = before.vertices, after.vertices
+    bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
+    fit = fit_shape(before, bone, _trimmed_motion(here, there))
+    scaled = fit.carried(here)
+    closest, normals, _ = bone.closest(scaled)
+    # The mesh shows all the bone that is left, so whatever lies off it is known to be off.
+    removed = missing_patches(before, bone, scaled, shown=np.inf)
+    stray = stray_patches(before, bone, fit.similarity, fit.sigma)[0]
+    on = fit.off <= LIES
+    gone = np.zeros(len(here), dtype=bool)
+    for patch in removed:
+        gone[patch.vertices] = True
+    areas = vertex_areas(before)
+    total = areas.sum()
+    moved = carried(fit.matrix, here)
+    large = [patch.vertices for patch in removed if patch.area >= LEAST_STRAY]
+    large += [patch.vertices for patch in stray]
+    rest = np.where(gone[:, None], 0.0, closest - scaled)
+    along = there - scaled
+    along -= (along * normals).sum(axis=1, keepdims=True) * normals
+    kept = fit.kept & ~gone
+    return PairedShape(
+        fit,
+        bool(
+            areas[on | gone].sum() >= RIGID_SHARE * total
+            and areas[on & ~gone].sum() >= LEAST_LYING * total
+            and not any(_is_displaced(here, there, bone, patch) for patch in large)
+        ),
+        _bent(before, ((closest - scaled) * normals).sum(axis=1), ~gone),
+        float(np.median(np.linalg.norm(along[kept], axis=1))) if kept.any() else 0.0,
+        moved + rest,
+        removed,
+        # Removed bone is reported once.
+        () if removed else stray,
+    )
+
+
+def _bent(before: SurfaceData, off: Floats, kept: NDArray[np.bool_]) -> Floats:
+    """Distances along normals, averaged over neighbours that count; 0 for the others, (n,) mm."""
+    near, weights = np.clip(off, -LIES, LIES), np.where(kept, 1.0, LEAST_WEIGHT)
+    mean = AlongSurface(before).averaged_within(near, weights, AVERAGED)
+    return np.where(kept, mean, 0.0)
+
+
+def _trimmed_motion(here: Floats, there: Floats) -> Floats:
+    """The rigid motion of most vertices, robust against the others (Tukey's biweight)."""
+    fit = rigid_fit(here, there)
+    for _ in range(TRIM_ROUNDS):
+        off = fit.residuals
+        reach = TUKEY * max(TO_SIGMA * float(np.median(off)), LEAST_SIGMA)
+        fit = rigid_fit(here, there, weights=(1.0 - np.minimum(off / reach, 1.0) ** 2) ** 2)
+    return fit.matrix
+
+
+def _is_displaced(here: Floats, there: Floats, bone: Surface, patch: NDArray[np.int64]) -> bool:
+    """Whether a patch that the bone's motion leaves off the bone moved as one piece."""
+    try:
+        own = rigid_fit(here[patch], there[patch]).matrix
+    except RegistrationError:
+        # Squeezed to a point or a line.
+        return False
+    moved = carried(own, here[patch])
+    off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
+    return bool((off <= OWN).mean() >= OWN_SHARE)

@@ -1,0 +1,1 @@
+"""Commands for one patient: case, landmarks, plan, prediction, pictures."""

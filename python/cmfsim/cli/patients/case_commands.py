@@ -1,0 +1,156 @@
+"""`cmfsim doctor` and `cmfsim build`: patient cases."""
+
+import argparse
+import dataclasses
+import json
+import logging
+import re
+import sys
+import time
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TextIO
+
+from cmfsim.cli.exit_codes import BAD_INPUT, DONE
+from cmfsim.cli.text.build_report import WIDTH, build_text
+from cmfsim.cli.text.notices import FindingsError, Notices
+from cmfsim.cli.text.terminal import StageProgress, columns, escaped, in_colour
+from cmfsim.doctor import Examination, examine, findings_text
+from cmfsim.io import Case
+from cmfsim.io.results.models import is_model_file
+from cmfsim.pipeline.building.inputs import plan_key
+from cmfsim.pipeline.predicting import case_for_models
+from cmfsim.pipeline.preparation import prepare
+from cmfsim.values.checks import as_positive
+from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.finding import SEVERITIES, Finding
+
+_log = logging.getLogger(__name__)
+# What the planning page states of the case that a plan was made for.
+MADE_FOR = re.compile(r"^# made for: ([0-9a-f]{64})\s*$", re.MULTILINE)
+
+__all__ = ["build", "case_of", "checked", "doctor", "print_findings"]
+
+
+def doctor(options: argparse.Namespace) -> int:
+    """Reports the problems of a case; the exit code is bad input if any is an error."""
+    case = Case.load(options.case)
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage(f"checking {case.name}")
+        found = examine(case)
+    findings, plan = found.findings, _plan_values(found)
+    if case.image is not None:
+        # Of other commands, the work itself follows.
+        findings = (*findings, Finding("not-segmented", where=case.where("image")))
+    if options.json:
+        counts = {f"{s}s": sum(f.severity == s for f in findings) for s in SEVERITIES}
+        entries = [dataclasses.asdict(finding) for finding in findings]
+        report = {
+            "case": case.name,
+            "file": str(case.file),
+            **counts,
+            "plan": plan,
+            "findings": entries,
+        }
+        print(json.dumps(report, allow_nan=False))
+    else:
+        for line in plan_lines(plan):
+            print(f"plan: {escaped(line)}")
+        print_findings(findings, sys.stdout)
+    return BAD_INPUT if _has_errors(findings) else DONE
+
+
+def build(options: argparse.Namespace) -> int:
+    """Builds a case, unless the doctor finds an error in it."""
+    case = case_of(options)
+    prepare(case, is_model_file)
+    notices = Notices(quiet=options.quiet)
+    begun = time.perf_counter()
+    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
+    seconds = time.perf_counter() - begun
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        build_case = import_module("cmfsim.pipeline.building.case_model").build_case
+        built = build_case(
+            case, progress=progress.stage, check=False, findings=findings, on_findings=notices.add
+        )
+    summary = dict(built.summary)
+    # Those of muscles are noticed after the last stage.
+    notices.add(Finding.from_values(entry) for entry in summary["findings"])
+    if not options.no_doctor:
+        summary["timings"] = {"checking the case": seconds, **summary["timings"]}
+    if options.json:
+        print(json.dumps(summary, allow_nan=False))
+        return DONE
+    width = min(columns(), WIDTH) if sys.stdout.isatty() else WIDTH
+    print(build_text(summary, width=width))
+    notices.summarise(str(Path(summary["output"]) / "build.json"))
+    return DONE
+
+
+def case_of(options: argparse.Namespace) -> Case:
+    """The case given to a command, with the changes given on the command line."""
+    case = Case.load(options.case)
+    if options.edge_length is not None:
+        edge_length = as_positive("--edge-length", options.edge_length)
+        case = dataclasses.replace(
+            case, mesh=dataclasses.replace(case.mesh, edge_length=edge_length)
+        )
+    if getattr(options, "plan", None) is not None:
+        case = case.with_plan(options.plan)
+        _warn_of_other_state(case, options.plan)
+    if options.output is not None:
+        # A link that the user names is followed, and the folder it leads to is printed.
+        output = options.output.resolve() if options.output.is_symlink() else options.output
+        case = dataclasses.replace(case, output=output)
+    return case
+
+
+def _warn_of_other_state(case: Case, path: Path) -> None:
+    """Warns of a plan that a planning page saved for another head, or for other cuts."""
+    made_for = MADE_FOR.search(path.read_text(encoding="utf-8"))
+    if made_for is not None and made_for[1] != plan_key(case):
+        _log.warning(
+            "%s: this plan was made for another case, or for other images, landmarks or cuts of "
+            "this case: check the motions below, or create the planning page again",
+            path,
+        )
+
+
+def checked(
+    case: Case, notices: Notices, models: Sequence[str] | None = None, *, quiet: bool
+) -> tuple[Finding, ...]:
+    """The findings of the doctor for a case and some models; warnings are printed.
+
+    Raises
+    ------
+    FindingsError
+        An error is among the findings.
+    """
+    with StageProgress(sys.stderr, quiet=quiet) as progress:
+        progress.stage("checking the case")
+        asked = case if models is None else case_for_models(case, models)
+        found = examine(asked, models=models)
+    if not quiet:
+        # Before the work: a reversed plan is seen here, not in the face.
+        for line in plan_lines(_plan_values(found)):
+            print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
+    if _has_errors(found.findings):
+        raise FindingsError(found.findings)
+    notices.add(found.findings)
+    return found.findings
+
+
+def _plan_values(found: Examination) -> dict[str, Any]:
+    return {name: motion.as_dict() for name, motion in found.plan.items()}
+
+
+def _has_errors(findings: Sequence[Finding]) -> bool:
+    return any(finding.severity == "error" for finding in findings)
+
+
+def print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
+    """Wrapped and coloured on a terminal; one line per part in a pipe."""
+    width = columns() if stream.isatty() else 0
+    text = findings_text(findings, colour=in_colour(stream), width=width, escape=escaped)
+    print(text, file=stream)

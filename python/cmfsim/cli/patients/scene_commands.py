@@ -1,0 +1,133 @@
+"""`cmfsim solve` and `cmfsim info`: scenes."""
+
+import argparse
+import dataclasses
+import json
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmfsim.cli.exit_codes import DONE
+from cmfsim.cli.text.notices import Notices
+from cmfsim.cli.text.terminal import escaped
+from cmfsim.errors import CaseInputError
+from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
+from cmfsim.solving.simulation import solve_scene
+from cmfsim.values.finding import Finding
+from cmfsim.values.scene import Scene
+
+__all__ = ["info", "solve"]
+
+
+def solve(options: argparse.Namespace) -> int:
+    """Solves a scene and writes its result."""
+    _check_output(options.output, options.scene)
+    scene = _with_overrides(_read(options.scene), options)
+    started = time.perf_counter()
+    result = solve_scene(scene)
+    seconds = time.perf_counter() - started
+    write_result(options.output, result)
+    logging.getLogger("cmfsim").info("wrote %s", options.output)
+    summary = dict(result.summary)
+    Notices(quiet=options.quiet).add(Finding.from_values(entry) for entry in summary["findings"])
+    size = np.linalg.norm(result.displacements, axis=1)
+    if options.json:
+        extra = {"output": str(options.output), "seconds": seconds, "largest": float(size.max())}
+        print(json.dumps({**summary, **extra}, allow_nan=False))
+        return DONE
+    print(f"solved        {summary['n_tets']} tets, {summary['n_unknowns']} unknowns")
+    print(f"method        {summary['method']}, {summary['iterations']} iterations")
+    print(
+        f"residual      {summary['residual']:.2e} "
+        f"(error {summary['error_estimate']:.2e} mm, estimated)"
+    )
+    if len(result.contact_nodes):
+        print(
+            f"contact       {len(result.contact_nodes)} nodes, largest gap "
+            f"{_number(summary['contact_gap'])} mm, {summary['contact_iterations']} iterations"
+        )
+    print(f"displacement  {size.max():.3f} mm at most, {size.mean():.3f} mm on average")
+    print(f"time          {seconds:.3f} s")
+    return DONE
+
+
+def _check_output(output: Path, scene: Path) -> None:
+    """Detects invalid options and outputs before the scene is solved."""
+    if output.suffix not in result_suffixes():
+        known = ", ".join(result_suffixes())
+        raise CaseInputError(f"{output.name}: a result file ends in {known}, not {output.suffix!r}")
+    if not output.parent.is_dir():
+        raise FileNotFoundError(f"{output.parent}: no such folder")
+    if output.is_dir():
+        raise CaseInputError(f"{output}: is a folder")
+    if output.exists() and scene.exists() and output.samefile(scene):
+        raise CaseInputError(f"{output}: the result would replace the scene; name another file")
+
+
+def _with_overrides(scene: Scene, options: argparse.Namespace) -> Scene:
+    given = {
+        name: getattr(options, name)
+        for name in ("method", "contact", "tolerance")
+        if getattr(options, name) is not None
+    }
+    changes: dict[str, Any] = {}
+    if given:
+        changes["options"] = dataclasses.replace(scene.options, **given)
+    if options.plan is not None:
+        changes["plan"] = read_plan(options.plan, scene)
+    return dataclasses.replace(scene, **changes) if changes else scene
+
+
+def _read(path: Path) -> Scene:
+    logging.getLogger("cmfsim").info("reading %s", path)
+    return read_scene(path)
+
+
+def info(options: argparse.Namespace) -> int:
+    """Lists the contents of a scene."""
+    scene = _read(options.scene)
+    nodes = scene.nodes
+    if options.json:
+        counts = {
+            name: {"joined": int(np.size(s.joined)), "sliding": int(np.size(s.sliding))}
+            for name, s in scene.segments.items()
+        }
+        print(
+            json.dumps(
+                {
+                    "sha256": scene.sha256(),
+                    "n_nodes": scene.n_nodes,
+                    "n_tets": scene.n_tets,
+                    "n_fixed": int(np.size(scene.fixed)),
+                    "lowest": nodes.min(axis=0).tolist() if len(nodes) else None,
+                    "highest": nodes.max(axis=0).tolist() if len(nodes) else None,
+                    "tissue": scene.header()["tissue"],
+                    "segments": counts,
+                    "solver": scene.options.header(),
+                },
+                allow_nan=False,
+            )
+        )
+        return DONE
+    print(f"mesh      {scene.n_nodes} nodes, {scene.n_tets} tets")
+    if len(nodes):
+        low, high = nodes.min(axis=0), nodes.max(axis=0)
+        extent = " × ".join(f"{length:.1f}" for length in high - low)
+        print(f"extent    {extent} mm")
+    print(f"tissue    {', '.join(scene.header()['tissue'].values())}")
+    print(f"fixed     {np.size(scene.fixed)} nodes")
+    for name, segment in scene.segments.items():
+        print(
+            f"segment   {escaped(name)}: {np.size(segment.joined)} joined, "
+            f"{np.size(segment.sliding)} sliding"
+        )
+    print(f"solver    {scene.options.method}, {scene.options.contact} contact")
+    print(f"sha256    {scene.sha256()}")
+    return DONE
+
+
+def _number(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2e}"

@@ -1,0 +1,174 @@
+"""`cmfsim template`: muscle templates listed, checked, imported, morphed and shown."""
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmfsim.cli.exit_codes import BAD_INPUT, DONE
+from cmfsim.cli.text.terminal import StageProgress, columns, escaped, in_colour
+from cmfsim.doctor import findings_text
+from cmfsim.errors import CaseInputError
+from cmfsim.muscles.template import (
+    MorphedMusculature,
+    MuscleTemplate,
+    check_template,
+    import_bodyparts3d,
+    template_names,
+)
+from cmfsim.pictures import picture_muscles
+from cmfsim.values.finding import SEVERITIES, Finding
+from cmfsim.values.musculature import Musculature
+
+__all__ = ["check", "import_atlas", "list_templates", "morph", "show"]
+
+# Landmarks that the table of a morph shows: those that disagree most with the others.
+WORST_SHOWN = 5
+
+
+def list_templates(options: argparse.Namespace) -> int:
+    """Lists the templates that come with the package."""
+    entries = []
+    for name in template_names():
+        template = MuscleTemplate.load(name)
+        entries.append(
+            {
+                "name": name,
+                "muscles": [muscle.name for muscle in template.muscles],
+                "landmarks": list(template.landmarks),
+                "licence": template.licence,
+                "attribution": template.attribution,
+                "source": template.source,
+            }
+        )
+    if options.json:
+        print(json.dumps({"templates": entries}, allow_nan=False))
+        return DONE
+    for entry in entries:
+        counts = f"{len(entry['muscles'])} muscles, {len(entry['landmarks'])} landmarks"
+        print(f"{entry['name']}: {counts}; {entry['source']}; {entry['licence']}")
+    return DONE
+
+
+def check(options: argparse.Namespace) -> int:
+    """Reports problems of a template; the exit code is bad input if any is an error."""
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage(f"checking {options.template}")
+        findings = check_template(options.template)
+    if options.json:
+        counts = {f"{s}s": sum(f.severity == s for f in findings) for s in SEVERITIES}
+        entries = [dataclasses.asdict(finding) for finding in findings]
+        print(json.dumps({"template": options.template, **counts, "findings": entries}))
+    else:
+        _print_findings(findings)
+    return BAD_INPUT if any(f.severity == "error" for f in findings) else DONE
+
+
+def import_atlas(options: argparse.Namespace) -> int:
+    """Makes a template from the files of an atlas, and writes it with a list of repairs."""
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        template = import_bodyparts3d(
+            options.folder,
+            options.landmarks,
+            verify=not options.any_files,
+            progress=lambda name: progress.stage(f"reading {name}"),
+        )
+        progress.stage("writing")
+        report = {
+            "template": template.name,
+            "licence": template.licence,
+            "attribution": template.attribution,
+            "muscles": len(template.muscles),
+            "findings": [dataclasses.asdict(finding) for finding in template.findings],
+        }
+        template.save(options.output, report=_beside(options.output, report))
+    if options.json:
+        print(json.dumps({"folder": str(options.output), **report}, allow_nan=False))
+        return DONE
+    _print_findings(template.findings)
+    print(f"wrote {options.output}: {len(template.muscles)} muscles; {template.licence}, ", end="")
+    print(template.attribution)
+    return DONE
+
+
+def morph(options: argparse.Namespace) -> int:
+    """Maps a template to a patient, and writes muscles, skull and landmark errors."""
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage(f"morphing {options.template}")
+        template = MuscleTemplate.load(options.template)
+        muscles = template.morph(options.landmarks, smoothing=options.smoothing)
+        progress.stage("writing")
+        report = {
+            **muscles.summary(),
+            "findings": [dataclasses.asdict(finding) for finding in muscles.findings],
+        }
+        muscles.save(options.output, report=_beside(options.output, report))
+    if options.json:
+        print(json.dumps({"folder": str(options.output), **report}, allow_nan=False))
+        return DONE
+    if muscles.findings:
+        _print_findings(muscles.findings)
+    _print_landmarks(muscles)
+    print(f"wrote {options.output}: {len(muscles)} muscles")
+    return DONE
+
+
+def show(options: argparse.Namespace) -> int:
+    """Draws the muscles of a template on its skull."""
+    path = Path(options.output)
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage(f"drawing {options.template}")
+        template = MuscleTemplate.load(options.template)
+        muscles = template.musculature
+        if options.only:
+            muscles = _chosen(template, options.only)
+        picture_muscles(path, muscles, template.skull, fibres=options.fibres)
+    if options.json:
+        print(json.dumps({"picture": str(path), "muscles": [m.name for m in muscles]}))
+    else:
+        print(f"wrote {path}: {len(muscles)} muscles")
+    return DONE
+
+
+def _beside(output: Path, report: dict[str, Any]) -> dict[str, Any] | None:
+    """The report, if it has a place: next to the files of a folder, not in an archive."""
+    return None if output.suffix == ".npz" else report
+
+
+def _chosen(template: MuscleTemplate, names: Sequence[str]) -> Musculature:
+    """The muscles with these names; a name without a side selects both."""
+    known = {muscle.name for muscle in template.muscles}
+    bare = {name.removesuffix("_L").removesuffix("_R") for name in known}
+    for name in names:
+        if name not in known | bare:
+            raise CaseInputError(f"no muscle {name!r}; muscles are: {', '.join(sorted(bare))}")
+    return Musculature(
+        tuple(
+            muscle
+            for muscle in template.muscles
+            if {muscle.name, muscle.name.removesuffix("_L").removesuffix("_R")} & set(names)
+        )
+    )
+
+
+def _print_landmarks(muscles: MorphedMusculature) -> None:
+    """How well the landmarks agree: the worst ones, by the distance the others would put them."""
+    residual = max(muscles.residuals.values())
+    print(f"{len(muscles.landmarks)} landmarks, matched to {residual:.2g} mm")
+    left_out = muscles.leave_one_out
+    if left_out is None:
+        return
+    median = float(np.median(left_out.distances))
+    print(f"predicted from the others, each is off by {median:.1f} mm off (median); worst:")
+    for line in left_out.table().splitlines()[: 1 + WORST_SHOWN]:
+        print(f"  {escaped(line)}")
+
+
+def _print_findings(findings: Sequence[Finding]) -> None:
+    width = columns() if sys.stdout.isatty() else 0
+    print(findings_text(findings, colour=in_colour(sys.stdout), width=width, escape=escaped))

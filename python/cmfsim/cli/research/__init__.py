@@ -1,0 +1,1 @@
+"""Commands that study methods: benches, benchmark, cohorts, virtual patients."""

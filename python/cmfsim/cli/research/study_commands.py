@@ -1,0 +1,414 @@
+"""`cmfsim predict`, `evaluate`, `sensitivity`, `study` and `report`: faces after operations."""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from cmfsim.cli.band_options import band_options
+from cmfsim.cli.exit_codes import DONE, FAILED
+from cmfsim.cli.patients.case_commands import case_of, checked
+from cmfsim.cli.text.band_text import band_lines
+from cmfsim.cli.text.causes_text import not_operated_line, thickness_lines
+from cmfsim.cli.text.notices import Notices
+from cmfsim.cli.text.terminal import StageProgress, escaped
+from cmfsim.errors import CmfsimError
+from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
+from cmfsim.pipeline.evaluating import evaluate as evaluate_case
+from cmfsim.pipeline.outputs import (
+    WrittenPrediction,
+    WrittenResults,
+    write_case_report,
+    write_results,
+)
+from cmfsim.pipeline.predicting import predict_models
+from cmfsim.pipeline.preparation import prepare
+from cmfsim.study.cohort import CaseOutcome, StudyOptions, StudyReport, run_study
+from cmfsim.study.outputs import write_study_report
+from cmfsim.study.trials import sensitivity as landmark_sensitivity
+from cmfsim.study.variants import run_variants, write_variants_report
+from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.prediction import MODELS, Prediction
+
+__all__ = ["achieved_text", "evaluate", "models_of", "predict", "report", "sensitivity", "study"]
+
+
+def models_of(given: Sequence[str] | None, default: Sequence[str]) -> tuple[str, ...]:
+    """The models given to a command, in the paper's order."""
+    named = set(given or default)
+    return MODELS if "all" in named else tuple(m for m in MODELS if m in named)
+
+
+def predict(options: argparse.Namespace) -> int:
+    """Predicts the face of a case by one model or by several."""
+    case = case_of(options)
+    models = models_of(options.model, ("M+S",))
+    band = band_options(options, case)
+    if band is not None:
+        band.check(models)
+    prepare(case, report=not options.no_report)
+    notices = Notices(quiet=options.quiet)
+    begun = time.perf_counter()
+    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
+    before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
+    failed: dict[str, CmfsimError] = {}
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        predicted = partial(
+            predict_models,
+            case,
+            models,
+            progress=progress.stage,
+            check=False,
+            findings=findings,
+            failed=failed,
+            on_findings=notices.add,
+            band=band,
+        )
+        written = write_results(
+            case.output,
+            lambda on_muscles: _timed(
+                _at_least_one(predicted(on_muscles=on_muscles), failed), before
+            ),
+            models,
+            stage=progress.stage,
+            with_report=not options.no_report,
+            slicer=options.slicer,
+        )
+    if options.json:
+        entries = [_figures(entry, case.output) for entry in written.predictions]
+        reasons = {model: str(error) for model, error in failed.items()}
+        answer = {"case": case.name, "predictions": entries, "failed": reasons}
+        more = {"findings": notices.as_dicts(), "left_out": written.left_out}
+        print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
+        return FAILED if failed else DONE
+    summary = written.predictions[0].summary
+    if summary.get("achieved") is not None:
+        print(achieved_text(summary["achieved"]))
+    print(_plan_text(summary))
+    for entry in written.predictions:
+        print(_prediction_text(_figures(entry, case.output)))
+    _print_report(case.output, written.report)
+    _end(notices, case.output, written)
+    _print_failed({model: str(error) for model, error in failed.items()})
+    return FAILED if failed else DONE
+
+
+def _at_least_one(
+    predictions: Iterable[Prediction], failed: Mapping[str, CmfsimError]
+) -> Iterator[Prediction]:
+    """The predictions, or the first error if there are none."""
+    found = False
+    for prediction in predictions:
+        found = True
+        yield prediction
+    if not found:
+        raise next(iter(failed.values()))
+
+
+def _timed(predictions: Iterable[Prediction], before: Mapping[str, float]) -> Iterator[Prediction]:
+    """The predictions with the seconds of what came before them among their timings."""
+    for prediction in predictions:
+        timings = {**before, **prediction.summary["timings"]}
+        yield replace(prediction, summary={**prediction.summary, "timings": timings})
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    """Predicts a case and compares it with the face after the operation."""
+    case = case_of(options)
+    if options.no_doctor and case.postoperative is not None:
+        case = replace(case, postoperative=replace(case.postoperative, verified=True))
+    models = models_of(options.model, MODELS)
+    prepare(case, report=not options.no_report, evaluation=True)
+    notices = Notices(quiet=options.quiet)
+    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        found = evaluate_case(
+            case,
+            models,
+            progress=progress.stage,
+            check=False,
+            findings=findings,
+            on_findings=notices.add,
+            fit_thickness=options.fit_thickness,
+        )
+        written = write_results(
+            case.output,
+            found.predictions,
+            models,
+            stage=progress.stage,
+            evaluation=lambda: found,
+            with_report=not options.no_report,
+            slicer=options.slicer,
+        )
+    values = found.as_dict()
+    code = FAILED if found.failed else DONE
+    if options.json:
+        answer = {**values, "output": str(case.output), "files": written.files}
+        more = {"findings": notices.as_dicts(), "left_out": written.left_out}
+        print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
+        return code
+    achieved = found.predictions[0].patient.summary.get("achieved")
+    if achieved is not None:
+        print(achieved_text(achieved))
+    print(_plan_text(found.predictions[0].summary))
+    print(not_operated_line(values["not_operated"]))
+    print(f"{escaped(case.name)}: distance from the post-operative face, mm")
+    print("  model        mean     SD   95 %    max   < 2 mm")
+    for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
+        figures = entry["regions"]["whole"]
+        print(
+            f"  {name:<10} {figures['mean_mm']:6.2f} {figures['std_mm']:6.2f} "
+            f"{figures['p95_mm']:6.2f} {figures['max_mm']:6.2f} "
+            f"{100 * figures['within']['2 mm']:6.0f} %"
+        )
+    for line in thickness_lines(values.get("thickness")):
+        print(line)
+    _print_report(case.output, written.report)
+    _end(notices, case.output, written)
+    _print_failed(found.failed)
+    return code
+
+
+def _end(notices: Notices, output: Path, written: WrittenResults) -> None:
+    """Prints doubtful findings again, below the figures."""
+    place = written.predictions[0].place
+    where = written.report or f"{place}/prediction.json".lstrip("/")
+    notices.summarise(str(output / where))
+
+
+def sensitivity(options: argparse.Namespace) -> int:
+    """Reports the effect of errors of skull landmarks on muscles and face."""
+    case = case_of(options)
+    prepare(case)
+    notices = Notices(quiet=options.quiet)
+    findings = (
+        () if options.no_doctor else checked(case, notices, (options.model,), quiet=options.quiet)
+    )
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        found = landmark_sensitivity(
+            case,
+            trials=_trials(options),
+            std=options.std,
+            seed=options.seed,
+            model=options.model,
+            progress=progress.stage,
+            check=False,
+            findings=findings,
+            on_findings=notices.add,
+        )
+    values = {**found.as_dict(), "findings": notices.as_dicts()}
+    text = json.dumps(values, indent=1, allow_nan=False)
+    case.output.mkdir(parents=True, exist_ok=True)
+    with replacing(case.output / "sensitivity.json") as file:
+        file.write(f"{text}\n".encode())
+    if options.json:
+        print(json.dumps(values, allow_nan=False))
+        return DONE
+    print(
+        f"{escaped(case.name)}, model {options.model}: mean distances from the positions under "
+        "the case's own landmarks, mm"
+    )
+    print("  trial  landmarks  muscles  masseter    skin  skin 95 %")
+    for number, trial in enumerate(found.trials):
+        masseter = [d for name, d in trial.muscle_deviation.items() if "masseter" in name]
+        muscles = list(trial.muscle_deviation.values())
+        skin = trial.as_dict()["skin"]
+        print(
+            f"  {number + 1:5d}  {trial.landmark_deviation:9.2f}  {_mean(muscles):7.2f}  "
+            f"{_mean(masseter):8.2f}  {skin['mean']:6.3f}  {skin['p95']:9.3f}"
+        )
+    moved = found.skin_deviation(moved=True)
+    print(f"  skin that the operation moves: {moved:.3f} mm on average")
+    notices.summarise(str(case.output / "sensitivity.json"))
+    return DONE
+
+
+def _trials(options: argparse.Namespace) -> Any:
+    """The number of trials to draw, or the landmarks of each file."""
+    if not options.landmarks:
+        return options.trials
+    return [read_landmark_file(path).points for path in options.landmarks]
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else float("nan")
+
+
+def study(options: argparse.Namespace) -> int:
+    """Predicts and compares every case of a cohort; failed if a case failed."""
+    cohort = Cohort.load(options.cohort)
+    if options.variants is not None:
+        return _study_variants(cohort, options)
+
+    def say(outcome: CaseOutcome) -> None:
+        if not options.quiet:
+            print(f"{outcome.name}: {outcome.status}, {outcome.seconds:.0f} s", file=sys.stderr)
+
+    found = run_study(
+        cohort,
+        workers=options.workers,
+        scheduler=options.scheduler,
+        fresh=options.fresh,
+        progress=say,
+    )
+    names = write_study_report(found)
+    if options.json:
+        print(json.dumps({**found.as_dict(), "files": names}, allow_nan=False))
+    else:
+        print(_study_text(found))
+        print(f"written       {escaped(str(cohort.output))}: {', '.join(names)}")
+    return FAILED if found.failed else DONE
+
+
+def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
+    """Runs a cohort as given and under each variant; failed if a case of one failed."""
+    variants = Variants.load(options.variants, cohort.models)
+
+    def say(variant: str, outcome: CaseOutcome) -> None:
+        if not options.quiet:
+            done = f"{outcome.status}, {outcome.seconds:.0f} s"
+            print(f"{variant}, {outcome.name}: {done}", file=sys.stderr)
+
+    where = StudyOptions(options.workers, options.scheduler, options.fresh)
+    found = run_variants(cohort, variants, options=where, progress=say)
+    names = write_variants_report(found)
+    if options.json:
+        more = {"output": str(found.output), "files": names}
+        print(json.dumps({**found.as_dict(), **more}, allow_nan=False))
+    else:
+        print("\n".join(escaped(line) for line in found.text().split("\n")))
+        print(f"written       {escaped(str(found.output))}: {', '.join(names)}")
+    for variant, outcome in found.failed:
+        print(f"cmfsim: error: {escaped(f'{variant}, {outcome.name}')}:", file=sys.stderr)
+        for line in outcome.error.splitlines():
+            print(f"  {escaped(line)}", file=sys.stderr)
+    return FAILED if found.failed else DONE
+
+
+def report(options: argparse.Namespace) -> int:
+    """Regenerates the report of a folder of results."""
+    folder: Path = options.folder
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage("writing the report")
+        name = write_case_report(folder)
+    if name is None:
+        return FAILED
+    if options.json:
+        print(json.dumps({"output": str(folder), "report": name}))
+    else:
+        _print_report(folder, name)
+    return DONE
+
+
+def _figures(entry: WrittenPrediction, output: Path) -> dict[str, Any]:
+    solution = entry.summary["solution"]
+    return {
+        "model": entry.summary["model"],
+        "n_tets": solution["n_tets"],
+        "residual": solution["residual"],
+        "contact_iterations": solution["contact_iterations"],
+        "contact_gap": solution["contact_gap"],
+        "plan": {name: m["clinical"] for name, m in entry.summary["plan"].items()},
+        "plan_digits": entry.summary.get("plan_digits", ""),
+        "skin": dict(entry.summary["skin"]),
+        "band": entry.summary.get("band"),
+        "timings": dict(entry.summary["timings"]),
+        "output": str(output / entry.place),
+        "files": entry.files,
+    }
+
+
+def _plan_text(summary: Mapping[str, Any]) -> str:
+    """The plan as it was applied, a line for each segment; last what the planning page calls it."""
+    plan = {name: entry["clinical"] for name, entry in summary["plan"].items()}
+    lines = plan_lines(plan)
+    if "plan_digits" in summary:
+        lines.append(f"{summary['plan_digits']} (digits of its motions, as in a saved plan's name)")
+    return "\n".join(f"plan: {escaped(line)}" for line in lines)
+
+
+def _prediction_text(entry: dict[str, Any]) -> str:
+    skin = entry["skin"]
+    residual = "unknown" if entry["residual"] is None else f"{entry['residual']:.1e}"
+    lines = [
+        f"model {entry['model']}",
+        f"  solved      {entry['n_tets']} tets, residual {residual}",
+    ]
+    if entry["contact_iterations"]:
+        gap = "unknown" if entry["contact_gap"] is None else f"{entry['contact_gap']:.1e} mm"
+        lines.append(f"  contact     {entry['contact_iterations']} iterations, largest gap {gap}")
+    lines += [
+        *band_lines(entry["band"]),
+        f"  skin moves  {skin['mean']:.2f} mm on average, {skin['largest']:.2f} mm at most",
+        f"  time        {sum(entry['timings'].values()):.1f} s from the files to the face",
+        f"  written     {escaped(entry['output'])}: {', '.join(entry['files'])}",
+    ]
+    return "\n".join(lines)
+
+
+def _study_text(found: StudyReport) -> str:
+    models = found.cohort.models
+    lines = [f"{escaped(found.cohort.name)}: mean error over the face, mm"]
+    if found.cohort.note:
+        lines.append(escaped(found.cohort.note))
+    lines.append("  case         " + "".join(f"{m:>8}" for m in (*models, "still")) + "  outcome")
+    for outcome in found.outcomes:
+        cells = ""
+        for model in (*models, None):
+            entry = (
+                outcome.evaluation.get("no_change")
+                if model is None
+                else outcome.evaluation.get("models", {}).get(model)
+            )
+            mean = "–" if entry is None else f"{entry['regions']['whole']['mean_mm']:.2f}"
+            cells += f"{mean:>8}"
+        lines.append(f"  {escaped(outcome.name):<12} {cells}  {outcome.status}")
+    for outcome in found.outcomes:
+        warnings = outcome.evaluation.get("warnings", ())
+        lines += [f"  {escaped(outcome.name)}: {escaped(warning)}" for warning in warnings]
+    return "\n".join(lines)
+
+
+def _print_failed(failed: Mapping[str, str]) -> None:
+    """Prints which of several models have no result; the others were written."""
+    for model, reason in failed.items():
+        print(f"cmfsim: error: model {model}: {escaped(reason)}", file=sys.stderr)
+
+
+def achieved_text(achieved: Mapping[str, Any]) -> str:
+    """The motion of each segment in the operation, as in Table 2 of Kim et al. (2010)."""
+    lines = ["achieved plan: motion of each segment's middle, mm (L, P, S), and rotation about it"]
+    for name, found in achieved["segments"].items():
+        shift = " ".join(f"{c:+6.2f}" for c in found["translation_mm"])
+        axis = ", ".join(f"{c:+.2f}" for c in found["axis"])
+        how = (
+            f"vertex by vertex, {found['rms_mm']:.2f} mm rms from a rigid motion"
+            if found["method"] == "vertices"
+            else f"registered to the bone within {found['rms_mm']:.2f} mm rms "
+            f"({found['share']:.0%} of it)"
+        )
+        lines.append(
+            f"  {escaped(name):<14} {shift}  {found['angle_degrees']:5.2f}° about ({axis}), {how}"
+            f"{_size_text(found.get('shape'))}"
+        )
+    return "\n".join(lines)
+
+
+def _size_text(shape: Mapping[str, Any] | None) -> str:
+    """The size after with its interval, and how many directions the shape leaves open."""
+    if shape is None:
+        return ""
+    low, high = shape["scale_interval"]
+    n_open = len(shape["open"])
+    left = f"; {n_open} of 6 directions open" if n_open else ""
+    return f", size {shape['scale']:.3f} ({low:.3f} to {high:.3f}){left}"
+
+
+def _print_report(folder: Path, name: str | None) -> None:
+    if name is not None:
+        print(f"report: {escaped(str(folder / name))}")

@@ -1,0 +1,1 @@
+"""What the terminal shows: findings, reports, causes of errors."""

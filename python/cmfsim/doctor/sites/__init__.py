@@ -1,0 +1,1 @@
+"""Checks of landmarks, and of where skin and bones lie."""

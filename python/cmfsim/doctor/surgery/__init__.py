@@ -1,0 +1,1 @@
+"""Checks of cuts, plans and moved bones."""

@@ -1,0 +1,326 @@
+"""Whether cuts and plan can be meant: names, landmarks, sizes of motions, bone through skin."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.bones import CuttingPlane, free_cut, place_procedure
+from cmfsim.bones.cuts.planes import Cut
+from cmfsim.doctor.evidence import Evidence
+from cmfsim.doctor.sites.places import place_text
+from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of
+from cmfsim.doctor.surgery.plan_size import (
+    SizedMotion,
+    check_motion_size,
+    check_typed,
+    nothing_moves,
+)
+from cmfsim.errors import CaseError, CmfsimError, LandmarkError
+from cmfsim.io.slicer.transforms import motion_in_lps
+from cmfsim.io.surfaces import surface_as_stored
+from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
+from cmfsim.values.checks import Floats
+from cmfsim.values.clinical_motion import ClinicalMotion
+from cmfsim.values.finding import Finding
+from cmfsim.values.motion import carried
+from cmfsim.values.surface_data import MovedSurface
+
+__all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of", "vertices_of"]
+
+# Depth by which a moved bone may pass the undeformed skin before it is reported, mm: skin goes with
+# the bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
+THROUGH_SKIN = 2.0
+# How far outside a bone its neighbourhood is asked for tissue, mm.
+BESIDE_BONE = 0.5
+
+
+def check_cuts(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about the names of bones and segments, and the landmarks that cuts need."""
+    case = evidence.case
+    bones = set(case.surfaces.bones) if case.surfaces else {"cranium", "mandible", "skull"}
+    available = set(bones)
+    for number, cut in enumerate(case.osteotomies):
+        where = case.where(f"osteotomies.{number}")
+        if cut.bone is not None and cut.bone not in available:
+            yield Finding(
+                "unknown-name",
+                f"the cut is meant for bone {cut.bone!r}",
+                where=where,
+                why="no such bone or segment exists at this point of the list",
+                facts={"names": ", ".join(sorted(available))},
+            )
+        available |= set(cut.segments)
+        yield from _check_procedure(evidence, cut, where)
+    cut_up = {CUT_UP[p]: cut for cut in case.osteotomies if (p := cut.procedure or "") in CUT_UP}
+    if {"le_fort_1", "le_fort_3"} <= {cut.procedure for cut in case.osteotomies}:
+        yield Finding("cuts-both-le-fort", where=case.where("osteotomies"))
+    for name in case.plan:
+        if name in cut_up:
+            cut = cut_up[name]
+            yield Finding(
+                "unknown-name",
+                f"the plan moves {name!r}, which {cut.procedure} cuts into "
+                f"{', '.join(cut.segments)}",
+                where=case.where(f"plan.{name}"),
+                why="after the cut no segment has this name, and which piece is meant is unclear",
+                fix=f"write [plan.{cut.segments[0]}] for the piece with the teeth",
+            )
+        elif name not in available:
+            yield Finding(
+                "unknown-name",
+                f"the plan moves {name!r}",
+                where=case.where(f"plan.{name}"),
+                why="no bone and no osteotomy of the case has this name",
+                fix=f"use one of: {', '.join(sorted(available))}, or add the osteotomy that "
+                "creates it",
+            )
+
+
+def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iterator[Finding]:
+    """Whether a standard procedure can be placed from the landmarks that are there."""
+    if cut.procedure is None:
+        return
+    landmarks = evidence.case.landmarks
+    if landmarks.proposed or landmarks.is_completed(len(evidence.skull_landmarks)):
+        # Placed from landmarks that are found when the case is built.
+        return
+    try:
+        yield from place_procedure(cut.procedure, evidence.skull_landmarks, cut.options).findings
+    except LandmarkError as error:
+        yield Finding(
+            "landmark-missing",
+            str(error),
+            severity="error",
+            where=where,
+            why="standard procedures are placed from skull landmarks",
+            fix="add it to the file under [landmarks] skull, or cut by planes",
+        )
+    except CaseError as error:
+        yield Finding("cut-options", str(error), where=where)
+
+
+def _cuts(evidence: Evidence) -> Iterator[Cut]:
+    """The cuts of the case that can be placed, in their order."""
+    for cut in evidence.case.osteotomies:
+        if cut.procedure is not None:
+            # Landmarks or options that do not place it are reported by `check_cuts`.
+            with suppress(CaseError, LandmarkError):
+                placed = place_procedure(cut.procedure, evidence.skull_landmarks, cut.options)
+                yield from placed.cuts
+        elif cut.plane is not None and cut.bone is not None and cut.name is not None:
+            plane = CuttingPlane(cut.plane.point, cut.plane.normal)
+            yield from free_cut(cut.bone, cut.name, (plane,)).cuts
+
+
+def _owners(evidence: Evidence, bone: str, points: Floats) -> NDArray[np.object_]:
+    """The name of the segment that each of (k, 3) points in or on a bone belongs to."""
+    names = np.full(len(points), bone, dtype=object)
+    there = set(evidence.bones)
+    for cut in _cuts(evidence):
+        source = next((name for name in cut.sources if name in there), None)
+        if source is None:
+            continue
+        there |= {cut.segment} if cut.rest is None else {cut.segment, cut.rest}
+        own = np.flatnonzero(names == source)
+        inside = np.maximum.reduce(
+            [np.minimum.reduce([p.distance(points[own]) for p in group]) for group in cut.groups]
+        )
+        names[own[inside > 0.0]] = cut.segment
+        if cut.rest is not None:
+            names[own[inside <= 0.0]] = cut.rest
+            there.discard(source)
+    return names
+
+
+def _segments_of(evidence: Evidence, bone: str) -> list[str]:
+    """The names of the segments that a bone is cut into, itself among them if it is left."""
+    return list(dict.fromkeys(_owners(evidence, bone, evidence.bones[bone].samples)))
+
+
+def _piece(evidence: Evidence, name: str) -> Floats | None:
+    """Points on the surface of a bone or segment, (k, 3) mm, with the unit normals, (k, 6) in all.
+
+    None if nothing is known of it.
+    """
+    found = []
+    for bone, body in evidence.bones.items():
+        own = body.samples[_owners(evidence, bone, body.samples) == name]
+        if len(own):
+            found.append(np.concatenate([own, body.index.closest(own)[1]], axis=1))
+    return np.concatenate(found) if found else None
+
+
+def vertices_of(evidence: Evidence) -> dict[str, Floats | None]:
+    """The vertices, (k, 3) mm, of each segment whose motion is a matrix, as far as it has any."""
+    found: dict[str, Floats | None] = dict.fromkeys(evidence.motions)
+    for bone, body in evidence.bones.items():
+        points = body.repaired.vertices
+        owners = _owners(evidence, bone, points)
+        for name, known in found.items():
+            own = points[owners == name]
+            if len(own):
+                found[name] = own if known is None else np.concatenate([known, own])
+    return found
+
+
+def _parts(evidence: Evidence) -> list[BonePart]:
+    """The bones of both jaws, cut as the case cuts them, with the motions that are known."""
+    parts = []
+    for bone, body in evidence.bones.items():
+        jaw = jaw_of(bone)
+        if jaw is None:
+            continue
+        for name in _segments_of(evidence, bone):
+            moved = evidence.moved.get(name)
+            motion = evidence.motions.get(name, np.eye(4))
+            where = evidence.case.where(f"plan.{name}")
+            if isinstance(moved, MovedSurface):
+                parts.append(BonePart(name, jaw, where, body.repaired, moved))
+                continue
+
+            def owns(points: Floats, bone: str = bone, name: str = name) -> NDArray[np.bool_]:
+                return np.asarray(_owners(evidence, bone, points) == name, dtype=np.bool_)
+
+            parts.append(BonePart(name, jaw, where, body.repaired, motion, owns))
+    return parts
+
+
+def pieces_of(evidence: Evidence) -> dict[str, Floats | None]:
+    """What `_piece` gives for each segment whose motion is a matrix, by name."""
+    return {name: _piece(evidence, name) for name in evidence.motions}
+
+
+def check_plan(
+    evidence: Evidence, plan: Mapping[str, ClinicalMotion], pieces: Mapping[str, Floats | None]
+) -> Iterator[Finding]:
+    """Findings about what the plan does to each bone.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    plan : mapping of str to ClinicalMotion
+        As `state_plan` gives it.
+    pieces : mapping of str to (k, 6) float64 or None
+        As `pieces_of` gives it.
+    """
+    case = evidence.case
+    # A motion that cannot be read is reported where files are.
+    known = not case.achieved and set(case.plan) == set(evidence.motions)
+    if known and all(np.array_equal(motion, np.eye(4)) for motion in evidence.motions.values()):
+        yield nothing_moves(case.where("plan"))
+    apart = False
+    for name, matrix in evidence.motions.items():
+        piece, given = pieces[name], case.plan[name]
+        yield from _check_frame(evidence, name, matrix)
+        wrong = list(
+            check_motion_size(
+                SizedMotion(
+                    name,
+                    matrix,
+                    case.where(f"plan.{name}"),
+                    None if piece is None else piece[:, :3],
+                    plan[name].point,
+                    typed=given.typed,
+                    has_centre=given.centre is not None,
+                )
+            )
+        )
+        yield from wrong
+        if given.typed:
+            yield from check_typed(plan[name], case.where(f"plan.{name}"))
+        # A bone that flies off passes the skin as well: one reason is enough.
+        flies = any(f.severity == "error" for f in wrong)
+        apart = apart or flies
+        if piece is not None and not flies:
+            yield from check_against_skin(
+                evidence, name, piece[:, :3], carried(matrix, piece[:, :3])
+            )
+    if not apart:
+        yield from check_jaws(_parts(evidence), evidence.skull_landmarks)
+
+
+def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Finding]:
+    """Findings on numbers without a frame, read as LPS, if the surfaces are not in LPS."""
+    case, read = evidence.case, evidence.transforms.get(name)
+    stated = case.plan[name].frame is not None
+    if read is not None:
+        stated = "frame" not in read.assumed
+    if stated or case.surfaces is None:
+        return
+    frame = case.surfaces.frame or _header_frame(case.surfaces.skin)
+    if frame == "LPS" or np.allclose(motion_in_lps(matrix, frame), matrix, rtol=0.0, atol=1e-9):
+        return
+    yield Finding(
+        "plan-frame",
+        f"the motion of {name} has no frame and is read as LPS, but the surfaces are in {frame}",
+        where=case.where(f"plan.{name}"),
+        facts={"frame": frame},
+    )
+
+
+def _header_frame(path: Path) -> str:
+    """The frame that the header of a surface states; LPS where it states none."""
+    try:
+        return surface_as_stored(path).frame or "LPS"
+    except (CmfsimError, OSError):
+        # Reported where files are looked for.
+        return "LPS"
+
+
+def check_against_skin(
+    evidence: Evidence, name: str, points: Floats, moved: Floats
+) -> Iterator[Finding]:
+    """Findings about a segment whose points move through the skin, or touch no tissue."""
+    yield from _check_through_skin(evidence, name, points, moved)
+    piece = _piece(evidence, name)
+    if piece is not None:
+        yield from _check_tissue(evidence, name, piece)
+
+
+def _check_through_skin(
+    evidence: Evidence, name: str, points: Floats, moved: Floats
+) -> Iterator[Finding]:
+    skin = evidence.skin
+    if skin is None:
+        return
+    inside_before = skin.index.winding_number(points) >= 0.5
+    outside_after = skin.index.winding_number(moved) < 0.5
+    through = np.flatnonzero(inside_before & outside_after)
+    if not len(through):
+        return
+    closest = skin.index.closest(moved[through])[0]
+    depth = np.linalg.norm(closest - moved[through], axis=1)
+    if depth.max() <= THROUGH_SKIN:
+        return
+    worst = int(np.argmax(depth))
+    yield Finding(
+        "plan-through-skin",
+        f"{name} is moved through the undeformed skin, by {depth[worst]:.1f} mm at "
+        f"{place_text(moved[through[worst]])}",
+        where=evidence.case.where(f"plan.{name}"),
+    )
+
+
+def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Finding]:
+    """Findings on a moving bone without adjacent soft tissue in the meshed region."""
+    skin = evidence.skin
+    if skin is None:
+        return
+    beside = piece[:, :3] + BESIDE_BONE * piece[:, 3:]
+    tissue = (skin.index.winding_number(beside) > 0.5) & evidence.in_region(beside)
+    for other in evidence.bones.values():
+        if tissue.any():
+            beside_tissue = np.flatnonzero(tissue)
+            inside = other.index.winding_number(beside[beside_tissue]) > 0.5
+            tissue[beside_tissue[inside]] = False
+    if tissue.any():
+        return
+    yield Finding(
+        "segment-no-tissue",
+        f"{name} touches no soft tissue in the meshed region",
+        severity="error",
+        where=evidence.case.where(f"plan.{name}"),
+    )

@@ -1,0 +1,116 @@
+"""A first case file from what lies in a folder: `cmfsim init`.
+
+`finds` reads and measures files, `scene_finds` what a scene of 3D Slicer holds, `gathering` both;
+`roles` knows what names say; `surfaces`, `choices` and `motions` decide what each thing is for, and
+turn what they cannot decide into questions; `draft` writes the case file.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from cmfsim.drafting.case_lines import Taken
+from cmfsim.drafting.draft import CaseDraft, draft_case
+from cmfsim.drafting.finds import CASE_FILE, EXTRACTED
+from cmfsim.drafting.gathering import gather
+from cmfsim.drafting.written import check_written
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io import replacing
+
+__all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case"]
+
+SCENES = (".mrml", ".mrb")
+
+
+def init_case(
+    path: str | os.PathLike[str],
+    *,
+    force: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> CaseDraft:
+    """Writes a `case.toml` for the files in a folder, and states what each file was taken for.
+
+    Parameters
+    ----------
+    path : path
+        A folder, or a scene of 3D Slicer (`.mrml`, `.mrb`): its folder becomes the case's.
+    force : bool
+        Whether an existing case file is replaced.
+    progress : callable
+        Called with the name of each stage.
+
+    Returns
+    -------
+    CaseDraft
+
+    Raises
+    ------
+    FileNotFoundError
+        The path does not exist.
+    CaseError
+        (also `ValueError`) A case file exists already; the folder has no usable files; several
+        scenes; a scene that is damaged, or whose transforms are not rigid. Not `ValueError`: the
+        case that was written reads as something else than was found; it is removed again.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> draft = cmfsim.init_case("planning.mrb")  # doctest: +SKIP
+    >>> for taken in draft.taken:  # doctest: +SKIP
+    ...     print(taken.label, taken.taken_for, taken.why)
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such folder or scene")
+    is_scene = path.is_file()
+    if is_scene and path.suffix.lower() not in SCENES:
+        raise CaseInputError(
+            f"{path.name}: name a folder, or a scene of 3D Slicer ({', '.join(SCENES)})"
+        )
+    folder = path.parent if is_scene else path
+    case_file = folder / CASE_FILE
+    if case_file.exists() and not force:
+        raise CaseInputError(f"{case_file}: already exists; --force replaces it")
+    with tempfile.TemporaryDirectory(prefix="cmfsim-init-") as unpacked:
+        draft = _drafted(folder, path if is_scene else None, Path(unpacked), progress)
+    if draft.files:
+        (folder / EXTRACTED).mkdir(exist_ok=True)
+    for name, write in draft.files.items():
+        write(folder / name)
+    before = case_file.read_bytes() if case_file.exists() else None
+    _write(case_file, draft.text.encode())
+    progress("reading the case back")
+    try:
+        check_written(case_file, draft.shown, is_open=bool(draft.questions))
+    except CaseInputError:
+        # It is the case's owner who has to correct it.
+        raise
+    except CmfsimError:
+        if before is None:
+            case_file.unlink()
+        else:
+            _write(case_file, before)
+        raise
+    return draft
+
+
+def _write(path: Path, data: bytes) -> None:
+    with replacing(path) as file:
+        file.write(data)
+
+
+def _drafted(
+    folder: Path, scene: Path | None, unpacked: Path, progress: Callable[[str], None]
+) -> CaseDraft:
+    found = gather(folder, scene, unpacked, progress)
+    if not found.surfaces and not any(not image.error for image in found.images):
+        reasons = [f"{other.label}: {other.why}" for other in found.others]
+        reasons += [f"{image.label}: {image.error}" for image in found.images if image.error]
+        more = f" ({'; '.join(reasons[:5])})" if reasons else ""
+        raise CaseInputError(
+            f"{folder}: contains neither a CT nor surfaces that can be read{more}. Looked for: "
+            "DICOM, NRRD, NIfTI, MetaImage, STL, PLY, OBJ, VTP, VTK, .seg.nrrd, .mrml and .mrb"
+        )
+    progress("identifying the files")
+    return draft_case(found, unpacked, folder.resolve().name or "case")

@@ -1,0 +1,271 @@
+"""Everything in a folder, or in the scene of 3D Slicer that it holds, read once."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from cmfsim.drafting.finds import (
+    ImageFind,
+    LandmarkFind,
+    Listing,
+    OtherFind,
+    SurfaceFind,
+    TransformFind,
+    image_find,
+    landmark_find,
+    listing,
+    surface_find,
+)
+from cmfsim.drafting.roles import name_role
+from cmfsim.drafting.scene_finds import LooseMotion, scene_finds
+from cmfsim.drafting.segment_finds import segment_finds
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io.images.segmentations import NAMES_FILE
+from cmfsim.io.slicer.bundles import unpack_bundle
+from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
+
+__all__ = ["Gathered", "gather"]
+
+# Images that are read to see which is the CT.
+MAX_IMAGES = 6
+# Masks that are read by their names.
+MAX_MASKS = 40
+NOT_NAMED = "the scene does not name this file"
+# Bytes of a header in which Slicer states itself, or the frame.
+HEADER = 1024
+BY_SLICER = (b"3D Slicer output", b"SPACE=LPS", b"SPACE=RAS", b"Segmentation_")
+
+Found = TypeVar("Found")
+
+
+@dataclass
+class Gathered:
+    """What was found, by kind.
+
+    Attributes
+    ----------
+    scene : str
+        The label of the scene that was read; empty if there is none.
+    by_slicer : bool
+        Whether 3D Slicer saved any of the files.
+    seen : list of Path
+        Every file of the folder.
+    names : list of Path
+        Those with the names of labels.
+    scene_files : set of Path
+        Those that the scene names.
+    links : dict of str to tuple of str
+        The transforms of the scene, with what lies directly under each.
+    """
+
+    folder: Path
+    scene: str = ""
+    by_slicer: bool = False
+    surfaces: list[SurfaceFind] = field(default_factory=list)
+    images: list[ImageFind] = field(default_factory=list)
+    landmarks: list[LandmarkFind] = field(default_factory=list)
+    transforms: list[TransformFind] = field(default_factory=list)
+    loose: list[LooseMotion] = field(default_factory=list)
+    others: list[OtherFind] = field(default_factory=list)
+    seen: list[Path] = field(default_factory=list)
+    names: list[Path] = field(default_factory=list)
+    scene_files: set[Path] = field(default_factory=set)
+    links: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def shown(self, path: Path) -> str:
+        """A path as the case file will have it."""
+        return path.relative_to(self.folder).as_posix()
+
+
+def gather(
+    folder: Path, scene: Path | None, unpacked: Path, progress: Callable[[str], None]
+) -> Gathered:
+    """What a folder holds.
+
+    Parameters
+    ----------
+    folder : Path
+    scene : Path or None
+        The scene that is meant; else the only one of the folder.
+    unpacked : Path
+        An empty folder for the files of a bundle.
+    progress : callable
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Several scenes; a scene that is damaged or hostile; a transform of a
+        scene that is not rigid.
+    """
+    found = Gathered(folder)
+    paths = listing(folder)
+    found.others += paths.others(folder)
+    found.seen = paths.seen
+    named_by_scene = found.scene_files = _gather_scene(found, paths, scene, unpacked, progress)
+
+    def rest(of: list[Path]) -> list[Path]:
+        return [path for path in of if path.resolve() not in named_by_scene]
+
+    if found.scene:
+        for path in (*rest(paths.surfaces), *rest(paths.labels)):
+            role = name_role(path.name)
+            if role.is_after and path in paths.surfaces:
+                progress(f"reading {found.shown(path)}")
+                _read(found, path, surface_find, found.surfaces)
+            else:
+                why = f"the scene {found.scene} does not have it"
+                found.others.append(OtherFind(found.shown(path), why))
+        found.others += [
+            OtherFind(found.shown(path), f"the scene {found.scene} does not have it")
+            for path in rest(paths.transforms)
+        ]
+    else:
+        _gather_files(found, paths, progress)
+    _gather_landmarks(found, rest(paths.markups))
+    # A folder of DICOM is named last where it is the case's own: it holds all else as well.
+    files = [(path, None) for path in rest(paths.images)]
+    places = sorted(paths.dicom, key=lambda place: place[0] == folder)
+    _gather_images(found, [*files, *places], progress)
+    found.by_slicer = bool(found.scene) or any(
+        _by_slicer(path) for path in (*paths.surfaces, *paths.labels)
+    )
+    return found
+
+
+def _gather_landmarks(found: Gathered, paths: list[Path]) -> None:
+    """Adds the landmarks of files; those of a scene come before them."""
+    has_marks = bool(found.landmarks)
+    for path in paths:
+        if has_marks and not name_role(path.name).is_after:
+            why = f"the scene {found.scene} has landmarks of its own"
+            found.others.append(OtherFind(found.shown(path), why))
+        else:
+            _read(found, path, landmark_find, found.landmarks)
+
+
+def _gather_images(
+    found: Gathered, places: list[tuple[Path, str | None]], progress: Callable[[str], None]
+) -> None:
+    """Adds the images of files and folders; the CT of a scene comes before them."""
+    has_ct = any(not image.role.is_after and not image.error for image in found.images)
+    labels: list[tuple[Path, str]] = []
+    # Masks of a hundred organs come one per file: those of a head have its names.
+    named = [path for path, _ in places if name_role(path.name).part not in {"", "other"}]
+    others = [path for path, _ in places if path not in named]
+    read = {*named[:MAX_MASKS], *others[:MAX_IMAGES]}
+    for path, series in places:
+        label = found.shown(path) + ("" if series is None else f" (series {series})")
+        if has_ct and not name_role(path.name).is_after:
+            found.others.append(OtherFind(label, f"the scene {found.scene} has another CT"))
+        elif path not in read:
+            why = f"more than {MAX_IMAGES} images, and its name is none of a head's part: not read"
+            found.others.append(OtherFind(label, why))
+        else:
+            progress(f"reading {label}")
+            image = image_find(path, label, series)
+            if image.is_labels and found.scene and not image.role.is_after:
+                found.others.append(OtherFind(label, f"the scene {found.scene} does not have it"))
+            elif image.is_labels:
+                labels.append((path, label))
+            else:
+                found.images.append(image)
+    segments = segment_finds(labels)
+    found.surfaces += segments.surfaces
+    found.others += segments.others
+    folders = {path.parent for path, _ in labels}
+    found.names = [
+        path for path in found.seen if path.name == NAMES_FILE and path.parent in folders
+    ]
+
+
+def _gather_scene(
+    found: Gathered,
+    paths: Listing,
+    scene: Path | None,
+    unpacked: Path,
+    progress: Callable[[str], None],
+) -> set[Path]:
+    """The files that the scene of the folder names, after what it has was added."""
+    if scene is None and len(paths.scenes) > 1:
+        names = ", ".join(found.shown(path) for path in paths.scenes)
+        raise CaseInputError(
+            f"{found.folder}: holds {len(paths.scenes)} scenes of 3D Slicer ({names}): give the "
+            f"right one, such as cmfsim init {paths.scenes[0]}"
+        )
+    if scene is None:
+        scene = next(iter(paths.scenes), None)
+    if scene is None:
+        return set()
+    found.others += [
+        OtherFind(found.shown(path), "another scene was given")
+        for path in paths.scenes
+        if not path.samefile(scene)
+    ]
+    found.scene = found.shown(scene)
+    progress(f"reading {found.scene}")
+    bundled = scene.suffix.lower() == ".mrb"
+    file = unpack_bundle(scene, unpacked) if bundled else scene
+    read = scene_finds(read_slicer_scene(file), found.scene)
+    found.surfaces += read.surfaces
+    found.images += read.images
+    found.landmarks += read.landmarks
+    found.loose += read.loose
+    found.others += read.others
+    found.links = read.links
+    if bundled:
+        found.others += [
+            OtherFind(f"{found.scene}: {path.relative_to(unpacked).as_posix()}", NOT_NAMED)
+            for path in sorted(unpacked.rglob("*"))
+            if path.is_file() and path != file and path.resolve() not in read.files
+        ]
+    return read.files
+
+
+def _gather_files(found: Gathered, paths: Listing, progress: Callable[[str], None]) -> None:
+    for path in paths.surfaces:
+        progress(f"reading {found.shown(path)}")
+        _read(found, path, surface_find, found.surfaces)
+    for path in paths.labels:
+        label = found.shown(path)
+        progress(f"reading {label}")
+        segments = segment_finds([(path, label)])
+        found.surfaces += segments.surfaces
+        found.others += segments.others
+    for path in paths.transforms:
+        label = found.shown(path)
+        role = name_role(path.name[: -len(path.suffix)])
+        if path.suffix.lower() == ".txt" and not _is_matrix(path):
+            found.others.append(OtherFind(label, "is no transform: not 16 numbers"))
+            continue
+        found.transforms.append(TransformFind(label, role, path))
+
+
+def _read(
+    found: Gathered, path: Path, read: Callable[[Path, str], Found], into: list[Found]
+) -> None:
+    label = found.shown(path)
+    try:
+        into.append(read(path, label))
+    except (CmfsimError, OSError) as error:
+        found.others.append(OtherFind(label, f"cannot be read: {error}"))
+
+
+def _is_matrix(path: Path) -> bool:
+    """Whether a text holds a transform, and is not somebody's notes."""
+    with path.open("rb") as file:
+        begin = file.read(HEADER)
+    if begin.startswith(b"#Insight Transform File"):
+        return True
+    lines = [line.partition(b"#")[0] for line in begin.splitlines()]
+    words = b" ".join(lines).replace(b",", b" ").split()
+    try:
+        return len([float(word) for word in words]) == 16
+    except ValueError:
+        return False
+
+
+def _by_slicer(path: Path) -> bool:
+    with path.open("rb") as file:
+        begin = file.read(HEADER)
+    return any(mark in begin for mark in BY_SLICER)

@@ -1,0 +1,332 @@
+"""The motions of the segments: the plan of a case, from a scene's transforms or from files."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim.drafting.case_lines import Taken, quoted
+from cmfsim.drafting.finds import OtherFind, SurfaceFind, TransformFind
+from cmfsim.drafting.roles import MOVING, safe_key
+from cmfsim.drafting.scene_finds import LooseMotion
+from cmfsim.drafting.surfaces import Anatomy
+from cmfsim.errors import CmfsimError
+from cmfsim.io.slicer.transforms import is_itk_file, motion_in_lps, read_transform_file
+from cmfsim.values.checks import Floats
+from cmfsim.values.clinical_motion import clinical_motion
+
+__all__ = ["DraftMotion", "Plan", "file_motions", "scene_motions"]
+
+# A motion below this, mm and as entries of a rotation, is none.
+NOTHING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class DraftMotion:
+    """The motion of a segment as the case will have it.
+
+    Attributes
+    ----------
+    words : str
+        What it does, such as "moves the maxilla 4.0 mm forwards at the upper incisors".
+    source : tuple of str
+        Where it comes from and how it was understood.
+    matrix : (4, 4) float64, mm, LPS, or None
+    transform : str
+        A TOML value instead of a matrix.
+    question : str
+        Why a person has to decide; empty if not.
+    choices : tuple of str
+    shown : (4, 4) float64, mm, LPS, or None
+        The motion that `words` describes.
+    """
+
+    words: str
+    source: tuple[str, ...]
+    matrix: Floats | None = None
+    transform: str = ""
+    question: str = ""
+    choices: tuple[str, ...] = ()
+    shown: Floats | None = None
+
+
+@dataclass
+class Plan:
+    """The motions of a case by segment, and what was noticed.
+
+    Attributes
+    ----------
+    anatomy : Anatomy
+        The surfaces that move.
+    landmarks : mapping of str to (3,) float64, mm, LPS
+        Of the skull, before the operation.
+    motions : dict of str to DraftMotion
+    taken : list of Taken
+    others : list of OtherFind
+    links : set of str
+        The names of the transforms of the scene that are motions of segments.
+    """
+
+    anatomy: Anatomy
+    landmarks: Mapping[str, Floats]
+    motions: dict[str, DraftMotion] = field(default_factory=dict)
+    taken: list[Taken] = field(default_factory=list)
+    others: list[OtherFind] = field(default_factory=list)
+    links: set[str] = field(default_factory=set)
+
+    def words(self, segment: str, matrix: Floats) -> str:
+        """A motion in words."""
+        find = self.anatomy.bones.get(segment)
+        vertices = None if find is None else self.anatomy.placed(find)
+        stated = clinical_motion(segment, matrix, landmarks=self.landmarks, vertices=vertices)
+        return f"moves the {segment.replace('_', ' ')} {stated.text}"
+
+
+def scene_motions(
+    plan: Plan,
+    moved: Mapping[str, SurfaceFind],
+    loose: Sequence[LooseMotion],
+    reference: Floats,
+    *,
+    in_image: bool,
+) -> None:
+    """Adds the motions that a scene applies to segments, relative to the rest of the head.
+
+    Parameters
+    ----------
+    plan : Plan
+    moved : mapping of str to SurfaceFind
+        Segments by name.
+    loose : sequence of LooseMotion
+        Transforms that are applied to nothing.
+    reference : (4, 4) float64, mm, LPS
+        What the scene applies to what does not move.
+    in_image : bool
+        Whether the case is in the coordinates of its image, rather than in those of the world.
+    """
+    back = np.linalg.inv(reference)
+    asked = _asked(plan.anatomy)
+    # What the skin lies under as well moves no segment.
+    skin = plan.anatomy.skin
+    shared = set() if skin is None else {*skin.chain}
+    # A piece that has a segment's name moves by it, wherever its surface comes from.
+    known = {n: finds[0] for n, finds in asked.items() if n in MOVING and len(finds) == 1}
+    for name, find in {**moved, **known}.items():
+        matrix = back @ find.to_world if in_image else find.to_world @ back
+        if np.abs(matrix - np.eye(4)).max() <= NOTHING:
+            continue
+        words = plan.words(name, matrix)
+        chain = " → ".join(find.chain) or "no transform, and the rest of the head under one"
+        source = (
+            f"{find.label} lies under: {chain}; the matrix is what that does to it relative to",
+            "the rest of the head, in LPS mm: from where it is to where it goes.",
+        )
+        question, choices = _unusual(name, find, words)
+        plan.motions[name] = DraftMotion(words, source, matrix, "", question, choices, matrix)
+        plan.links |= {*find.chain} - shared
+        why = f"transform to parent of {find.label} in the scene: {words}"
+        plan.taken.append(
+            Taken(", ".join(find.chain) or find.label, f"motion of {name}", why, "mm", "LPS")
+        )
+    for name, finds in asked.items():
+        if name not in known:
+            motions = [back @ f.to_world if in_image else f.to_world @ back for f in finds]
+            _ask_whose(plan, name, finds, motions)
+    for motion in loose:
+        _add_loose(plan, motion)
+
+
+def _asked(anatomy: Anatomy) -> dict[str, list[SurfaceFind]]:
+    """The surfaces about which there are questions, by the bone's name."""
+    found: dict[str, list[SurfaceFind]] = {}
+    for question in anatomy.questions:
+        part, _, name = question.key.partition(".")
+        finds = [find for find, _ in question.choices if find is not None]
+        if part == "bones" and finds:
+            found[name] = finds
+    return found
+
+
+def _ask_whose(
+    plan: Plan, name: str, finds: Sequence[SurfaceFind], motions: Sequence[Floats]
+) -> None:
+    """Asks about the motion of a bone of which it is not clear which surface, or bone, it is."""
+    moved = [
+        (find, matrix)
+        for find, matrix in zip(finds, motions, strict=True)
+        if np.abs(matrix - np.eye(4)).max() > NOTHING
+    ]
+    if not moved:
+        return
+    choices = [f"{find.label} {plan.words(name, matrix)}" for find, matrix in moved]
+    if len(moved) == 1:
+        choices.append("if it is: write the matrix below, under the name of the bone")
+    question = f"is this the motion of {name}? See [surfaces.bones]"
+    plan.motions[name] = DraftMotion(
+        "", (), moved[0][1] if len(moved) == 1 else None, "", question, tuple(choices)
+    )
+    label = ", ".join(dict.fromkeys(link for find, _ in moved for link in find.chain))
+    plan.links |= {link for find, _ in moved for link in find.chain}
+    plan.taken.append(Taken(label, f"motion of {name}", question, "mm", "LPS", question=True))
+
+
+def _unusual(name: str, find: SurfaceFind, words: str) -> tuple[str, tuple[str, ...]]:
+    """Why a motion that a scene has may be none of the plan."""
+    if name == "cranium":
+        return "the scene moves the cranium relative to the skin: is that planned?", (
+            f"it {words}",
+            "remove this table if the cranium stays, or rename it and write the matrix below",
+        )
+    words_of = [link for link in find.chain if any(w in link.lower() for w in ("regist", "align"))]
+    if words_of:
+        return (
+            f"{words_of[0]!r} looks like the name of a registration, not of a plan: which is it?"
+        ), (
+            f"as a plan it {words}",
+            "remove this table if the segment does not move, or write the matrix below instead",
+        )
+    return "", ()
+
+
+def _add_loose(plan: Plan, motion: LooseMotion) -> None:
+    name = motion.role.part
+    if name not in MOVING or name in plan.motions or motion.role.registers:
+        plan.others.append(
+            OtherFind(motion.label, "the scene does not apply this transform to any model")
+        )
+        return
+    words = plan.words(name, motion.matrix)
+    question = f"{motion.label} is not applied to any model: was it hardened, or is it the plan?"
+    choices = (
+        f"as the plan it {words}: write the matrix below instead of this line;",
+        "if it was hardened, the surface has moved already: undo that in Slicer, and init again",
+    )
+    plan.motions[name] = DraftMotion(words, (), motion.matrix, "", question, choices)
+    plan.taken.append(
+        Taken(motion.label, f"motion of {name}", question, "mm", "LPS", question=True)
+    )
+
+
+def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool) -> None:
+    """Adds the motions in transform files, by the segment in the file's name.
+
+    Parameters
+    ----------
+    plan : Plan
+    found : sequence of TransformFind
+    by_slicer : bool
+        Whether other files of the folder were saved by 3D Slicer.
+    """
+    by_part: dict[str, list[TransformFind]] = {}
+    for find in found:
+        part = find.role.part
+        if part in MOVING and not find.role.registers:
+            by_part.setdefault(part, []).append(find)
+        elif find.role.registers:
+            why = "its name suggests a registration, not a plan"
+            plan.taken.append(Taken(find.label, "not used", why))
+        else:
+            _ask_segment(plan, find)
+    for name, finds in by_part.items():
+        if len(finds) > 1:
+            _ask_which(plan, name, finds)
+            continue
+        find = finds[0]
+        try:
+            motion = _of_file(plan, name, find, by_slicer=by_slicer)
+        except (CmfsimError, OSError) as error:
+            plan.others.append(OtherFind(find.label, f"is not a rigid motion of {name}: {error}"))
+            text = f"{find.label} cannot be used: {error}"
+            plan.motions[name] = DraftMotion("", (), None, '"?"', text, ("or remove this table",))
+            continue
+        plan.motions[name] = motion
+        asked = bool(motion.question)
+        why = motion.question or f"{motion.source[0]}: {motion.words}"
+        plan.taken.append(Taken(find.label, f"motion of {name}", why, "mm", "", question=asked))
+
+
+def _ask_segment(plan: Plan, find: TransformFind) -> None:
+    """Asks what a transform moves whose name does not say it."""
+    text = f"{find.label}: its name does not identify a segment. Which one does it move?"
+    choices = (
+        f"{quoted(find.label)}, and rename this table to [plan.NAME] of one of",
+        f"{', '.join(MOVING)}; or remove the table",
+    )
+    name = safe_key(find.label.rpartition("/")[2].partition(".")[0])
+    plan.motions[name] = DraftMotion("", (), None, '"?"', text, choices)
+    plan.taken.append(Taken(find.label, "", text, question=True))
+
+
+def _ask_which(plan: Plan, name: str, finds: Sequence[TransformFind]) -> None:
+    names = " or ".join(find.label for find in finds)
+    text = f"{names}: which one moves the {name}?"
+    choices = tuple(quoted(find.label) for find in finds)
+    plan.motions[name] = DraftMotion("", (), None, '"?"', text, choices)
+    plan.taken += [Taken(find.label, f"motion of {name}", text, question=True) for find in finds]
+
+
+def _of_file(plan: Plan, name: str, find: TransformFind, *, by_slicer: bool) -> DraftMotion:
+    """The motion in a file, with its direction and frame as far as they are known.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) As `read_transform_file`.
+    """
+    file = f"file = {quoted(find.label)}"
+
+    def read_as(direction: str) -> Floats:
+        return read_transform_file(find.path, direction=direction).matrix
+
+    itk = is_itk_file(find.path) or _holds_itk(find.path)
+    if not itk:
+        return _of_text(plan, name, find)
+    try:
+        stated = read_transform_file(find.path)
+    except CmfsimError:
+        slicer, other = (plan.words(name, read_as(way)) for way in ("from-parent", "to-parent"))
+        if by_slicer:
+            source: tuple[str, ...] = (
+                f"{find.label} is taken as 3D Slicer saves it, from-parent: other files are its.",
+                f'If ITK registered the bone before to the one after: "to-parent", which {other}.',
+            )
+            toml = f'{{{file}, direction = "from-parent"}}'
+            return DraftMotion(slicer, source, None, toml, shown=read_as("from-parent"))
+        text = f"{find.label} does not record its direction: which of these is the plan?"
+        choices = (
+            f'"from-parent" (as 3D Slicer saves it): {slicer}',
+            f'"to-parent" (as ITK registers it): {other}',
+        )
+        return DraftMotion("", (), None, f'{{{file}, direction = "?"}}', text, choices)
+    words = plan.words(name, stated.matrix)
+    source = (f"{find.label} states its direction: {stated.direction}",)
+    toml = f'{{{file}, direction = "{stated.direction}"}}'
+    return DraftMotion(words, source, None, toml, shown=stated.matrix)
+
+
+def _of_text(plan: Plan, name: str, find: TransformFind) -> DraftMotion:
+    """The motion in a text of 4 × 4 numbers."""
+    read = read_transform_file(find.path)
+    here = plan.words(name, read.matrix)
+    file = f"file = {quoted(find.label)}"
+    if "frame" not in read.assumed:
+        source = (f"{find.label}: {read.text}",)
+        toml = f'{{{file}, frame = "{read.frame}"}}'
+        return DraftMotion(here, source, None, toml, shown=read.matrix)
+    other = plan.words(name, motion_in_lps(read.matrix, "RAS"))
+    if here == other:
+        source = (f"{find.label}: LPS or RAS, which give the same motion",)
+        toml = f'{{{file}, frame = "LPS"}}'
+        return DraftMotion(here, source, None, toml, shown=read.matrix)
+    text = f"{find.label} does not state its frame: which of these is the plan?"
+    choices = (
+        f'"RAS" (the matrix that 3D Slicer shows): {other}',
+        f'"LPS" (typed, or made by ITK): {here}',
+    )
+    return DraftMotion("", (), None, f'{{{file}, frame = "?"}}', text, choices)
+
+
+def _holds_itk(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(30).startswith(b"#Insight Transform File")

@@ -1,0 +1,190 @@
+"""Where what was found lies in the case, and the paths by which the case names it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim.drafting.case_lines import Text, quoted
+from cmfsim.drafting.choices import Images, Marks
+from cmfsim.drafting.finds import EXTRACTED, ImageFind, LandmarkFind, SurfaceFind
+from cmfsim.drafting.gathering import Gathered
+from cmfsim.drafting.motions import Plan
+from cmfsim.drafting.roles import safe_key
+from cmfsim.drafting.surfaces import Anatomy, Question
+from cmfsim.drafting.written.checking import Shown
+from cmfsim.errors import CaseInputError
+from cmfsim.io.landmarks.landmark_files import write_landmarks
+from cmfsim.io.surfaces import write_surface
+from cmfsim.values.checks import Floats
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = [
+    "SAME",
+    "Draft",
+    "Place",
+    "choices_of",
+    "image_path",
+    "landmark_path",
+    "place_after",
+    "place_before",
+    "surface_path",
+]
+
+# Entries of two transforms that are one differ by less.
+SAME = 1e-9
+
+
+@dataclass(frozen=True)
+class Place:
+    """How the surfaces of a table of the case are placed.
+
+    Attributes
+    ----------
+    frame : str or None
+        What the table states.
+    shown : str or None
+        The frame of the files that state none.
+    matrix : callable
+        What carries a surface from its own coordinates to those of the case, LPS mm.
+    """
+
+    frame: str | None
+    shown: str | None
+    matrix: Callable[[SurfaceFind], Floats]
+
+
+@dataclass
+class Draft:
+    """What a case is made of, and the text that is made of it."""
+
+    found: Gathered
+    unpacked: Path
+    images: Images
+    anatomy: Anatomy
+    marks: Marks
+    plan: Plan
+    reference: Floats
+    by_image: bool
+    text: Text = field(default_factory=Text)
+    files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
+    shown: Shown = field(default_factory=Shown)
+
+
+def place_before(draft: Draft) -> Place:
+    """Where surfaces lie before the operation, and what the case states of their frame."""
+    reference = np.eye(4) if draft.by_image else draft.reference
+    return _place(draft, draft.anatomy.chosen, draft.anatomy.frame, lambda _: reference)
+
+
+def place_after(draft: Draft, frame: str | None) -> Place:
+    """Where surfaces lie after the operation: a scene shows them there."""
+    back = np.linalg.inv(draft.reference) if draft.by_image else np.eye(4)
+    return _place(draft, draft.anatomy.after, frame, lambda find: back @ find.to_world)
+
+
+def _place(
+    draft: Draft,
+    finds: Sequence[SurfaceFind],
+    frame: str | None,
+    matrix: Callable[[SurfaceFind], Floats],
+) -> Place:
+    """What a table of surfaces states of their frame: files that are written state LPS in vain."""
+    place = Place(None, frame, lambda find: matrix(find) if find.in_scene else np.eye(4))
+    as_they_are = not any(_is_packed(draft, find, place) for find in finds)
+    frames = {find.stated or frame for find in finds if find.is_silent}
+    one_frame = len(frames) == 1 and all(find.is_silent for find in finds)
+    if as_they_are and one_frame and frames == {"RAS"}:
+        return replace(place, frame="RAS")
+    return replace(place, frame="LPS" if frame == "LPS" else None)
+
+
+def _is_packed(draft: Draft, find: SurfaceFind, place: Place) -> bool:
+    """Whether a surface has no file of its own where the case lies: packed, voxels, or moved."""
+    moved = not np.allclose(place.matrix(find), np.eye(4), rtol=0.0, atol=SAME)
+    return moved or find.path.is_relative_to(draft.unpacked) or find.is_made
+
+
+def surface_path(draft: Draft, find: SurfaceFind, name: str, place: Place) -> str:
+    """The path of a surface in the case; a copy in LPS mm where its file alone would not do."""
+    true = find.stated or place.shown or "LPS"
+    matrix, flip = place.matrix(find), [-1.0, -1.0, 1.0] if true == "RAS" else [1.0, 1.0, 1.0]
+    known = draft.anatomy.asks("units") is None
+    vertices = find.surface.vertices * flip @ matrix[:3, :3].T + matrix[:3, 3]
+    reads_as = place.frame or ("LPS" if find.is_silent else find.stated)
+    if not _is_packed(draft, find, place) and (true == reads_as or not known):
+        path = draft.found.shown(find.path)
+    elif not known:
+        raise CaseInputError(
+            f"{find.label} is {find.extent.max():.4g} long: a scene of 3D Slicer is in mm, so its "
+            "transforms do not fit this surface: scale it to mm, and save the scene again"
+        )
+    else:
+        path = f"{EXTRACTED}/{name}.ply"
+        surface = SurfaceData(vertices, find.surface.triangles)
+        if not draft.by_image or find.role.is_after:
+            draft.files[path] = lambda target: write_surface(target, surface)
+    if known and (draft.anatomy.asks("frame") is None or not find.is_silent):
+        draft.shown.surfaces[path] = vertices
+    return path
+
+
+def _candidate_path(draft: Draft, find: SurfaceFind, place: Place) -> str:
+    tail = find.label.rpartition(": ")[2].rpartition(" / ")[2].rpartition("/")[2]
+    name = safe_key(tail.partition(".")[0] if find.is_made else tail)
+    taken = {path for path in draft.files if path.startswith(f"{EXTRACTED}/{name}")}
+    return surface_path(draft, find, f"{name}_{len(taken) + 1}" if taken else name, place)
+
+
+def choices_of(draft: Draft, question: Question, place: Place) -> list[str]:
+    """What may be written for a question; a surface of a scene gets a file, so that it can be."""
+    return [
+        words if find is None else f"{quoted(_candidate_path(draft, find, place))}: {words}"
+        for find, words in question.choices
+    ]
+
+
+def landmark_path(draft: Draft, find: LandmarkFind, key: str) -> str:
+    """The path of landmarks in the case; where they lie before the operation."""
+    matrix = _marks_matrix(draft, find)
+    points = {
+        label: matrix[:3, :3] @ point + matrix[:3, 3]
+        for label, point in draft.marks.placed(find).items()
+    }
+    if "frame" not in draft.marks.questions or find.read.stated:
+        draft.shown.landmarks[key] = points
+    apart = not np.allclose(matrix, np.eye(4), rtol=0.0, atol=SAME)
+    if not apart and not find.path.is_relative_to(draft.unpacked):
+        return draft.found.shown(find.path)
+    name = f"{EXTRACTED}/{key}.mrk.json"
+    draft.files[name] = lambda path: write_landmarks(path, points)
+    return name
+
+
+def _marks_matrix(draft: Draft, find: LandmarkFind) -> Floats:
+    """What carries landmarks of a scene to where they lie before the operation in the case."""
+    if not find.in_scene:
+        return np.eye(4)
+    # A list under a segment's transform goes with the segment; before, it lies with the head.
+    moved = [bone for bone in draft.anatomy.bones.values() if bone.chain and bone.is_moved]
+    with_bone = any(bone.chain == find.chain for bone in moved) or bool(
+        set(find.chain) & draft.plan.links
+    )
+    matrix = draft.reference if with_bone else find.to_world
+    return np.linalg.inv(draft.reference) @ matrix if draft.by_image else matrix
+
+
+def image_path(draft: Draft, image: ImageFind) -> str:
+    """The path of a CT; that of a bundle is copied next to the case."""
+    if not image.path.is_relative_to(draft.unpacked):
+        return "." if image.path == draft.found.folder else draft.found.shown(image.path)
+    name = f"{EXTRACTED}/{safe_key(image.path.name.partition('.')[0])}"
+    name += "".join(image.path.suffixes[-2:]) if image.path.suffix == ".gz" else image.path.suffix
+    data = image.path.read_bytes()
+    draft.files[name] = lambda path: _keep(path, data)
+    return name
+
+
+def _keep(path: Path, data: bytes) -> None:
+    path.write_bytes(data)

@@ -1,0 +1,223 @@
+"""Bone with the hollows that it encloses, teeth and metal."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmfsim.errors import ImageInputError
+from cmfsim.imaging.bones.bone_edge import at_half_height
+from cmfsim.imaging.bones.metal import Metal, without_streaks
+from cmfsim.imaging.intensities.levels import level_of
+from cmfsim.imaging.morphology import (
+    Mask,
+    Volume,
+    chosen,
+    closed,
+    depth,
+    grown,
+    label,
+    resampled_to,
+    watershed,
+)
+from cmfsim.imaging.options import SegmentOptions
+from cmfsim.imaging.skins.skin import Skin
+from cmfsim.imaging.working_grid import Working, coarse_of
+from cmfsim.values.finding import Finding
+
+__all__ = ["Bone", "find_bone"]
+
+# Teeth are denser than compact bone, HU; smaller groups of such voxels are none, mm³.
+ENAMEL = 1400.0
+LEAST_TEETH = 200.0
+# Enamel lies within this of the occlusal plane at the incisors, mm.
+OCCLUSAL_REACH = 30.0
+# Full range of the bone's level, HU: soft tissue is near −1 then.
+BONE_SCALE = 250.0
+# The cavity of the skull is what a ball of this radius fits into, once the way through the great
+# foramen (some 36 × 30 mm) is left out, mm.
+CAVITY_RADIUS = 19.0
+# Ways that a ball of this radius passes join lobes of one brain, mm.
+JOINED_RADIUS = 16.0
+# A cranial cavity is at least this large, mm³: a third of a child's.
+LEAST_CAVITY = 300_000.0
+# The part of its surface that is bone; what soft tissue and the image's borders enclose is none. A
+# skull that is cut at the brows has 0.92, the mouth in a round field of view 0.78.
+LEAST_BOUNDED = 0.85
+# Bone partly in a voxel seals a hollow from this part of the way between soft tissue and bone on.
+SEAL_PART = 0.6
+SOFT = 40.0
+
+
+@dataclass(frozen=True, eq=False)
+class Bone:
+    """Bone on the working grid.
+
+    Attributes
+    ----------
+    hu : (nx, ny, nz) float32
+        What bone was found in: streaks of metal are taken out.
+    surface : (nx, ny, nz) float32
+        HU whose surface of bone lies at the threshold: see `at_half_height`.
+    mask : (nx, ny, nz) bool
+        Bone and the hollows in it.
+    solid : (nx, ny, nz) bool
+        Bone alone.
+    cavity : (nx, ny, nz) bool or None
+        Where the brain is; None where no skull encloses it in the image.
+    findings : tuple of Finding
+    """
+
+    hu: Volume
+    surface: Volume
+    mask: Mask
+    solid: Mask
+    cavity: Mask | None
+    findings: tuple[Finding, ...]
+
+
+def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) -> Bone:
+    """The bone of a head.
+
+    Errors
+    ------
+    ImageError
+        (also `ValueError`) No bone at this threshold.
+    """
+    threshold = options.least_bone
+    under = depth(skin.mask, work.spacing, 2.0 * options.least_skin)
+    hu = metal.hu
+    solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
+    solid &= under > options.least_skin
+    solid, findings = _without_islands(solid, work, options)
+    with ThreadPoolExecutor(1) as beside:
+        walls = beside.submit(_walls, hu, solid, under, work, options)
+        cavity = _cranial_cavity(solid, skin, work)
+        mask = _enclosed(walls.result(), solid, cavity, under, work=work, options=options)
+    surface = hu
+    if options.bone_threshold is None:
+        surface, mask = at_half_height(hu, mask, threshold, BONE_SCALE, work.spacing)
+    return Bone(hu, surface, mask, solid & mask, cavity, tuple(findings))
+
+
+def bone_level(bone: Bone, options: SegmentOptions) -> Volume:
+    """The level of all bone."""
+    return level_of(bone.surface, options.least_bone, BONE_SCALE, bone.mask)
+
+
+def _without_islands(
+    solid: Mask, work: Working, options: SegmentOptions
+) -> tuple[Mask, list[Finding]]:
+    labels, sizes = label(solid, corners=True)
+    if len(sizes) == 1:
+        raise ImageInputError(
+            f"no bone above {options.least_bone:g} HU inside the skin: check that this is a CT "
+            "in HU; if it is not, set bone_threshold"
+        )
+    volumes = sizes * float(np.prod(work.spacing))
+    kept = volumes > min(options.island, float(volumes.max()) - 1e-9)
+    dropped = float(volumes[~kept].sum())
+    kept_mask = chosen(kept, labels)
+    findings = []
+    if dropped > options.island:
+        findings.append(
+            Finding(
+                "bone-islands",
+                f"{len(sizes) - 1 - np.count_nonzero(kept)} pieces of bone below "
+                f"{options.island:g} mm³ each, {dropped / 1000.0:.1f} cm³ together, were dropped",
+                where="bone",
+            )
+        )
+    return kept_mask, findings
+
+
+def _cranial_cavity(solid: Mask, skin: Skin, work: Working) -> Mask | None:
+    """The room of the brain, found as a large room with narrow ways out; None if there is none."""
+    coarse, steps, shift = coarse_of(solid.astype(np.float32), work.spacing)
+    inside, _, _ = coarse_of(skin.mask.astype(np.float32), work.spacing)
+    wall: Mask = np.asfortranarray(coarse > 0.25)
+    # Where the image cuts the skull, its border is the wall: one more layer all round.
+    wide = np.asfortranarray(np.pad(wall, 1, mode="constant", constant_values=False))
+    head = np.pad(inside > 0.5, 1, mode="edge")
+    rim = np.ones_like(wide)
+    rim[1:-1, 1:-1, 1:-1] = False
+    sealed = closed(wide, 4.0, steps) | (rim & head)
+    room = depth(np.asfortranarray(~sealed), steps)
+    labels, sizes = label(room > CAVITY_RADIUS)
+    if len(sizes) < 3:
+        return None
+    outer = np.unique(labels[~head & (labels > 0)])
+    sizes[outer] = 0
+    brain = int(np.argmax(sizes))
+    if not sizes[brain] or not len(outer):
+        return None
+    # Lobes that more than the great foramen joins are one room.
+    wide_rooms, _ = label(room > JOINED_RADIUS)
+    joined = wide_rooms == wide_rooms[labels == brain][0]
+    if (joined & np.isin(labels, outer)).any():
+        joined = labels == brain
+    seeds = np.where(joined, 1, np.where(labels > 0, 2, 0))
+    # Rooms part where the way between them is narrowest.
+    basins = watershed(-room, seeds, ~sealed)
+    cavity = (basins == 1)[1:-1, 1:-1, 1:-1]
+    if np.count_nonzero(cavity) * float(np.prod(steps)) < LEAST_CAVITY:
+        return None
+    if not _enclosed_by_skull(cavity, wall):
+        return None
+    fine = resampled_to(cavity.astype(np.float32), steps, shift, solid.shape, work.spacing)
+    return fine > 0.5
+
+
+def _enclosed_by_skull(cavity: Mask, wall: Mask) -> bool:
+    """Whether a room is the brain's: so is the mouth where an image cuts the head."""
+    rim = grown(cavity) & ~cavity
+    bounded = int(np.count_nonzero(rim & grown(wall)))
+    return bounded >= LEAST_BOUNDED * int(np.count_nonzero(rim))
+
+
+def _walls(hu: Volume, solid: Mask, under: Volume, work: Working, options: SegmentOptions) -> Mask:
+    """Bone and what is partly bone, closed: the walls of hollows."""
+    seal = options.least_bone - (1.0 - SEAL_PART) * (options.least_bone - SOFT)
+    walls = solid | ((hu > seal) & (under > 2.0 * options.least_skin))
+    return closed(walls, options.closing, work.spacing)
+
+
+def _enclosed(
+    walls: Mask,
+    solid: Mask,
+    cavity: Mask | None,
+    under: Volume,
+    *,
+    work: Working,
+    options: SegmentOptions,
+) -> Mask:
+    """Bone with marrow, sinuses and the cranial cavity."""
+    if cavity is not None:
+        walls = walls | cavity
+    labels, sizes = label(~walls)
+    outer = np.zeros(len(sizes), dtype=bool)
+    outer[labels.T[under.T < 0.0]] = True
+    if not outer[1:].any():
+        outer[np.argmax(sizes)] = True
+    outer[0] = False
+    hollows = ~walls & ~chosen(outer, labels)
+    if cavity is not None:
+        hollows |= cavity
+    # Of the closed walls only what bounds a hollow belongs to bone; the rest are outer grooves.
+    reach = options.closing + float(work.spacing.max())
+    added = walls & (depth(hollows, work.spacing, reach) > -reach)
+    mask = solid | hollows | added
+    mask &= under > options.least_skin
+    return mask
+
+
+def teeth_level(bone: Bone, work: Working, occlusal_height: float | None) -> Volume | None:
+    """The level of what is as dense as enamel near the tooth rows; None if that is little."""
+    if occlusal_height is None:
+        return None
+    z = work.origin[2] + work.spacing[2] * np.arange(work.hu.shape[2])
+    near = np.abs(z - occlusal_height) < OCCLUSAL_REACH
+    mask = bone.mask & (bone.hu > ENAMEL) & near[None, None, :]
+    if np.count_nonzero(mask) * float(np.prod(work.spacing)) < LEAST_TEETH:
+        return None
+    return level_of(bone.hu, ENAMEL, BONE_SCALE, mask)

@@ -1,0 +1,1 @@
+"""The skin in a scan: outer surface, hollows inside, things that lie on it."""

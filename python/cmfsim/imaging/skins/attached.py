@@ -1,0 +1,264 @@
+"""Things on the face that are no part of it: tubes, holders, tape. They are reported, not removed.
+
+Whatever protrudes from the head and is thin is checked: it belongs to the face if it has a mirror
+image on the other side, as ears, nose and lips have, is less dense than plastic and protrudes no
+further than a nose. What lies flat on the face has a step all round (`find_plates`).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.imaging.bones.bone import Bone
+from cmfsim.imaging.morphology import (
+    Mask,
+    Volume,
+    box_of,
+    chosen,
+    depth,
+    label,
+    ndimage,
+    opened,
+    reached,
+    simplex,
+)
+from cmfsim.imaging.skins.plates import STEP as PLATE_STEP
+from cmfsim.imaging.skins.plates import find_plates
+from cmfsim.imaging.skins.skin import Skin
+from cmfsim.imaging.working_grid import Working, coarse_of
+from cmfsim.values.finding import Finding
+
+__all__ = ["attached_findings"]
+
+# Voxels that things on the face are told apart on, mm.
+STEP = 2.0
+# What a ball of this radius does not fit into stands out from the head, mm: tubes for the airway
+# measure up to 15 mm across.
+WIDEST = 8.0
+# A part without its mirror image within the first is one-sided, with all that joins it and has none
+# within the second, mm: noses and lips deviate less.
+ONE_SIDED = 5.0
+NEARLY_ONE_SIDED = 3.0
+# Plastic is denser than this, skin and cartilage are not, HU; bone this near is the head's own, mm.
+PLASTIC = 130.0
+OWN_BONE = 4.0
+# Noses, lips and chins stand out from the opened head by 6 mm at most; plates of chin rests by far
+# more. What is farther out than the first is no face's, with all that joins it beyond the second,
+# mm.
+FARTHEST = 15.0
+STANDING_OUT = 8.0
+# A throat has up to 400 mm² across, a windpipe 300 mm².
+AIRWAY_AREA = 900.0
+# It lies deep in the head for this length, mm, with thick tissue on so much of its sides, and under
+# the skin of the neck, which is thin, on so much at least. Hollow things are thin all around.
+AIRWAY_LENGTH, DEEP, SHALLOW = 20.0, 0.8, 0.3
+# Smaller and shorter things are folds, swellings and noise, mm³ and mm.
+LEAST_VOLUME = 600.0
+LEAST_LENGTH = 18.0
+# The face lies in front of this part of the head's depth: ears, folded or not, lie behind.
+FACE_PART = 0.45
+ONE_SIDED_TEXT = "with no counterpart on the other side"
+FLAT_TEXT = "flat, with a step all round that no part of a face has"
+# A flat thing whose middle lies within the box of another one, wider by this, is the same, mm.
+SAME = 10.0
+# A nose stands out farther than this from what larger balls, of the second radius, sweep in the
+# head; a pad does not, mm.
+FLAT, BROAD = 13.0, 20.0
+# Points of the face that its plane of symmetry is fitted to.
+SAMPLES = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class _Head:
+    """The inside of the head in voxels of about `STEP`.
+
+    Attributes
+    ----------
+    mask : (nx, ny, nz) bool
+    spacing, origin : (3,) float64, mm
+    """
+
+    mask: Mask
+    spacing: NDArray[np.float64]
+    origin: NDArray[np.float64]
+
+    @cached_property
+    def core(self) -> Mask:
+        """What balls can sweep in the head with its airway."""
+        return opened(self.mask | _airway(self.mask, self.spacing), WIDEST, self.spacing)
+
+    @cached_property
+    def away(self) -> Volume:
+        """The distance from that, mm; negative in it."""
+        return -depth(self.core, self.spacing)
+
+    @cached_property
+    def away_broadly(self) -> Volume:
+        """The distance from what larger balls can sweep, mm; negative in it."""
+        return -depth(opened(self.mask, BROAD, self.spacing), self.spacing)
+
+
+@dataclass(frozen=True, eq=False)
+class _Thing:
+    """What is on the face.
+
+    Attributes
+    ----------
+    middle, size : (3,) float64, mm
+    volume : float, mm³
+        Not known of what lies flat: 0.
+    kind : str
+    """
+
+    middle: NDArray[np.float64]
+    size: NDArray[np.float64]
+    volume: float
+    kind: str
+
+
+def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
+    """A finding for each thing on the face: one-sided, dense as plastic, or flat with a rim."""
+    inside, spacing, shift = coarse_of(skin.mask.astype(np.float32), work.spacing, STEP)
+    head = _Head(np.asfortranarray(inside > 0.5), spacing, work.origin + shift)
+    things = _protruding(head, work, bone)
+    for flat in _flat(head, work, skin):
+        near = [np.abs(flat.middle - thing.middle) < 0.5 * thing.size + SAME for thing in things]
+        if not any(inside.all() for inside in near):
+            things.append(flat)
+    return [_finding(thing) for thing in things]
+
+
+def _flat(head: _Head, work: Working, skin: Skin) -> list[_Thing]:
+    """What lies flat on the face."""
+    level, spacing, shift = coarse_of(skin.level, work.spacing, PLATE_STEP)
+    things = []
+    for voxels in find_plates(level, spacing, _behind(box_of(level > 0.0)[1])):
+        places = work.origin + shift + voxels * spacing
+        index = np.rint((places - head.origin) / head.spacing).astype(np.intp)
+        index = np.clip(index, 0, np.array(head.mask.shape) - 1)
+        if head.away_broadly[tuple(index.T)].max() <= FLAT:
+            size = (np.ptp(voxels, axis=0) + 1) * spacing
+            things.append(_Thing(places.mean(axis=0), size, 0.0, FLAT_TEXT))
+    return things
+
+
+def _behind(rows: slice) -> int:
+    """The first layer along y behind the face, of those that hold the head."""
+    return int(rows.start + int(FACE_PART * (rows.stop - rows.start)))
+
+
+def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
+    """What protrudes, and is one-sided, has the density of plastic, or reaches too far."""
+    spacing = head.spacing
+    hu = coarse_of(work.hu, work.spacing, STEP)[0]
+    own = coarse_of(bone.solid.astype(np.float32), work.spacing, STEP)[0] > 0.25
+    behind = _behind(box_of(head.mask)[1])
+    around = depth(head.mask, spacing)
+    out = head.mask & ~head.core
+    out[:, behind:] = False
+    far = reached(out & (head.away > STANDING_OUT), head.away > FARTHEST)
+    dense = out & (hu > PLASTIC) & (around < WIDEST)
+    dense &= depth(np.asfortranarray(own), spacing) < -OWN_BONE
+    mirrored = _mirrored(around, spacing, behind, out)
+    alone = reached(out & (mirrored < -NEARLY_ONE_SIDED), mirrored < -ONE_SIDED)
+    found: Mask = dense | alone | far
+    labels, sizes = label(found, corners=True)
+    things = []
+    for piece in range(1, len(sizes)):
+        voxels = np.argwhere(labels == piece)
+        volume = len(voxels) * float(np.prod(spacing))
+        size = (np.ptp(voxels, axis=0) + 1) * spacing
+        if volume < LEAST_VOLUME or float(np.linalg.norm(size)) < LEAST_LENGTH:
+            continue
+        middle = head.origin + voxels.mean(axis=0) * spacing
+        kinds = ((far, "further out than a nose"), (dense, "with the density of plastic"))
+        here = labels == piece
+        kind = next((text for which, text in kinds if which[here].mean() > 0.5), ONE_SIDED_TEXT)
+        things.append(_Thing(middle, size, volume, kind))
+    return things
+
+
+def _airway(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
+    """The air in throat and windpipe: closed in by tissue in each slice, narrow, deep somewhere.
+
+    The skin in front of a windpipe is thin and stands free of the rest of the neck, as a thing on
+    the face does. Air in or behind such a thing is nowhere deep in the head.
+    """
+    images = ndimage()
+    across = np.zeros((3, 3, 3), dtype=bool)
+    across[:, :, 1] = images.generate_binary_structure(2, 1)
+    # Filled in each slice alone: the airway is open at nose, mouth and the end of the image.
+    closed_in = images.binary_fill_holes(mask, structure=across) & ~mask
+    labels, count = images.label(closed_in, structure=across)
+    areas = np.bincount(labels.ravel(), minlength=count + 1) * spacing[0] * spacing[1]
+    around = images.grey_dilation(labels, footprint=across)
+    walls = mask & (around > 0)
+    walled = np.bincount(around[walls], minlength=count + 1)
+    thick = np.bincount(around[walls & _thick(mask, spacing)], minlength=count + 1)
+    is_airy = (areas <= AIRWAY_AREA) & (thick >= SHALLOW * walled)
+    is_airy[0] = False
+    pieces, sizes = label(np.asfortranarray(is_airy[labels]))
+    is_deep = (is_airy & (thick >= DEEP * walled))[labels]
+    is_airway = [False]
+    for piece, block in enumerate(images.find_objects(pieces, len(sizes) - 1), 1):
+        levels = (is_deep[block] & (pieces[block] == piece)).any(axis=(0, 1))
+        is_airway.append(bool(np.count_nonzero(levels) * spacing[2] >= AIRWAY_LENGTH))
+    return chosen(np.array(is_airway), pieces)
+
+
+def _thick(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
+    """Where a ball fits into the head, as if its lowest slice went on below the image."""
+    low = box_of(mask)[2].start
+    below = int(np.ceil(WIDEST / spacing[2])) + 1
+    lowest = np.repeat(mask[:, :, low : low + 1], below, axis=2)
+    longer = np.asfortranarray(np.concatenate([lowest, mask[:, :, low:]], axis=2))
+    thick = np.zeros_like(mask)
+    thick[:, :, low:] = opened(longer, WIDEST, spacing)[:, :, below:]
+    return thick
+
+
+def _finding(thing: _Thing) -> Finding:
+    size = " × ".join(f"{length:.0f}" for length in thing.size)
+    volume = f", {thing.volume / 1000.0:.1f} cm³" if thing.volume else ""
+    x, y, z = thing.middle
+    return Finding(
+        "skin-attachment",
+        f"something protrudes from the face, {thing.kind}: {size} mm{volume}",
+        where=f"skin at ({x:.0f}, {y:.0f}, {z:.0f}) mm",
+    )
+
+
+def _mirrored(around: Volume, spacing: NDArray[np.float64], behind: int, out: Mask) -> Volume:
+    """The depth inside the head of each voxel's mirror image, mm; infinite where not asked for."""
+    face = np.argwhere(np.abs(around[:, :behind]) < float(spacing.max())) * spacing
+    if not len(face) or not out.any():
+        return np.full(around.shape, np.float32(np.inf))
+    face = face[:: max(1, len(face) // SAMPLES)]
+    middle = face.mean(axis=0)
+
+    def reflected(points: Any, plane: Any) -> Any:
+        offset, yaw, roll = plane
+        normal = np.array([1.0, yaw, roll])
+        normal /= np.linalg.norm(normal)
+        away = (points - middle) @ normal - offset
+        return points - 2.0 * away[:, None] * normal
+
+    def at(points: Any) -> Any:
+        index = np.rint(points / spacing).astype(np.intp)
+        last = np.array(around.shape) - 1
+        index = np.clip(index, 0, last)
+        return around[tuple(index.T)]
+
+    def cost(plane: Any) -> float:
+        # What is far off counts no more than this: a tube may not turn the plane.
+        return float(np.minimum(np.abs(at(reflected(face, plane))), 3.0 * ONE_SIDED).mean())
+
+    steps = np.array([8.0, 0.1, 0.1])
+    plane = simplex(cost, np.zeros(3), steps)
+    deep = np.full(around.shape, np.float32(np.inf))
+    voxels = np.argwhere(out)
+    deep[tuple(voxels.T)] = at(reflected(voxels * spacing, plane))
+    return deep

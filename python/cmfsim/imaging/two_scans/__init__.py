@@ -1,0 +1,1 @@
+"""Registration of two scans of one head, and the skull that stays."""

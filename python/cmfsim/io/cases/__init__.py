@@ -1,0 +1,1 @@
+"""Case files and what belongs to them: plans, cohorts, variants, templates, scenes."""

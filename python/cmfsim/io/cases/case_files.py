@@ -1,0 +1,304 @@
+"""A patient case and its file, `case.toml` (docs/formats.md).
+
+Only the case file itself is read here. Paths that it names are resolved against its folder.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeAlias
+
+from cmfsim.errors import CaseInputError
+from cmfsim.io.cases.case_changes import CaseChanges
+from cmfsim.io.cases.case_plans import is_achieved, osteotomies_of, plan_of
+from cmfsim.io.cases.case_tables import (
+    band_of,
+    image_of,
+    landmarks_of,
+    lips_of,
+    mesh_of,
+    muscles_of,
+    node_kinds_of,
+    output_folder,
+    postoperative_of,
+    region_of,
+    solver_of,
+    surfaces_of,
+    tissue_of,
+)
+from cmfsim.io.cases.tables import read_tables
+from cmfsim.io.files.reading_writing import FORMAT_VERSION, is_there
+from cmfsim.values.case_parts import (
+    CaseBand,
+    CaseImage,
+    CaseLandmarks,
+    CaseLips,
+    CaseMesh,
+    CaseMotion,
+    CaseMuscles,
+    CaseOsteotomy,
+    CasePostoperative,
+    CaseSurfaces,
+)
+from cmfsim.values.case_region import Region
+from cmfsim.values.checks import as_text
+from cmfsim.values.solver_options import SolverOptions
+from cmfsim.values.tissue_data import TissueData
+
+__all__ = ["CASE_FORMAT", "Case", "CaseOrPath", "as_case"]
+
+CASE_FORMAT = "cmfsim-case"
+# What a case's file is called where its folder alone is given.
+CASE_FILE = "case.toml"
+TABLES = (
+    "format",
+    "version",
+    "name",
+    "note",
+    "image",
+    "surfaces",
+    "landmarks",
+    "region",
+    "mesh",
+    "lips",
+    "osteotomies",
+    "plan",
+    "node_kinds",
+    "tissue",
+    "muscles",
+    "solver",
+    "band",
+    "postoperative",
+    "output",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A patient: input files, cuts, plan and solver options.
+
+    Attributes
+    ----------
+    name : str
+    file : Path
+        The case file.
+    output : Path
+        Folder of everything that is written for the case.
+    image : CaseImage or None
+        Exactly one of `image` and `surfaces` is given.
+    surfaces : CaseSurfaces or None
+    landmarks : CaseLandmarks
+    region : Region
+    mesh : CaseMesh
+    lips : CaseLips
+    osteotomies : tuple of CaseOsteotomy
+        In the order in which they are made.
+    plan : mapping of str to CaseMotion
+        Segments that it does not name stay.
+    achieved : bool
+        The plan is measured on the post-operative bones; `plan` is empty.
+    node_kinds : mapping of str to plain values
+        Options of the stage that classifies nodes.
+    tissue : TissueData or None
+        Fat: everywhere in a homogeneous model, between the muscles in the others. None: that of the
+        muscles' preset, or of the default preset without muscles.
+    muscles : CaseMuscles or None
+        None: `cmfsim build` makes a model without muscles.
+    solver : SolverOptions
+    band : CaseBand
+    postoperative : CasePostoperative or None
+    note : str
+        A remark for readers of the report, such as that the patient is synthetic.
+    places : mapping of str to str
+        File and line of each dotted key, such as "case.toml:12", for findings.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> case = cmfsim.Case.load("case.toml")  # doctest: +SKIP
+    """
+
+    name: str
+    file: Path
+    output: Path
+    image: CaseImage | None = None
+    surfaces: CaseSurfaces | None = None
+    landmarks: CaseLandmarks = field(default_factory=CaseLandmarks)
+    region: Region = field(default_factory=Region)
+    mesh: CaseMesh = field(default_factory=CaseMesh)
+    lips: CaseLips = field(default_factory=CaseLips)
+    osteotomies: tuple[CaseOsteotomy, ...] = ()
+    plan: Mapping[str, CaseMotion] = field(default_factory=dict)
+    achieved: bool = False
+    node_kinds: Mapping[str, Any] = field(default_factory=dict)
+    tissue: TissueData | None = None
+    muscles: CaseMuscles | None = None
+    solver: SolverOptions = field(default_factory=SolverOptions)
+    band: CaseBand = field(default_factory=CaseBand)
+    postoperative: CasePostoperative | None = None
+    note: str = ""
+    places: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        as_text("case name", self.name)
+        if (self.image is None) == (self.surfaces is None):
+            raise CaseInputError("a case has either an image or surfaces")
+        if self.achieved and self.plan:
+            raise CaseInputError("a plan is either given or achieved, not both")
+        for name in ("plan", "node_kinds", "places"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    @property
+    def fat(self) -> TissueData:
+        """The fat of the case: `tissue`, or that of the preset of its muscles."""
+        if self.tissue is not None:
+            return self.tissue
+        muscles = CaseMuscles() if self.muscles is None else self.muscles
+        return TissueData("preset", preset=muscles.preset, fraction=0.0)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], *, changes: CaseChanges | None = None) -> "Case":
+        """The case that a `case.toml` describes.
+
+        Parameters
+        ----------
+        path : path
+            Of the file, or of a folder that holds a `case.toml`.
+        changes : CaseChanges, optional
+            Of settings in the file. Paths in it are resolved against the folder of the case, too.
+
+        Returns
+        -------
+        Case
+
+        Raises
+        ------
+        FileNotFoundError
+            The case file does not exist. The files that it names are not checked.
+        CaseError
+            (also `ValueError`) Not TOML, an unknown key, a value of another type or out of range:
+            with file, line and key.
+        """
+        return _read(_case_file(Path(path)), changes)
+
+    def with_plan(self, path: str | os.PathLike[str]) -> "Case":
+        """The case under the plan in another file, such as one saved by the planning page.
+
+        Parameters
+        ----------
+        path : path
+            TOML with tables `[plan.SEGMENT]`, as in a case, and nothing else. They replace the
+            case's own plan: segments that they do not name stay.
+
+        Raises
+        ------
+        FileNotFoundError
+            The file does not exist.
+        CaseError
+            (also `ValueError`) Not TOML, another table, no motion, or one that is not valid: with
+            file, line and key.
+        """
+        document = read_tables(Path(path)).only("plan")
+        if not list(document.table("plan")):
+            document.fail("plan", "has no motion: add tables [plan.SEGMENT]")
+        return replace(self, plan=plan_of(document, Path(path).parent), achieved=False)
+
+    def where(self, key: str) -> str:
+        """File, line and key, as findings name a place in the case file."""
+        parts = key.split(".")
+        for length in range(len(parts), 0, -1):
+            place = self.places.get(".".join(parts[:length]))
+            if place is not None:
+                return f"{place} {key}"
+        return f"{self.file.name} {key}"
+
+
+# What functions on cases take.
+CaseOrPath: TypeAlias = Case | str | os.PathLike[str]
+
+
+def as_case(case: CaseOrPath) -> Case:
+    """The case itself, or the one that the file or folder at a path describes.
+
+    Parameters
+    ----------
+    case : Case or path
+
+    Raises
+    ------
+    FileNotFoundError, CaseError
+        As `Case.load`; `CaseError` (also `ValueError`) also for anything else.
+    """
+    if isinstance(case, Case):
+        return case
+    if isinstance(case, str | os.PathLike):
+        return Case.load(case)
+    raise CaseInputError(
+        f"the case is of type {type(case).__name__}: give a Case, or the path of a case.toml or "
+        "of the folder that contains it"
+    )
+
+
+def _case_file(path: Path) -> Path:
+    """The case file that a path leads to: itself, or the one in a folder."""
+    if not is_there(path) or not path.is_dir():
+        return path
+    file = path / CASE_FILE
+    if not file.exists():
+        raise CaseInputError(
+            f"{path.resolve()}: is a folder without a {CASE_FILE}: give the path of the case "
+            "file, or of the folder that contains it"
+        )
+    return file
+
+
+def _read(path: Path, changes: CaseChanges | None) -> Case:
+    document = read_tables(path)
+    if changes is not None:
+        document = document.changed(changes)
+    document.only(*TABLES)
+    found = document.text("format")
+    if found != CASE_FORMAT:
+        document.fail("format", f"is {found!r}: {CASE_FORMAT!r} is needed")
+    version = document.need("version", f": write version = {FORMAT_VERSION}")
+    if isinstance(version, bool) or version != FORMAT_VERSION:
+        document.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
+    folder = path.parent
+    if ("image" in document) == ("surfaces" in document):
+        both = "image" in document
+        document.fail(
+            "surfaces" if both else None,
+            "is given together with [image]: give one of them"
+            if both
+            else "needs [image] or [surfaces]",
+        )
+    return Case(
+        name=document.text("name", path.resolve().parent.name or "case"),
+        file=path,
+        output=output_folder(document.table("output").only("folder"), folder),
+        image=image_of(document.table("image"), folder) if "image" in document else None,
+        surfaces=surfaces_of(document.table("surfaces"), folder)
+        if "surfaces" in document
+        else None,
+        landmarks=landmarks_of(document.table("landmarks"), folder),
+        region=region_of(document.table("region")),
+        mesh=mesh_of(document.table("mesh"), folder),
+        lips=lips_of(document, folder),
+        osteotomies=osteotomies_of(document),
+        plan={} if is_achieved(document) else plan_of(document, folder),
+        achieved=is_achieved(document),
+        node_kinds=node_kinds_of(document.table("node_kinds")),
+        tissue=tissue_of(document.table("tissue")),
+        muscles=muscles_of(document.table("muscles"), folder) if "muscles" in document else None,
+        solver=solver_of(document.table("solver")),
+        band=band_of(document, folder),
+        postoperative=(
+            postoperative_of(document.table("postoperative"), folder)
+            if "postoperative" in document
+            else None
+        ),
+        note=document.text("note") if "note" in document else "",
+        places=document.all_places(),
+    )

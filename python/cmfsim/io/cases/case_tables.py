@@ -1,0 +1,412 @@
+"""Tables of a case file but those of its plan: what each may hold, and within what limits."""
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, PRESETS
+from cmfsim.errors import CaseInputError
+from cmfsim.io.cases.tables import Table
+from cmfsim.io.files.reading_writing import is_there
+from cmfsim.values.case_parts import (
+    FRAMES,
+    LIP_SEAMS,
+    UNITS,
+    CaseBand,
+    CaseImage,
+    CaseLandmarks,
+    CaseLips,
+    CaseMesh,
+    CaseMuscles,
+    CasePostoperative,
+    CaseSurfaces,
+)
+from cmfsim.values.case_region import Plane, Region
+from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE, MuscleModuli, TissueModuli
+from cmfsim.values.solver_options import CONTACTS, SolverOptions
+from cmfsim.values.tissue_data import MIXINGS, TissueData
+
+__all__ = [
+    "band_of",
+    "checked_name",
+    "file_of",
+    "file_or_none",
+    "image_of",
+    "landmarks_of",
+    "lips_of",
+    "mesh_of",
+    "muscles_of",
+    "node_kinds_of",
+    "output_folder",
+    "plane_of",
+    "postoperative_of",
+    "region_of",
+    "solver_of",
+    "stated_frame",
+    "surfaces_of",
+    "tissue_of",
+]
+
+# What [muscles] and each table below [muscles.moduli] may set, as `MuscleModuli` has it.
+MODULI = ("young_along", "young_across", "poisson")
+# Wider, mm, than any muscle of the face is thick.
+MOST_BLUR = 30.0
+# Points in a tet that a muscle's surface crosses.
+SAMPLES = (1, 100_000)
+# Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
+EDGE_LENGTHS = (0.3, 30.0)
+MOST_CLEFT = 20.0
+# How far the seam between the lips may go on past the teeth, and lips may reach from it, mm.
+MOST_LIP_DEPTH = 20.0
+LIP_HEIGHTS = (3.0, 30.0)
+# Coverages of a band that a calibration of up to a thousand cases can give.
+COVERAGES = (0.001, 0.999)
+# CT values above this are clipped, HU.
+MOST_HU = 4000.0
+# What takes the values of an image to HU: images from 0 to 1 have a slope of some 4000.
+MOST_SLOPE = 1e5
+MOST_INTERCEPT = 1e5
+# Grid spacings that a head can be worked on at, mm.
+WORKING_SPACINGS = (0.2, 5.0)
+
+
+def stated_frame(table: Table) -> str | None:
+    """The frame of numbers or files, where the case states it."""
+    return table.text("frame", choices=FRAMES) if "frame" in table else None
+
+
+def file_of(table: Table, key: str, folder: Path) -> Path:
+    """A path to read; the case is its owner's, so that it may lead to images kept elsewhere."""
+    return table.path(key, folder)
+
+
+def file_or_none(table: Table, key: str, folder: Path) -> Path | None:
+    """The file that a key names, or None where the key is missing."""
+    return file_of(table, key, folder) if key in table else None
+
+
+def output_folder(table: Table, folder: Path) -> Path:
+    """The folder to write to, below that of the case: a case never writes anywhere else."""
+    name = table.text("folder", "out")
+    relative = PurePosixPath(name)
+    plain = not relative.is_absolute() and ".." not in relative.parts
+    if not plain or any(c in name for c in "\\:\0") or relative == PurePosixPath():
+        table.fail(
+            "folder",
+            f"is {name!r}: give a folder below the case's own (for any other: cmfsim build -o)",
+        )
+    try:
+        is_there(folder / relative)
+    except CaseInputError as error:
+        table.fail("folder", f"names {error}")
+    return folder / relative
+
+
+def image_of(table: Table, folder: Path) -> CaseImage:
+    """The image of [image], with how its values become HU."""
+    table.only(
+        "file",
+        "skin_threshold",
+        "bone_threshold",
+        "metal_threshold",
+        "working_spacing",
+        "series",
+        "rescale",
+    )
+    skin = table.number("skin_threshold", "HU", low=-1024.0, high=3071.0)
+    bone = table.number("bone_threshold", "HU", low=-1024.0, high=3071.0)
+    metal = table.number("metal_threshold", "HU", low=-1024.0, high=MOST_HU)
+    if skin is not None and bone is not None and skin >= bone:
+        table.fail(
+            "skin_threshold", f"is {skin:g}, bone_threshold is {bone:g}: the former must be smaller"
+        )
+    if bone is not None and metal is not None and bone >= metal:
+        table.fail(
+            "bone_threshold",
+            f"is {bone:g}, metal_threshold is {metal:g}: the former must be smaller",
+        )
+    low, high = WORKING_SPACINGS
+    spacing = table.number("working_spacing", "mm", low=low, high=high)
+    path = file_of(table, "file", folder)
+    return CaseImage(path, skin, bone, spacing, metal, _dicom_series(table), _rescale(table))
+
+
+def _rescale(table: Table) -> tuple[float, float] | None:
+    """Slope and intercept from the values of an image to HU."""
+    if "rescale" not in table:
+        return None
+    given = table.plain("rescale")
+    if not isinstance(given, list) or len(given) != 2 or any(isinstance(n, str) for n in given):
+        table.fail("rescale", f"is {given!r}: [slope, intercept] is needed, such as [1, -1024]")
+    slope, intercept = (float(n) for n in given)
+    if not 0.0 < slope <= MOST_SLOPE or abs(intercept) > MOST_INTERCEPT:
+        table.fail(
+            "rescale",
+            f"is [{slope:g}, {intercept:g}]: the slope must be above 0 and at most {MOST_SLOPE:g}, "
+            f"the intercept within ±{MOST_INTERCEPT:g}",
+        )
+    return slope, intercept
+
+
+def _dicom_series(table: Table) -> str | None:
+    """The DICOM series that is meant, by its number or UID."""
+    if "series" not in table:
+        return None
+    given = table.plain("series")
+    if isinstance(given, bool) or not isinstance(given, int | str) or not str(given).strip():
+        table.fail("series", f'is {given!r}: the number or UID of a DICOM series, such as "3"')
+    return str(given)
+
+
+def surfaces_of(table: Table, folder: Path) -> CaseSurfaces:
+    """The skin and the bones of [surfaces], with their unit and frame."""
+    table.only("skin", "bones", "units", "frame")
+    bones = table.table("bones")
+    names = list(bones)
+    if not names:
+        table.fail(
+            "bones" if "bones" in table else None,
+            'names no bone: add a line such as cranium = "file.ply"',
+        )
+    return CaseSurfaces(
+        skin=file_of(table, "skin", folder),
+        bones={checked_name(bones, name, name): file_of(bones, name, folder) for name in names},
+        units=table.text("units", "mm", tuple(UNITS)),
+        frame=stated_frame(table),
+    )
+
+
+def checked_name(table: Table, key: str, name: str) -> str:
+    """A name that can stand in a file name: of a bone or segment."""
+    if not name or not all(c.isalnum() or c in "_-+" for c in name) or len(name) > 64:
+        table.fail(
+            key, f"is not a valid name ({name!r}): letters, digits, '_', '-' and '+', 64 at most"
+        )
+    return name
+
+
+def landmarks_of(table: Table, folder: Path) -> CaseLandmarks:
+    """The files of [landmarks], and whether missing ones are to be found."""
+    table.only("skull", "skin", "frame", "automatic", "templates")
+    return CaseLandmarks(
+        file_or_none(table, "skull", folder),
+        file_or_none(table, "skin", folder),
+        stated_frame(table),
+        _automatic(table),
+        _template_folders(table, folder),
+    )
+
+
+def _automatic(table: Table) -> bool | str:
+    """Whether landmarks are found: true, false, or those that the files lack."""
+    given = table.plain("automatic") if "automatic" in table else True
+    if not isinstance(given, bool) and given != "missing":
+        table.fail("automatic", f'is {given!r}: true, false or "missing" is needed')
+    return given if isinstance(given, bool) else "missing"
+
+
+def _template_folders(table: Table, folder: Path) -> tuple[Path, ...]:
+    """The folders of heads whose landmarks are known."""
+    if "templates" not in table:
+        return ()
+    given = table.plain("templates")
+    if not isinstance(given, list) or not all(isinstance(n, str) and n.strip() for n in given):
+        table.fail("templates", f'is {given!r}: a list of folders, such as ["heads/a", "heads/b"]')
+    return tuple(folder / name for name in given)
+
+
+def plane_of(table: Table, key: str) -> Plane:
+    """The plane of a table with a point and a normal."""
+    plane = table.table(key).only("point", "normal")
+    point, normal = plane.vector("point"), plane.vector("normal")
+    if point is None or normal is None:
+        table.fail(key, "needs point = [x, y, z] and normal = [x, y, z]")
+    with table.at(key):
+        return Plane(point, normal)
+
+
+def region_of(table: Table) -> Region:
+    """The part of the head that is meshed, from [region]."""
+    table.only("posterior_plane", "posterior_depth", "lower", "upper")
+    if "posterior_plane" in table and "posterior_depth" in table:
+        table.fail("posterior_depth", "is given together with posterior_plane: give one of them")
+    plane = plane_of(table, "posterior_plane") if "posterior_plane" in table else None
+    with table.at("lower"):
+        return Region(
+            plane,
+            table.number("posterior_depth", "mm", low=-200.0, high=200.0),
+            table.number("lower", "mm"),
+            table.number("upper", "mm"),
+        )
+
+
+def mesh_of(table: Table, folder: Path) -> CaseMesh:
+    """The edge lengths of [mesh], or its own mesh."""
+    table.only("edge_length", "refine", "cleft", "parting", "file")
+    low, high = EDGE_LENGTHS
+    edge_length = table.number("edge_length", "mm", low=low, high=high)
+    cleft = table.number("cleft", "mm", low=0.0, high=MOST_CLEFT)
+    parting = table.table("parting").only("surface") if "parting" in table else None
+    default = CaseMesh()
+    return CaseMesh(
+        default.edge_length if edge_length is None else edge_length,
+        table.flag("refine", default=default.refine),
+        default.cleft if cleft is None else cleft,
+        None if parting is None else file_of(parting, "surface", folder),
+        file_or_none(table, "file", folder),
+    )
+
+
+def lips_of(document: Table, folder: Path) -> CaseLips:
+    """Whether and where lips are separated; a seam is a way to find it, or a surface."""
+    table = document.table("lips").only("contact", "seam", "depth", "height")
+    default = CaseLips()
+    contact = table.flag("contact", default=default.contact)
+    seam: Path | str = default.seam
+    if "seam" in table:
+        seam = table.text("seam")
+        if seam not in LIP_SEAMS:
+            seam = file_of(table, "seam", folder)
+            if "parting" in document.table("mesh"):
+                table.fail("seam", "is a surface, as is parting in [mesh]: give one of them")
+    depth = table.number("depth", "mm", low=0.0, high=MOST_LIP_DEPTH)
+    low, high = LIP_HEIGHTS
+    height = table.number("height", "mm", low=low, high=high)
+    return CaseLips(
+        contact,
+        seam,
+        default.depth if depth is None else depth,
+        default.height if height is None else height,
+    )
+
+
+def band_of(document: Table, folder: Path) -> CaseBand:
+    """Whether a band is asked for, and by which calibration."""
+    table = document.table("band").only("calibration", "coverage", "group")
+    low, high = COVERAGES
+    coverage = table.number("coverage", low=low, high=high)
+    return CaseBand(
+        asked="band" in document,
+        calibration=file_or_none(table, "calibration", folder),
+        coverage=CaseBand().coverage if coverage is None else coverage,
+        group=table.text("group") if "group" in table else None,
+    )
+
+
+def node_kinds_of(table: Table) -> dict[str, Any]:
+    """The options by name; regions as plain tables."""
+    options = {key: table.plain(key) for key in table if key != "regions"}
+    if "regions" in table:
+        options["regions"] = [_plain(region) for region in table.tables("regions")]
+    return options
+
+
+def _plain(table: Table) -> dict[str, Any]:
+    return {key: table.plain(key) for key in table}
+
+
+def tissue_of(table: Table) -> TissueData | None:
+    """The fat that the table states; None if it states none."""
+    table.only("preset", "young", "poisson")
+    young = table.number("young", "MPa", low=YOUNG_RANGE[0], high=YOUNG_RANGE[1])
+    poisson = table.number("poisson", above=-1.0, high=0.4999)
+    if "preset" in table:
+        if young is not None or poisson is not None:
+            table.fail("preset", "is given together with young or poisson: give one or the other")
+        with table.at("preset"):
+            return TissueData("preset", preset=table.text("preset"), fraction=0.0)
+    if young is None and poisson is None:
+        return None
+    if young is None or poisson is None:
+        table.fail(None, "needs both young (MPa) and poisson, or neither")
+    return TissueData("isotropic", young=young, poisson=poisson)
+
+
+def muscles_of(table: Table, folder: Path) -> CaseMuscles:
+    """A template's name is that of one in the package; a path leads to a folder."""
+    settings = ("template", "smoothing", "fit", "blur", "preset", "mixing", "samples", "seed")
+    table.only(*settings, *MODULI, "moduli")
+    default = CaseMuscles()
+    template: Path | str = table.text("template", str(default.template))
+    if template != default.template:
+        template = file_of(table, "template", folder)
+    smoothing = table.number("smoothing", low=0.0, high=1e6)
+    blur = table.number("blur", "mm", low=0.0, high=MOST_BLUR)
+    return CaseMuscles(
+        template,
+        default.smoothing if smoothing is None else smoothing,
+        table.text("preset", default.preset, PRESETS),
+        table.text("mixing", default.mixing, MIXINGS),
+        table.whole("samples", default.samples, *SAMPLES),
+        table.whole("seed", default.seed, 0, 2**63 - 1),
+        _muscle_moduli(table),
+        table.flag("fit", default=default.fit),
+        default.blur if blur is None else blur,
+    )
+
+
+def _muscle_moduli(table: Table) -> TissueModuli:
+    """Moduli of all muscles from the table itself, of single ones from those below `moduli`."""
+    each = table.table("moduli")
+
+    def given(table: Table) -> MuscleModuli:
+        low, high = YOUNG_RANGE
+        along, across = (table.number(key, "MPa", low=low, high=high) for key in MODULI[:2])
+        poisson = table.number("poisson", above=-1.0, high=MOST_POISSON)
+        return MuscleModuli(along, across, poisson)
+
+    moduli = TissueModuli(
+        muscle=given(table), muscles={name: given(each.table(name).only(*MODULI)) for name in each}
+    )
+    with table.at("moduli" if "moduli" in table else None):
+        moduli.resolved(table.text("preset", CaseMuscles().preset, PRESETS))
+    return moduli
+
+
+def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
+    """The face and bones after the operation, from [postoperative]."""
+    flags = ("aligned", "verified")
+    table.only("skin", "image", "landmarks", "bones", "units", "frame", "series", *flags)
+    bones = table.table("bones")
+    if "skin" in table and "image" in table:
+        table.fail("image", "is given together with skin: give one of them")
+    if "image" in table and "bones" in table:
+        table.fail(
+            "bones",
+            "is given together with image, from which bones are segmented: give one of them",
+        )
+    if "series" in table and "image" not in table:
+        table.fail("series", "chooses among the DICOM series of an image, but there is no image")
+    if "skin" not in table and "image" not in table and not list(bones):
+        table.fail(None, "needs skin, image or bones")
+    return CasePostoperative(
+        file_or_none(table, "skin", folder),
+        file_or_none(table, "image", folder),
+        file_or_none(table, "landmarks", folder),
+        {checked_name(bones, name, name): file_of(bones, name, folder) for name in bones},
+        table.flag("aligned", default=True),
+        table.text("units", "mm", tuple(UNITS)),
+        stated_frame(table),
+        _dicom_series(table),
+        table.flag("verified", default=False),
+    )
+
+
+def solver_of(table: Table) -> SolverOptions:
+    """The options of [solver]."""
+    names = tuple(SolverOptions().as_dict())
+    table.only(*names)
+    given: dict[str, Any] = {}
+    for key in table:
+        if key == "method":
+            given[key] = table.text(key, choices=METHODS)
+        elif key == "contact":
+            given[key] = table.text(key, choices=CONTACTS)
+        elif key == "element":
+            given[key] = table.text(key, choices=ELEMENTS)
+        elif key == "kinematics":
+            given[key] = table.text(key, choices=KINEMATICS)
+        else:
+            given[key] = table.plain(key)
+            with table.at(key):
+                SolverOptions(**{key: given[key]})
+    return SolverOptions(**given)

@@ -1,0 +1,392 @@
+"""Muscle templates on disk: a folder with `template.toml`, or one `.npz` archive.
+
+A survey reads as much as it can and lists everything that is wrong; reading refuses at the first.
+"""
+
+import contextlib
+import glob
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.io.cases.tables import Table, read_tables
+from cmfsim.io.cases.template_archives import (
+    TEMPLATE_FORMAT,
+    read_template_archive,
+    write_template_archive,
+)
+from cmfsim.io.files.leftovers import abandoned, temporary_folder
+from cmfsim.io.files.reading_writing import FORMAT_VERSION, beside, is_there, named
+from cmfsim.io.landmarks.curves import read_curves, write_curves
+from cmfsim.io.landmarks.landmark_files import read_landmark_file, write_landmarks
+from cmfsim.io.surfaces import read_surface, write_surface
+from cmfsim.values.case_parts import FRAMES, UNITS
+from cmfsim.values.finding import Finding
+from cmfsim.values.musculature import MOST_BOXES, MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
+from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.template import TemplateData
+
+__all__ = ["TEMPLATE_FILE", "TemplateSurvey", "read_template", "survey_template", "write_template"]
+
+TEMPLATE_FILE = "template.toml"
+KEYS = (
+    "format",
+    "version",
+    "name",
+    "licence",
+    "attribution",
+    "source",
+    "skull",
+    "units",
+    "frame",
+    "landmarks",
+    "muscles",
+)
+MUSCLE_KEYS = ("name", "side", "kind", "file", "boxes", "course", "concepts")
+# File and line at the start of an error's text.
+PLACE = re.compile(r"([^\s:]+(?::\d+)?): (.*)", re.DOTALL)
+MISSING = "file-missing"
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateSurvey:
+    """What a template on disk holds, and what is wrong with it; no template if it cannot be one."""
+
+    template: TemplateData | None
+    findings: tuple[Finding, ...]
+
+
+def read_template(path: str | os.PathLike[str]) -> TemplateData:
+    """The template of a folder with `template.toml`, or of an `.npz` archive.
+
+    Raises
+    ------
+    FileNotFoundError
+        The folder or archive, or a file that it names, does not exist.
+    CaseError
+        (also `ValueError`) Anything else: file, line and key, and how many more there are.
+    """
+    survey = survey_template(path)
+    errors = [f for f in survey.findings if f.severity == "error"]
+    if survey.template is None or errors:
+        first = errors[0]
+        more = f" (and {len(errors) - 1} more: cmfsim template check)" if len(errors) > 1 else ""
+        text = f"{first.where}: {first.what}{more}"
+        raise FileNotFoundError(text) if first.code == MISSING else CaseInputError(text)
+    return survey.template
+
+
+def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
+    """What a template on disk holds, and everything that keeps it from being read.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no such folder or archive.
+    """
+    path = Path(path)
+    if not is_there(path):
+        raise FileNotFoundError(f"{path}: no such template")
+    gathered = _Gathered(path.name)
+    template: TemplateData | None = None
+    if path.is_dir():
+        template = _survey_folder(path, gathered)
+    else:
+        with gathered.at("create it again"), named(path):
+            template = read_template_archive(path)
+    if gathered.has_error:
+        template = None
+    elif template is not None and gathered.findings:
+        template = _with_findings(template, gathered.findings)
+    return TemplateSurvey(template, tuple(gathered.findings))
+
+
+def write_template(
+    path: str | os.PathLike[str],
+    template: TemplateData,
+    report: Mapping[str, Any] | None = None,
+) -> None:
+    """Writes a template: a folder, or one archive if the name ends in `.npz`.
+
+    A report is written beside it in the folder, as `report.json`; an archive has no place for one.
+
+    A folder is written under another name first and takes its place whole. A folder that is there
+    is replaced if it holds a template and nothing else.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) The folder holds files that are not of a template.
+    OSError
+        The place cannot be written to.
+    """
+    path = Path(path)
+    if path.suffix == ".npz":
+        write_template_archive(path, template)
+        return
+    with _replacing_folder(path) as fresh:
+        _write_files(fresh, template)
+        if report is not None:
+            text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+            (fresh / "report.json").write_text(text + "\n", encoding="utf-8", newline="\n")
+
+
+class _Gathered:
+    """Findings in the order in which they turn up."""
+
+    def __init__(self, where: str) -> None:
+        self.findings: list[Finding] = []
+        self.where = where
+
+    @property
+    def has_error(self) -> bool:
+        return any(finding.severity == "error" for finding in self.findings)
+
+    def at(self, fix: str) -> "_Attempt":
+        """A context that turns an error into a finding with its place, and goes on."""
+        return _Attempt(self, fix)
+
+
+class _Attempt:
+    """The context of `_Gathered.at`."""
+
+    def __init__(self, gathered: _Gathered, fix: str) -> None:
+        self._gathered, self._fix = gathered, fix
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> bool:
+        if not isinstance(error, CmfsimError | OSError | ValueError):
+            return False
+        found = PLACE.fullmatch(str(error))
+        where, what = (found[1], found[2]) if found else (self._gathered.where, str(error))
+        self._gathered.findings.append(
+            Finding(MISSING, what, where=where)
+            if isinstance(error, FileNotFoundError)
+            else Finding("template-unusable", what, where=where, fix=self._fix)
+        )
+        return True
+
+
+def _with_findings(template: TemplateData, findings: list[Finding]) -> TemplateData:
+    given = {name: getattr(template, name) for name in TemplateData.__dataclass_fields__}
+    return TemplateData(**{**given, "findings": (*template.findings, *findings)})
+
+
+def _survey_folder(folder: Path, gathered: _Gathered) -> TemplateData | None:
+    table: Table | None = None
+    with gathered.at("correct the line"):
+        table = read_tables(folder / TEMPLATE_FILE)
+    if table is None:
+        return None
+    given: dict[str, Any] = {}
+    with gathered.at("correct the line"):
+        table.only(*KEYS)
+    with gathered.at(f'write format = "{TEMPLATE_FORMAT}"'):
+        _check_format(table)
+    with gathered.at('state its terms of use: licence = "…"'):
+        given["licence"] = table.text("licence")
+    with gathered.at("correct the line"):
+        given["name"] = table.text("name")
+        given.update({key: table.text(key) for key in ("attribution", "source") if key in table})
+    units, frame = "mm", "LPS"
+    with gathered.at("correct the line"):
+        units = table.text("units", units, tuple(UNITS))
+        frame = table.text("frame", frame, FRAMES)
+    with gathered.at("repair the skull reference"):
+        given["skull"] = _surface(table, "skull", folder, units, frame)
+    with gathered.at("correct the landmarks"):
+        landmarks = table.table("landmarks").only("file", "definitions")
+        definitions = landmarks.table("definitions")
+        given["definitions"] = {name: definitions.text(name) for name in definitions}
+        found = read_landmark_file(_file(landmarks, "file", folder))
+        gathered.findings += found.findings
+        given["landmarks"] = found.points
+    muscles: list[MuscleSurface] = []
+    concepts: dict[str, tuple[str, ...]] = {}
+    entries: list[Table] = []
+    with gathered.at("write [[muscles]] before each muscle"):
+        entries = table.tables("muscles")
+    for entry in entries:
+        with gathered.at("correct this muscle's table or file"):
+            muscle = _muscle(entry, folder, units, frame)
+            muscles.append(muscle)
+            concepts[muscle.name] = _texts(entry, "concepts")
+    if gathered.has_error:
+        return None
+    with gathered.at("correct the template"):
+        return TemplateData(
+            muscles=tuple(muscles), concepts={k: v for k, v in concepts.items() if v}, **given
+        )
+    return None
+
+
+def _check_format(table: Table) -> None:
+    found = table.text("format")
+    if found != TEMPLATE_FORMAT:
+        table.fail("format", f"is {found!r}: {TEMPLATE_FORMAT!r} is needed")
+    version = table.need("version", f": write version = {FORMAT_VERSION}")
+    if isinstance(version, bool) or version != FORMAT_VERSION:
+        table.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
+
+
+def _file(table: Table, key: str, folder: Path) -> Path:
+    """A file inside the template's folder: a template may come from a stranger."""
+    name = table.text(key)
+    try:
+        path = beside(folder, key, name)
+        there = is_there(path) and path.is_file()
+    except CaseInputError:
+        table.fail(key, f"is {name!r}: a file inside the template's folder is needed")
+    if not there:
+        place = f"{TEMPLATE_FILE}:{table.line(key)}"
+        raise FileNotFoundError(f"{place}: {key} names {name!r}: no such file")
+    return path
+
+
+def _surface(table: Table, key: str, folder: Path, units: str, frame: str) -> SurfaceData:
+    return read_surface(_file(table, key, folder), units=units, frame=frame)
+
+
+def _muscle(table: Table, folder: Path, units: str, frame: str) -> MuscleSurface:
+    table.only(*MUSCLE_KEYS)
+    boxes = table.number("boxes", low=1, high=MOST_BOXES)
+    if boxes is not None and boxes != int(boxes):
+        table.fail("boxes", f"is {boxes:g}: a whole number is needed")
+    name = table.text("name")
+    side = table.text("side", choices=MUSCLE_SIDES)
+    kind = table.text("kind", choices=MUSCLE_KINDS)
+    course = read_curves(_file(table, "course", folder)) if "course" in table else ()
+    surface = _surface(table, "file", folder, units, frame)
+    with table.at(None):
+        return MuscleSurface(
+            name, side, surface, kind, None if boxes is None else int(boxes), course
+        )
+
+
+def _texts(table: Table, key: str) -> tuple[str, ...]:
+    if key not in table:
+        return ()
+    value = table.plain(key)
+    if not isinstance(value, list) or not all(isinstance(entry, str) for entry in value):
+        table.fail(key, f"is {value!r}: a list of texts is needed")
+    return tuple(value)
+
+
+def _write_files(folder: Path, template: TemplateData) -> None:
+    """Writes the files of a template into a folder that is there."""
+    skull, landmarks = "skull.ply", "skull.mrk.json"
+    write_surface(folder / skull, template.skull)
+    write_landmarks(folder / landmarks, template.landmarks)
+    lines = [
+        f'format = "{TEMPLATE_FORMAT}"',
+        f"version = {FORMAT_VERSION}",
+        *(
+            f"{key} = {_toml_text(getattr(template, key))}"
+            for key in ("name", "licence", "attribution", "source")
+            if getattr(template, key)
+        ),
+        f'skull = "{skull}"',
+        "",
+        "[landmarks]",
+        f'file = "{landmarks}"',
+    ]
+    if template.definitions:
+        lines += ["", "[landmarks.definitions]"]
+        lines += [
+            f"{_toml_text(name)} = {_toml_text(where)}"
+            for name, where in template.definitions.items()
+        ]
+    for muscle in template.muscles:
+        file, course = f"muscle-{muscle.name}.ply", f"course-{muscle.name}.mrk.json"
+        lines += [
+            "",
+            "[[muscles]]",
+            f'name = "{muscle.name}"',
+            f'side = "{muscle.side}"',
+            f'kind = "{muscle.kind}"',
+            f'file = "{file}"',
+        ]
+        write_surface(folder / file, muscle.surface)
+        if muscle.boxes is not None:
+            lines.append(f"boxes = {muscle.boxes}")
+        if muscle.course:
+            lines.append(f'course = "{course}"')
+            write_curves(folder / course, muscle.course)
+        if concepts := template.concepts.get(muscle.name):
+            lines.append(f"concepts = [{', '.join(_toml_text(c) for c in concepts)}]")
+    (folder / TEMPLATE_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def _toml_text(text: str) -> str:
+    """A text as a basic string of TOML, whose escapes are JSON's, with DEL escaped too."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+@contextlib.contextmanager
+def _replacing_folder(folder: Path) -> Iterator[Path]:
+    """A new folder beside `folder`, which takes its place when all went well.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) `folder` is a file, or holds what no template is written as.
+    """
+    folder = Path.cwd() / folder
+    _refuse_foreign(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    prefix = f".{folder.name}.writing-"
+    for left in abandoned(folder.parent, f"{glob.escape(prefix)}*"):
+        # Killed between the two renames below: the old folder comes back.
+        if (left / "old").exists() and not folder.exists():
+            (left / "old").replace(folder)
+        shutil.rmtree(left, ignore_errors=True)
+    with temporary_folder(folder.parent, prefix) as fresh:
+        try:
+            new, old = fresh / "new", fresh / "old"
+            new.mkdir()
+            yield new
+            if folder.exists():
+                folder.replace(old)
+            try:
+                new.replace(folder)
+            except BaseException:
+                if old.exists():
+                    old.replace(folder)
+                raise
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+
+
+# What templates and their reports are written as.
+TEMPLATE_FILES = re.compile(
+    r"template\.toml|skull\.ply|skull\.mrk\.json|report\.json|muscles\.png|"
+    r"muscle-[A-Za-z0-9_+-]+\.ply|course-[A-Za-z0-9_+-]+\.mrk\.json"
+)
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Refuses to replace what somebody else has put there."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise CaseInputError(f"{folder.name}: is a file, but a folder is to be written there")
+    foreign = sorted(p.name for p in folder.iterdir() if not TEMPLATE_FILES.fullmatch(p.name))
+    if foreign:
+        raise CaseInputError(
+            f"{folder.name}: holds {foreign[0]!r} ({len(foreign)} such), which is not part of a "
+            "template: choose another folder, or move that file away"
+        )

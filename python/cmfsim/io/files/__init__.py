@@ -1,0 +1,1 @@
+"""What every reader and writer of files stands on: safe writing, documents, text, archives."""

@@ -1,0 +1,1 @@
+"""DICOM: headers, slices, and the series that they make up."""

@@ -1,0 +1,365 @@
+"""A CT from a folder of DICOM files, or a file of several frames: which series is meant."""
+
+import contextlib
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim.errors import ImageInputError
+from cmfsim.io.images.dicom.headers import DicomHeader, dicom_header
+from cmfsim.io.images.dicom.slices import counted, is_localizer, listed, slices_of
+from cmfsim.io.images.dicom.stack import volume_of
+from cmfsim.io.images.image_headers import check_shape
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+
+__all__ = ["dicom_files", "dicom_places", "read_dicom_file", "read_dicom_folder"]
+
+# A folder with more files is not one patient's scan.
+MOST_FILES = 20_000
+# How far below a folder its series go on.
+MOST_DEPTH = 6
+# Bytes before the mark of DICOM.
+PREAMBLE = 128
+# A series of fewer slices is a scout or a sample, no second volume that might be meant.
+LEAST_VOLUME = 10
+# The largest series is meant where no other has more than this part of its slices.
+CLEARLY_LARGEST = 0.5
+# What a DICOMDIR is.
+DIRECTORY = "1.2.840.10008.1.3.10"
+
+
+@dataclass(frozen=True)
+class Series:
+    """The images of one series in a folder."""
+
+    uid: str
+    headers: tuple[DicomHeader, ...]
+
+    @property
+    def first(self) -> DicomHeader:
+        """The file that describes the series."""
+        return self.headers[0]
+
+    @property
+    def modality(self) -> str:
+        """The modality, such as "CT" or "MR"; empty where it is not stated."""
+        return next((m for h in self.headers if (m := h.text("modality"))), "")
+
+    @property
+    def count(self) -> int:
+        """Its slices."""
+        return sum(h.count for h in self.headers)
+
+    def described(self) -> str:
+        """Number, description, slices and spacing, as a person tells series apart."""
+        number = self.first.text("series_number") or "-"
+        parts = [f"number {number}", f"{self.count} slices"]
+        if (gap := self._gap()) is not None:
+            parts.append(f"{gap:.3g} mm apart")
+        if self.modality not in {"", "CT"}:
+            parts.append(self.modality)
+        name = self.first.text("series_description") or "no description"
+        return f"{name!r} ({', '.join(parts)}; {self.uid})"
+
+    def _gap(self) -> float | None:
+        places = [h.numbers("position", 3) for h in self.headers]
+        across = self.first.numbers("orientation", 6)
+        known = [p for p in places if p is not None]
+        if across is None or len(known) < 2:
+            return None
+        heights = np.sort(np.array(known) @ np.cross(across[:3], across[3:]))
+        return float(np.median(np.diff(heights)))
+
+
+def read_dicom_folder(
+    folder: Path, series: str | None = None
+) -> tuple[ImageData, str, tuple[Finding, ...]]:
+    """The CT of a folder, its modality, and findings on how it lay there.
+
+    Parameters
+    ----------
+    folder : Path
+    series : str, optional
+        UID or number of the series that is meant.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) No CT, several that may be meant, slices that do not make a volume.
+    """
+    headers, findings = _headers(folder, series)
+    chosen, more = _chosen(folder, _series(headers), series)
+    findings += more
+    slices = [s for header in chosen.headers for s in slices_of(header)]
+    return volume_of(folder.name, slices, chosen.modality, findings)
+
+
+def read_dicom_file(path: Path) -> tuple[ImageData, str, tuple[Finding, ...]]:
+    """The CT of a DICOM file of several frames.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) No DICOM image, one slice, no CT, frames that do not make a volume.
+    """
+    header = dicom_header(path)
+    if header is None or not header.has_pixels:
+        raise ImageInputError(
+            f"{path.name}: is not a readable image; NRRD, NIfTI, MetaImage or DICOM is needed"
+        )
+    _check_modality(path.name, {header.text("modality")})
+    slices = slices_of(header)
+    if len(slices) < 2:
+        size = [int(header.tags.get(k, 0)) for k in ("columns", "rows")]
+        check_shape(path.name, [*size, 1])
+    return volume_of(path.name, slices, header.text("modality"), [])
+
+
+def _check_modality(name: str, found: set[str]) -> None:
+    if not found & {"", "CT"}:
+        raise ImageInputError(
+            f"{name}: DICOM modality is {', '.join(sorted(found))!r}: a CT is needed, because "
+            "thresholds are in HU"
+        )
+
+
+def dicom_files(folder: Path) -> list[Path]:
+    """The files that a folder of DICOM may be read from: its own, and DICOM files below it."""
+    own = sorted(p for p in folder.iterdir() if p.is_file())
+    return [*own, *(p for p in _below(folder) if _is_marked(p))]
+
+
+def dicom_places(folders: Sequence[Path]) -> list[tuple[Path, str | None]]:
+    """Where the images in some folders are read, and which series of a place is meant.
+
+    Folders that have parts of one series are one place: the folder that all of them lie in. The
+    series is None where the place holds nothing else.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        That directly hold DICOM files.
+    """
+    held = {folder: _series_in(folder) for folder in folders}
+    # A DICOMDIR alone is no image.
+    groups: list[tuple[list[Path], Counter[str]]] = []
+    for folder, counts in held.items():
+        if not counts:
+            continue
+        joined = [g for g in groups if set(g[1]) & set(counts) - {""}]
+        paths = [p for g in joined for p in g[0]]
+        groups = [g for g in groups if g not in joined]
+        groups.append(([*paths, folder], sum((g[1] for g in joined), counts)))
+    places: list[tuple[Path, str | None]] = []
+    for paths, counts in groups:
+        if len(paths) == 1:
+            places.append((paths[0], None))
+            continue
+        place = Path(os.path.commonpath(paths))
+        others = [f for f in held if held[f] and f not in paths and f.is_relative_to(place)]
+        largest = max(sorted(counts), key=lambda uid: counts[uid])
+        places.append((place, largest if others else None))
+    return sorted(places)
+
+
+def _series_in(folder: Path) -> Counter[str]:
+    """How many images of each series a folder holds; those that are damaged are found later."""
+    counts: Counter[str] = Counter()
+    for path in sorted(p for p in folder.iterdir() if p.is_file()):
+        with contextlib.suppress(ImageInputError, OSError):
+            header = dicom_header(path)
+            if header is not None and header.has_pixels:
+                counts[header.text("series_uid")] += 1
+    return counts
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    """The plain files in the folders below a folder, in a fixed order; hidden ones left out."""
+    for place, folders, names in os.walk(folder):
+        here = Path(place)
+        deep = len(here.relative_to(folder).parts) >= MOST_DEPTH
+        folders[:] = [] if deep else sorted(f for f in folders if f[0] != ".")
+        if here != folder:
+            yield from (p for name in sorted(names) if (p := here / name).is_file())
+
+
+def _is_marked(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(PREAMBLE + 4)[PREAMBLE:] == b"DICM"
+
+
+def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[Finding]]:
+    """The DICOM images of a folder, by file name, and what else is there.
+
+    A series goes on in folders below: scanners and disks write some hundred files to each. Of
+    these, only the series of the folder itself are taken, or the one that is asked for.
+    """
+    paths = sorted(p for p in folder.iterdir() if p.is_file())
+    _check_number(folder, len(paths))
+    headers, others = [], []
+    for path in paths:
+        header = dicom_header(path)
+        if header is None:
+            others.append(path.name)
+        elif _is_image(header):
+            headers.append(header)
+    below, damaged = _headers_below(folder, {*map(_key, headers)}, wanted)
+    if not headers and damaged:
+        raise ImageInputError(damaged[0])
+    findings = _below_findings(folder, headers, below)
+    headers += below
+    if not headers:
+        raise ImageInputError(
+            f"{folder.name}: there is no DICOM image in the folder or below it "
+            f"({len(paths)} files in it)"
+        )
+    if damaged:
+        findings.append(
+            Finding(
+                "dicom-skipped",
+                f"skipped {counted(len(damaged), 'file')} in folders below: {damaged[0]}",
+                severity="warning",
+                where=folder.name,
+            )
+        )
+    missing = [p.name for p in sorted(folder.iterdir()) if p.is_symlink() and not p.exists()]
+    if missing:
+        findings.append(
+            Finding(
+                "dicom-skipped",
+                f"skipped {counted(len(missing), 'link')} to files that are not here: "
+                f"{listed(missing)}",
+                severity="warning",
+                where=folder.name,
+                why="slices at the ends of a series are not missed when they are absent",
+                fix="fetch the files (with DataLad: datalad get)",
+            )
+        )
+    if others:
+        findings.append(
+            Finding(
+                "dicom-skipped",
+                f"skipped {counted(len(others), 'file')} not in DICOM: {listed(others)}",
+                severity="note",
+                where=folder.name,
+            )
+        )
+    return headers, findings
+
+
+def _headers_below(
+    folder: Path, own: set[tuple[str, str]], wanted: str | None
+) -> tuple[list[DicomHeader], list[str]]:
+    """The images in folders below that belong to a folder, and why others cannot be read."""
+    headers, damaged = list[DicomHeader](), list[str]()
+    for path in _below(folder):
+        if not _is_marked(path):
+            continue
+        _check_number(folder, len(headers))
+        try:
+            header = dicom_header(path)
+        except ImageInputError as error:
+            damaged.append(str(error))
+            continue
+        if header is None or not _is_image(header):
+            continue
+        is_wanted = wanted is not None and _is_meant(header, wanted)
+        if not own or is_wanted or (header.text("series_uid") and _key(header) in own):
+            headers.append(header)
+    return headers, damaged
+
+
+def _below_findings(
+    folder: Path, own: list[DicomHeader], below: list[DicomHeader]
+) -> list[Finding]:
+    places = Counter(h.path.parent.relative_to(folder).as_posix() for h in below)
+    if len(places) + bool(own) < 2:
+        return []
+    parts = [f"{name} ({n})" for name, n in sorted(places.items())]
+    return [
+        Finding(
+            "dicom-folders",
+            f"images were also read from folders below: {listed(parts)}",
+            where=folder.name,
+        )
+    ]
+
+
+def _check_number(folder: Path, count: int) -> None:
+    if count > MOST_FILES:
+        raise ImageInputError(
+            f"{folder.name}: holds {count} files, more than {MOST_FILES}: name the folder of one "
+            "series"
+        )
+
+
+def _is_image(header: DicomHeader) -> bool:
+    return header.has_pixels and header.text("sop_class") != DIRECTORY
+
+
+def _key(header: DicomHeader) -> tuple[str, str]:
+    """What images of one series share: slices of several modalities under one UID are several."""
+    return header.text("series_uid"), header.text("modality")
+
+
+def _is_meant(header: DicomHeader, wanted: str) -> bool:
+    """Whether an image is of the series of a UID or number."""
+    return wanted.strip() in {header.text("series_uid"), header.text("series_number").strip()}
+
+
+def _series(headers: list[DicomHeader]) -> list[Series]:
+    """The series of a folder."""
+    groups: dict[tuple[str, str], list[DicomHeader]] = {}
+    stated = {uid: modality for uid, modality in map(_key, headers) if modality}
+    for header in headers:
+        uid, modality = _key(header)
+        # A slice that states no modality has that of its series.
+        groups.setdefault((uid, modality or stated.get(uid, "")), []).append(header)
+    return [Series(uid, tuple(group)) for (uid, _), group in sorted(groups.items())]
+
+
+def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Series, list[Finding]]:
+    """The series that is meant: as asked for, or the CT that is clearly the largest."""
+    listed = "; ".join(s.described() for s in found)
+    how = 'write series = "NUMBER or UID" beside the folder in the case file, or keep one series'
+    how += " in the folder"
+    if wanted is not None:
+        meant = [s for s in found if _is_meant(s.first, wanted)]
+        if len(meant) != 1:
+            raise ImageInputError(
+                f"{folder.name}: series {wanted!r} was requested, which {len(meant)} of "
+                f"{len(found)} series have: {listed}"
+            )
+        _check_modality(folder.name, {meant[0].modality})
+        return meant[0], []
+    _check_modality(folder.name, {s.modality for s in found})
+    cts = [s for s in found if s.modality in {"", "CT"}]
+    volumes = [s for s in cts if not all(is_localizer(h) for h in s.headers)] or cts
+    volumes.sort(key=lambda s: (-s.count, s.uid))
+    first, rest = volumes[0], volumes[1:]
+    rivals = [s for s in rest if s.count > CLEARLY_LARGEST * first.count]
+    rivals += [
+        s
+        for s in rest
+        if s not in rivals
+        and s.count >= LEAST_VOLUME
+        and any(s.first.text(k) != first.first.text(k) for k in ("study_uid", "patient_id"))
+    ]
+    if rivals:
+        several = f"{len(rivals) + 1} CT series may be meant"
+        raise ImageInputError(f"{folder.name}: {several}; {how}: {listed}")
+    if len(found) == 1:
+        return first, []
+    finding = Finding(
+        "dicom-series",
+        f"{len(found)} series in the folder; the largest CT, {first.described()}, was chosen from: "
+        f"{listed}",
+        where=folder.name,
+        fix=how,
+    )
+    return first, [finding]

@@ -1,0 +1,276 @@
+"""Images in the formats that SimpleITK reads: NRRD, NIfTI, MetaImage and folders of DICOM."""
+
+import glob
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.errors import ImageError, ImageInputError, third_party
+from cmfsim.io.files.leftovers import abandoned, temporary_folder
+from cmfsim.io.files.reading_writing import is_there, utf8_path
+from cmfsim.io.images.dicom.series import read_dicom_file, read_dicom_folder
+from cmfsim.io.images.image_grids import aligned, shear_of, turn_of, upright
+from cmfsim.io.images.image_headers import KNOWN, ImageHeader, apart
+from cmfsim.io.images.metaimage import is_meta, meta_header
+from cmfsim.io.images.nifti import GZIP, is_nifti, read_nifti
+from cmfsim.io.images.nrrd import nrrd_header
+from cmfsim.processes.child import ReaderError, ReadLimits, read_in_child
+from cmfsim.values.finding import Finding
+from cmfsim.values.image_data import ImageData
+
+__all__ = ["ImageFile", "read_image", "read_image_file", "write_image"]
+
+# What is written; reading goes by content.
+SUFFIXES = (".nrrd", ".nii", ".nii.gz", ".mha")
+# Names of files that are no DICOM, whose content is none of their formats.
+OTHER_SUFFIXES = (".nrrd", ".nhdr", ".nii", ".gz", ".mha", ".mhd", ".hdr")
+# The ending of a file that holds header and voxels, by ITK's reader.
+ATTACHED = {"NrrdImageIO": ".nrrd", "MetaImageIO": ".mha"}
+# What tells formats apart.
+FIRST_BYTES = 1024
+# The header as read here and by ITK agree on the place of each corner to this, mm.
+READERS_AGREE = 0.1
+# Axes farther from a right angle than this are reported as sheared, degrees.
+SHEARED = 0.06
+# Copies of an image that reading it holds at once.
+COPIES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFile:
+    """An image with what was found on its file.
+
+    Attributes
+    ----------
+    image : ImageData
+        On an axis-aligned grid, LPS, mm.
+    modality : str
+        "CT", "MR", … of DICOM; empty where the file does not say it.
+    findings : tuple of Finding
+    """
+
+    image: ImageData
+    modality: str = ""
+    findings: tuple[Finding, ...] = ()
+
+
+def read_image(path: str | os.PathLike[str], *, series: str | None = None) -> ImageData:
+    """The image of a file or a DICOM folder, in LPS on an axis-aligned grid.
+
+    Parameters
+    ----------
+    path : path
+        NRRD, NIfTI, MetaImage, a DICOM file of several frames, or a folder of DICOM slices.
+    series : str, optional
+        UID or number of the DICOM series that is meant, where a folder holds several.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) Damaged, empty, not three-dimensional, one slice, colours, MR, slices
+        missing or at one place, several series that may be meant, a header that contradicts itself
+        or leads to files elsewhere.
+    FileNotFoundError
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> image = cmfsim.read_image("head.nii.gz")  # doctest: +SKIP
+    """
+    return read_image_file(path, series=series).image
+
+
+def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) -> ImageFile:
+    """The image of a file or a DICOM folder, with its modality and findings.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) As `read_image`.
+    FileNotFoundError
+    """
+    path = Path(path)
+    if not is_there(path, ImageInputError):
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.is_dir():
+        _simpleitk()
+        return ImageFile(*read_dicom_folder(path, series))
+    if series is not None:
+        raise ImageInputError(
+            f"{path.name}: series = {series!r} chooses among the series of a DICOM folder, but "
+            "this is a file: remove it, or give the folder"
+        )
+    with path.open("rb") as file:
+        begin = file.read(FIRST_BYTES)
+    if not begin:
+        raise ImageInputError(f"{path.name}: is empty")
+    _simpleitk()
+    # A DICOM file may begin with anything.
+    if begin[128:132] != b"DICM":
+        if begin.startswith(GZIP) or is_nifti(begin):
+            return _placed(path, *read_nifti(path))
+        if begin.startswith(b"NRRD000"):
+            return _read_file(path, nrrd_header(path))
+        if is_meta(begin):
+            return _read_file(path, meta_header(path))
+        if path.name.lower().endswith(OTHER_SUFFIXES):
+            raise ImageInputError(f"{path.name}: is not a readable image; {KNOWN}")
+    return ImageFile(*read_dicom_file(path))
+
+
+def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
+    """Writes an image to a file whose name ends in .nrrd, .nii, .nii.gz or .mha.
+
+    It is written under another name first, so that a failure leaves an older file intact.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) Another ending.
+
+    Examples
+    --------
+    >>> import cmfsim, numpy as np
+    >>> image = cmfsim.ImageData(np.zeros((4, 4, 4), dtype=np.int16), spacing=(1, 1, 1))
+    >>> cmfsim.write_image(image, "image.nrrd")  # doctest: +SKIP
+    """
+    path = Path(path)
+    suffix = next((s for s in SUFFIXES if path.name.lower().endswith(s)), None)
+    if suffix is None:
+        raise ImageInputError(f"{path.name}: images are written as {', '.join(SUFFIXES)}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent}: no such folder")
+    itk = _simpleitk()
+    values = image.values
+    if values.dtype == bool:
+        values = values.astype(np.uint8)
+    elif values.dtype == np.float16:
+        values = values.astype(np.float32)
+    written = itk.GetImageFromArray(np.ascontiguousarray(values.T))
+    written.SetSpacing([float(s) for s in image.spacing])
+    written.SetOrigin([float(o) for o in image.lowest])
+    # ITK tells the format by the ending of a name, and opens the file itself: so it gets a folder.
+    prefix = f".{path.name}.writing-"
+    for left in abandoned(path.parent, f"{glob.escape(prefix)}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    with temporary_folder(path.parent, prefix) as fresh:
+        try:
+            with utf8_path(fresh) as plain:
+                itk.WriteImage(written, f"{plain}/image{suffix}", useCompression=True)
+            (fresh / f"image{suffix}").replace(path)
+        except RuntimeError as error:
+            raise ImageError(f"{path.name}: cannot be written ({_last_line(error)})") from error
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _simpleitk() -> Any:
+    return third_party("SimpleITK", "images are read", "imaging", ImageError)
+
+
+def _last_line(error: Exception) -> str:
+    """What ITK says of an error, without the places in its sources."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__
+
+
+def _read_file(path: Path, header: ImageHeader) -> ImageFile:
+    """The image of a file whose header was read."""
+    size = max(path.stat().st_size, header.bytes)
+    limits = ReadLimits(20.0 + size / 5e6, 4 * 2**30 + COPIES * size)
+    try:
+        with _unpacked(path, header) as readable, utf8_path(readable) as plain:
+            task = "cmfsim.io.images.image_reading:read_volume"
+            answer = read_in_child(task, limits, path=plain, reader=header.reader)
+    except ReaderError as error:
+        raise ImageInputError(f"{path.name}: {error}") from error
+    values = answer.arrays["values"].T
+    if values.shape != header.size:
+        raise ImageInputError(
+            f"{path.name}: its header states {header.size} voxels, and {values.shape} were read: "
+            "is it damaged?"
+        )
+    theirs = _affine_of(answer.values)
+    affine = header.affine
+    if affine is None:
+        affine = theirs
+    elif not header.scaled and (off := apart(affine, theirs, header.size)) > READERS_AGREE:
+        raise ImageInputError(
+            f"{path.name}: two readings of its header disagree by {off:.4g} mm about its "
+            f"position ({affine.round(4).tolist()} and {theirs.round(4).tolist()}): export the "
+            "image again"
+        )
+    return _placed(path, values, affine, header.findings)
+
+
+@contextmanager
+def _unpacked(path: Path, header: ImageHeader) -> Iterator[Path]:
+    """A file that ITK reads: this one, or a copy with its voxels unpacked."""
+    if header.packed is None:
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="cmfsim-unpacked-") as folder:
+        # ITK goes by the ending as well: that of a header alone has its voxels elsewhere.
+        copy = Path(folder, path.name).with_suffix(ATTACHED[header.reader])
+        header.packed.write(copy, header.bytes)
+        yield copy
+
+
+def _placed(
+    path: Path,
+    values: NDArray[Any],
+    affine: NDArray[np.float64],
+    findings: tuple[Finding, ...],
+) -> ImageFile:
+    """The image of voxels with their map to LPS, on axes of the patient."""
+    if values.dtype.kind == "f":
+        _check_finite(values, path)
+    image = aligned(values, affine)
+    if image is None:
+        return ImageFile(
+            upright(values, affine, path.name), "", (*findings, _resampled(path, affine))
+        )
+    return ImageFile(image, "", findings)
+
+
+def _affine_of(place: Any) -> NDArray[np.float64]:
+    """The map from index to place of an ITK image, (3, 4)."""
+    direction = np.array(place["direction"]).reshape(3, 3)
+    return np.column_stack([direction * np.array(place["spacing"]), place["origin"]])
+
+
+def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:
+    shear = shear_of(affine)
+    if shear <= SHEARED:
+        return Finding(
+            "image-oblique",
+            f"the image's axes are turned by {turn_of(affine):.1f}° from the patient's; it was "
+            "resampled",
+            severity="note",
+            where=path.name,
+        )
+    return Finding(
+        "image-oblique",
+        f"the image's axes are {shear:.1f}° from right angles, as in a CT with a tilted gantry; it "
+        "was resampled by its stated axes",
+        severity="warning",
+        where=path.name,
+        why="a program that assumes perpendicular axes would show the head sheared",
+        fix="compare the skin with the scan visually",
+    )
+
+
+def _check_finite(values: NDArray[Any], path: Path) -> None:
+    count = sum(int(np.count_nonzero(~np.isfinite(layer))) for layer in values.T)
+    if count:
+        raise ImageInputError(
+            f"{path.name}: {count} voxels are NaN or infinite: every value must be finite"
+        )

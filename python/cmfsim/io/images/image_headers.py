@@ -1,0 +1,341 @@
+"""Shared checks of image headers: numbers, sizes, positions and names.
+
+A header may crash or mislead a reader: numbers of a thousand digits, infinite places, sizes beyond
+any memory, data files in other folders, sheared axes that are silently made orthogonal. Each format
+has its own file beside this one.
+"""
+
+import bz2
+import math
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.errors import ImageInputError
+from cmfsim.io.files.reading_writing import check_readable, is_below
+from cmfsim.values.finding import Finding
+
+__all__ = [
+    "KNOWN",
+    "LENGTHS",
+    "MOST_DIGITS",
+    "MOST_HEADER",
+    "MOST_PACKED",
+    "MOST_VOXELS",
+    "ImageHeader",
+    "PackedVoxels",
+    "apart",
+    "check_affine",
+    "check_length",
+    "check_shape",
+    "data_file",
+    "number",
+    "unstated",
+    "whole",
+]
+
+# Larger images are refused before memory is taken, voxels: 1024 × 1024 × 2000.
+MOST_VOXELS = 2_100_000_000
+# Longer text headers are none, bytes: those of scanners' exports have some 20 kB.
+MOST_HEADER = 1 << 20
+# Longer numbers stand in no header, characters: ITK's reader crashes at a thousand.
+MOST_DIGITS = 40
+# Characters of a name that an error repeats.
+MOST_SHOWN = 80
+# Sizes, spacings and places beyond these are no head's: voxels along an axis, mm.
+MOST_ALONG = 100_000
+FARTHEST = 1e6
+# Deflate cannot pack more tightly than this.
+MOST_PACKED = 1032
+# Bytes that are read or unpacked at once.
+CHUNK = 1 << 20
+LENGTHS: Mapping[str, float] = {
+    "mm": 1.0, "millimeter": 1.0, "millimetre": 1.0, "millimeters": 1.0, "cm": 10.0, "m": 1000.0,
+    "um": 0.001, "µm": 0.001, "micron": 0.001,
+}  # fmt: skip
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
+_WHOLE = re.compile(r"\d{1,18}")
+KNOWN = "NRRD, NIfTI, MetaImage or DICOM is needed"
+
+
+@dataclass(frozen=True, eq=False)
+class PackedVoxels:
+    """Voxels that ITK does not unpack, and the header of a file that has them unpacked.
+
+    Attributes
+    ----------
+    header : bytes
+    data : Path
+    start : int
+        Where they begin.
+    packing : str
+        As `check_length` takes it.
+    """
+
+    header: bytes
+    data: Path
+    start: int
+    packing: str
+
+    def write(self, path: Path, needed: int) -> None:
+        """Writes the file with its voxels unpacked, `needed` bytes of them."""
+        reader = _unpacker(self.packing)
+        with self.data.open("rb") as file, path.open("wb") as copy:
+            copy.write(self.header)
+            file.seek(self.start)
+            while not reader.eof and (block := file.read(CHUNK)):
+                copy.write(reader.decompress(block))
+            copy.truncate(len(self.header) + needed)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageHeader:
+    """What the header of an image file states.
+
+    Attributes
+    ----------
+    reader : str
+        ITK's name of the reader for its format.
+    size : tuple of int
+        Voxels along each of the three axes.
+    affine : (3, 4) float64 or None, mm
+        Takes an index (i, j, k, 1) to its place in LPS; None where the file states no frame: then
+        the reader's own spacing and origin are all that is known.
+    bytes : int
+        Of all voxels, unpacked.
+    scaled : bool
+        Whether the affine differs from the reader's for a stated reason: a unit, a choice.
+    findings : tuple of Finding
+    packed : PackedVoxels or None
+        Where ITK does not unpack them.
+    """
+
+    reader: str
+    size: tuple[int, int, int]
+    affine: NDArray[np.float64] | None
+    bytes: int
+    scaled: bool = False
+    findings: tuple[Finding, ...] = ()
+    packed: PackedVoxels | None = None
+
+
+def check_shape(name: str, size: list[int], components: int = 1) -> None:
+    """Refuses what is no volume of one number per voxel.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`)
+    """
+    text = " × ".join(map(str, size))
+    if components != 1:
+        raise ImageInputError(
+            f"{name}: has {components} numbers per voxel (colours or vectors): one is needed"
+        )
+    if len(size) > 3 and any(n > 1 for n in size[3:]):
+        raise ImageInputError(
+            f"{name}: has {len(size)} axes ({text}): save one volume of the series"
+        )
+    if len(size) < 3 or min(size[:3]) < 2:
+        raise ImageInputError(
+            f"{name}: is a single slice ({text}): a volume is needed; for DICOM give the "
+            "folder of all slices"
+        )
+    if max(size) > MOST_ALONG or math.prod(size) > MOST_VOXELS:
+        raise ImageInputError(
+            f"{name}: has {text} voxels: at most {MOST_VOXELS} are read, and {MOST_ALONG} along "
+            "an axis"
+        )
+
+
+def check_length(
+    data: Path, start: int, needed: int, layer: int, packing: str = ""
+) -> tuple[Finding, ...]:
+    """A finding on bytes after the voxels; refuses voxels that are fewer, or damaged where packed.
+
+    ITK pads what is short, drops what is long, and does not compare checksums.
+
+    Parameters
+    ----------
+    data : Path
+    start : int
+        Where the voxels begin.
+    needed : int
+        Bytes of the voxels, unpacked.
+    layer : int
+        Bytes of one slice: as many more may be slices that the header misses, and are refused.
+    packing : str
+        "gzip", "zlib" or "bzip2"; empty where they are not packed.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) With both lengths.
+    """
+    found, left = data.stat().st_size - start, 0
+    if packing:
+        found, left = _unpacked_length(data, start, needed + layer, packing)
+    if not 0 <= found - needed < layer:
+        what = "is cut short" if found < needed else "is longer than its header states"
+        raise ImageInputError(
+            f"{data.name}: {what}: {found} of {needed} bytes of voxels; copy it again"
+        )
+    left += found - needed
+    if not left:
+        return ()
+    what = f"{left} bytes after its voxels were ignored: they are no slice that its header misses"
+    return (Finding("field-ignored", what, where=data.name),)
+
+
+def _unpacked_length(data: Path, start: int, most: int, packing: str) -> tuple[int, int]:
+    """The bytes of voxels in a packed file, or a few above `most`, and those after its end."""
+    reader = _unpacker(packing)
+    found = 0
+    try:
+        with data.open("rb") as file:
+            file.seek(start)
+            while not reader.eof and found < most and (block := file.read(CHUNK)):
+                # Unpacked by pieces: a block of zeros alone would take a thousand times its size.
+                found += len(reader.decompress(block, CHUNK))
+                while not reader.eof and found < most and (more := _rest(reader)):
+                    found += len(more)
+            left = len(reader.unused_data) + len(file.read(CHUNK))
+    except (OSError, zlib.error) as error:
+        raise ImageInputError(
+            f"{data.name}: its voxels are damaged ({error}); copy the file again"
+        ) from error
+    if found < most and not reader.eof:
+        raise ImageInputError(
+            f"{data.name}: is cut short: its voxels are compressed, and the file ends before them; "
+            "copy it again"
+        )
+    return found, left if reader.eof else 0
+
+
+def _unpacker(packing: str) -> Any:
+    if packing == "bzip2":
+        return bz2.BZ2Decompressor()
+    return zlib.decompressobj(zlib.MAX_WBITS + 16 if packing == "gzip" else zlib.MAX_WBITS)
+
+
+def _rest(reader: Any) -> bytes:
+    """More of what is unpacked of the block that was given last; nothing once it is used up."""
+    if isinstance(reader, bz2.BZ2Decompressor):
+        return b"" if reader.needs_input else reader.decompress(b"", CHUNK)
+    tail = reader.unconsumed_tail
+    return bytes(reader.decompress(tail, CHUNK)) if tail else b""
+
+
+def data_file(path: Path, name: str) -> Path:
+    """The file beside a header that holds its voxels.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) It would lead out of the header's folder, it is a list or a pattern of
+        names, or there is none.
+    """
+    how = (
+        "a header may refer to one file next to it or below; save the image as one file (.nrrd, "
+        ".mha, .nii.gz)"
+    )
+    shown = name if len(name) <= MOST_SHOWN else f"{name[:MOST_SHOWN]}…"
+    if name.split(maxsplit=1)[:1] == ["LIST"] or "%" in name or "\0" in name or not name:
+        raise ImageInputError(f"{path.name}: its data file is {shown!r}: {how}")
+    given = Path(name)
+    if given.is_absolute() or ".." in given.parts or "\\" in name or ":" in name:
+        raise ImageInputError(f"{path.name}: its data file {shown!r} is in another folder: {how}")
+    data = path.parent / given
+    if not is_below(data, path.parent):
+        raise ImageInputError(
+            f"{path.name}: its data file {shown!r} is a link that points outside the folder: {how}"
+        )
+    try:
+        check_readable(data, ImageInputError)
+    except FileNotFoundError as error:
+        raise ImageInputError(
+            f"{path.name}: its data file {shown!r} does not exist next to it: copy both"
+        ) from error
+    except ImageInputError as error:
+        raise ImageInputError(f"{path.name}: its data file {shown!r}: {error}") from error
+    return data
+
+
+def unstated(path: Path, stated: str, how: str) -> Finding:
+    """A finding on a file that does not state its frame, and how it would."""
+    return Finding(
+        "frame-unstated",
+        f"{stated}: its axes were assumed to be left, posterior and superior",
+        severity="warning",
+        where=path.name,
+        why="if this is wrong, left and right of the face are swapped, or front and back; left "
+        "and right cannot be recognised in an image",
+        fix=f"export the image again with its orientation ({how}), and check left and right",
+    )
+
+
+def apart(a: NDArray[np.float64], b: NDArray[np.float64], size: tuple[int, int, int]) -> float:
+    """How far two maps of an image lie apart at its corners."""
+    corners = np.array(
+        [[(c >> axis & 1) * (size[axis] - 1.0) for axis in range(3)] + [1.0] for c in range(8)]
+    )
+    return float(np.linalg.norm(corners @ (a - b).T, axis=1).max())
+
+
+def whole(path: Path, key: str, text: str) -> int:
+    """A whole number of a header, not below 0.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`)
+    """
+    if not _WHOLE.fullmatch(text.strip()):
+        raise ImageInputError(f"{path.name}: {key} is {text[:MOST_DIGITS]!r}: not a whole number")
+    return int(text)
+
+
+def number(path: Path, key: str, text: str) -> float:
+    """A finite number of a header.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`) None, not finite, longer than any that is meant, or farther than a head.
+    """
+    text = text.strip()
+    if len(text) > MOST_DIGITS or not _NUMBER.fullmatch(text):
+        raise ImageInputError(f"{path.name}: {key} has {text[:MOST_DIGITS]!r}: not a finite number")
+    value = float(text)
+    if abs(value) > FARTHEST:
+        raise ImageInputError(f"{path.name}: {key} has {value:g}: no head is that large or so far")
+    return value
+
+
+def check_affine(name: str, affine: NDArray[np.float64], size: tuple[int, int, int]) -> None:
+    """Refuses a map from index to place whose axes span no space, or that leads too far.
+
+    Raises
+    ------
+    ImageError
+        (also `ValueError`)
+    """
+    lengths = np.linalg.norm(affine[:, :3], axis=0)
+    if not (lengths > 0.0).all():
+        raise ImageInputError(f"{name}: spacing is {lengths.tolist()} mm: must be above 0")
+    volume = abs(float(np.linalg.det(affine[:, :3] / lengths)))
+    # Axes of a scan tilted by 30° span 0.87; below a half they nearly lie in one plane.
+    if volume < 0.5:
+        raise ImageInputError(
+            f"{name}: direction {(affine[:, :3] / lengths).round(4).tolist()} is not a set of axes "
+            f"in space (they span {volume:.2g} of a cube)"
+        )
+    farthest = float(np.abs(affine[:, 3]).max() + (lengths * np.array(size)).max())
+    if farthest > FARTHEST:
+        raise ImageInputError(f"{name}: reaches {farthest:g} mm from the origin: no head does")

@@ -1,0 +1,292 @@
+"""Segmentations: `.seg.nrrd` of 3D Slicer (labels in layers, with names), and label images."""
+
+import gzip
+import json
+import math
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.errors import ImageInputError
+from cmfsim.io.files.reading_writing import check_readable
+from cmfsim.io.images.image_files import read_image_file
+from cmfsim.io.images.image_headers import check_shape, whole
+from cmfsim.io.images.nifti import read_nifti
+from cmfsim.io.images.nrrd import BYTES, nrrd_affine, nrrd_fields
+from cmfsim.values.finding import Finding
+
+__all__ = [
+    "NAMES_FILE",
+    "Segment",
+    "Segmentation",
+    "are_labels",
+    "read_labels",
+    "read_segmentation",
+]
+
+MAX_SEGMENTS = 200
+# Voxels of all layers, bytes in memory: those of a head CT in eight layers.
+MAX_VOXELS = 2**31
+LABEL_TYPES: Mapping[int, str] = {1: "u1", 2: "u2", 4: "u4"}
+# What Slicer states of each segment, one line each.
+ABOUT = re.compile(rb"^Segment(\d{1,4})_(Name|LabelValue|Layer):=([^\r\n]*)", re.MULTILINE)
+LAYER = re.compile(r"[0-9]{1,4}", re.ASCII)
+# Kinds of axes in NRRD that may run through space.
+SPATIAL_KINDS = frozenset({"domain", "space", "none", "???"})
+# zlib's number for a gzip stream.
+GZIP = 31
+# The largest label of the programs whose images are read (TotalSegmentator has 117).
+MOST_LABEL = 255
+# A CT has more values than this, or neighbours inside it that differ: noise.
+FEW_VALUES, SAME_NEIGHBOURS = 40, 0.8
+# Where nnU-Net states the names of the labels that it writes, next to them.
+NAMES_FILE = "dataset.json"
+MOST_NAMES = 1 << 20
+# TotalSegmentator's names, in an extension of its NIfTI header.
+LABEL_NAME = re.compile(rb'<Label\s[^>]*?Key="(\d{1,4})"[^>]*>(?:<!\[CDATA\[)?([^<\]]{1,100})')
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """A segment: its name, its layer, and the label that it has there."""
+
+    name: str
+    layer: int
+    label: int
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """The segments of a file.
+
+    Attributes
+    ----------
+    labels : (layers, nx, ny, nz) array of whole numbers
+    affine : (3, 4) float64, mm
+        The map from index (i, j, k, 1) to LPS.
+    segments : tuple of Segment
+    findings : tuple of Finding
+    """
+
+    labels: NDArray[Any]
+    affine: NDArray[np.float64]
+    segments: tuple[Segment, ...]
+    findings: tuple[Finding, ...] = ()
+
+    def mask(self, segment: Segment) -> NDArray[np.bool_]:
+        """Where a segment is, (nx, ny, nz)."""
+        mask: NDArray[np.bool_] = self.labels[segment.layer] == segment.label
+        return mask
+
+
+def read_segmentation(path: Path) -> Segmentation:
+    """The segments of a `.seg.nrrd` file, or the labels of a label image as segments.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    ImageError
+        (also `ValueError`) Not NRRD, detached, cut short, real numbers; a layer that is not there.
+    """
+    check_readable(path, ImageInputError)
+    with path.open("rb") as file:
+        if not file.read(7).startswith(b"NRRD000"):
+            raise ImageInputError(f"{path.name}: is not an NRRD file: save the segmentation again")
+    fields, begin = nrrd_fields(path)
+    sizes = [whole(path, "sizes", text) for text in fields.get("sizes", "").split()]
+    if len(sizes) not in {3, 4}:
+        raise ImageInputError(f"{path.name}: has {len(sizes)} axes: three, or four with layers")
+    across = _layer_axis(path, fields) if len(sizes) == 4 else None
+    shape = [size for axis, size in enumerate(sizes) if axis != across]
+    n_layers = 1 if across is None else sizes[across]
+    check_shape(path.name, shape)
+    if not 1 <= n_layers <= MAX_SEGMENTS or math.prod(sizes) > MAX_VOXELS:
+        raise ImageInputError(
+            f"{path.name}: has {n_layers} layers of {math.prod(shape)} voxels: at most "
+            f"{MAX_SEGMENTS} layers and {MAX_VOXELS} voxels are read"
+        )
+    width = BYTES.get(fields.get("type", "").lower(), 0)
+    if width not in LABEL_TYPES or fields["type"].lower() in {"float", "double"}:
+        raise ImageInputError(f"{path.name}: type is {fields.get('type')!r}: labels are needed")
+    axes = len(fields["sizes"].split())
+    affine, _, findings = nrrd_affine(path, fields, axes)
+    if affine is None:
+        raise ImageInputError(f"{path.name}: states no space: save it from 3D Slicer again")
+    order = ">" if fields.get("endian", "little").lower() == "big" else "<"
+    voxels = _voxels(path, fields, begin, math.prod(sizes) * width)
+    stored = np.frombuffer(voxels, order + LABEL_TYPES[width]).reshape(sizes, order="F")
+    labels = stored[None] if across is None else np.moveaxis(stored, across, 0)
+    with path.open("rb") as file:
+        head = file.read(begin)
+    return Segmentation(labels, affine, _segments(path, head, labels), findings)
+
+
+def are_labels(values: NDArray[Any]) -> bool:
+    """Whether the values of an image are labels, and not those of a CT: whole, few, in regions."""
+    low, high = values.min(), values.max()
+    if low != 0 or not 0 < high <= MOST_LABEL:
+        return False
+    layers = values[:, :, :: max(1, values.shape[2] // 16)]
+    if values.dtype.kind == "f" and (layers != np.rint(layers)).any():
+        return False
+    if len(np.unique(layers)) <= FEW_VALUES:
+        return True
+    inside = layers[1:][layers[1:] != 0]
+    same = layers[1:][layers[1:] != 0] == layers[:-1][layers[1:] != 0]
+    return inside.size > 0 and float(same.mean()) > SAME_NEIGHBOURS
+
+
+def read_labels(path: Path) -> Segmentation:
+    """The labels of an image as segments; their names where the file, or nnU-Net, states them.
+
+    Parameters
+    ----------
+    path : Path
+        NRRD, NIfTI or MetaImage. One label alone is a mask, named after its file.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    ImageError
+        (also `ValueError`) As `read_segmentation`; no labels.
+    """
+    check_readable(path, ImageInputError)
+    name = path.name.lower()
+    if name.endswith(".nrrd"):
+        return _named(path, read_segmentation(path))
+    if name.endswith((".nii", ".nii.gz")):
+        values, affine, findings = read_nifti(path)
+    else:
+        read = read_image_file(path)
+        values, findings = read.image.values, read.findings
+        if any(f.code == "image-oblique" for f in findings):
+            raise ImageInputError(
+                f"{path.name}: labels on a turned grid are read from NRRD and NIfTI: save it so"
+            )
+        affine = np.column_stack([np.diag(read.image.spacing), read.image.lowest])
+    if not are_labels(values):
+        raise ImageInputError(f"{path.name}: its values are not labels")
+    labels = values.astype(np.uint8)[None]
+    return _named(path, Segmentation(labels, affine, _segments(path, b"", labels), findings))
+
+
+def _named(path: Path, read: Segmentation) -> Segmentation:
+    """The segments with the names that the file, or the one of nnU-Net next to it, states."""
+    if not all(segment.name == f"label {segment.label}" for segment in read.segments):
+        return read
+    if len(read.segments) == 1:
+        names = {read.segments[0].label: path.name.partition(".")[0]}
+    else:
+        names = _names_inside(path) or _names_of_network(path.parent / NAMES_FILE)
+    segments = tuple(Segment(names.get(s.label, s.name), s.layer, s.label) for s in read.segments)
+    return Segmentation(read.labels, read.affine, segments, read.findings)
+
+
+def _names_inside(path: Path) -> dict[int, str]:
+    """Label names in the first bytes of a NIfTI file."""
+    packed = path.name.lower().endswith(".gz")
+    with gzip.open(path, "rb") if packed else path.open("rb") as file:
+        begin = file.read(MOST_NAMES)
+    return {
+        int(key): name.decode("utf-8", "replace").strip() for key, name in LABEL_NAME.findall(begin)
+    }
+
+
+def _names_of_network(path: Path) -> dict[int, str]:
+    """Label names in nnU-Net's description of its data: {"labels": {name: number}}."""
+    try:
+        if path.stat().st_size > MOST_NAMES:
+            return {}
+        labels = json.loads(path.read_bytes())["labels"]
+        pairs = [
+            (value, key) if isinstance(value, int) else (int(key), value)
+            for key, value in labels.items()
+        ]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return {}
+    return {number: name[:100] for number, name in pairs if isinstance(name, str)}
+
+
+def _layer_axis(path: Path, fields: Mapping[str, str]) -> int:
+    """The axis of the layers: the one of four without a direction, whatever its place.
+
+    `kinds`, where it is stated, must say the same: "list", or another kind that is not of space.
+    """
+    directions = fields.get("space directions", "")
+    rows = re.findall(r"\([^)]*\)|none", directions)
+    without = [axis for axis, row in enumerate(rows) if row == "none"]
+    kinds = fields.get("kinds", "").lower().split()
+    lists = [axis for axis, kind in enumerate(kinds) if kind not in SPATIAL_KINDS]
+    if len(without) != 1 or len(rows) != 4 or (lists and lists != without):
+        raise ImageInputError(
+            f"{path.name}: which of its four axes has the layers is not clear: space directions "
+            f"are {directions!r}, kinds {fields.get('kinds', '')!r}; one axis needs the direction "
+            '"none" and the kind "list"'
+        )
+    return without[0]
+
+
+def _voxels(path: Path, fields: Mapping[str, str], begin: int, needed: int) -> bytes:
+    packing = fields.get("encoding", "raw").lower()
+    if "data file" in fields or packing not in {"raw", "gzip", "gz"}:
+        raise ImageInputError(
+            f"{path.name}: its voxels are in another file, or packed as {packing!r}: save it as "
+            "one .seg.nrrd"
+        )
+    with path.open("rb") as file:
+        file.seek(begin)
+        raw = file.read()
+    if packing != "raw":
+        raw = _unpacked(path, raw, needed)
+    if len(raw) != needed:
+        what = "is cut short" if len(raw) < needed else "is longer than its header states"
+        raise ImageInputError(f"{path.name}: {what}: {len(raw)} of {needed} bytes of voxels")
+    return raw
+
+
+def _unpacked(path: Path, raw: bytes, needed: int) -> bytes:
+    """The voxels of a gzip stream, whose checksum stands at its end."""
+    unpacker = zlib.decompressobj(GZIP)
+    try:
+        voxels = unpacker.decompress(raw, needed + 1)
+        if len(voxels) == needed and not unpacker.eof:
+            voxels += unpacker.decompress(unpacker.unconsumed_tail, 1)
+    except zlib.error as error:
+        raise ImageInputError(f"{path.name}: is damaged ({error}): copy it again") from error
+    if len(voxels) == needed and not unpacker.eof:
+        raise ImageInputError(f"{path.name}: is cut short: its packed voxels do not end")
+    return voxels
+
+
+def _segments(path: Path, head: bytes, labels: NDArray[Any]) -> tuple[Segment, ...]:
+    about: dict[int, dict[bytes, str]] = {}
+    for number, key, value in ABOUT.findall(head):
+        about.setdefault(int(number), {})[key] = value.decode("utf-8", "replace").strip()
+    if not about:
+        present = [int(label) for label in np.unique(labels) if label]
+        about = {n: {b"LabelValue": str(label)} for n, label in enumerate(present)}
+    if len(about) > MAX_SEGMENTS:
+        raise ImageInputError(
+            f"{path.name}: has {len(about)} segments or labels: at most {MAX_SEGMENTS} are read; "
+            "is it a CT?"
+        )
+    found = []
+    for number, said in sorted(about.items()):
+        label = whole(path, f"Segment{number}_LabelValue", said.get(b"LabelValue", str(number + 1)))
+        text = said.get(b"Layer", "0")
+        layer = int(text) if LAYER.fullmatch(text) else -1
+        if not 0 <= layer < len(labels):
+            raise ImageInputError(
+                f"{path.name}: Segment{number}_Layer is {said.get(b'Layer')!r}: there are "
+                f"{len(labels)} layers"
+            )
+        found.append(Segment(said.get(b"Name", f"label {label}"), layer, label))
+    return tuple(found)

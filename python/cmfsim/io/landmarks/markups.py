@@ -1,0 +1,189 @@
+"""Markups of 3D Slicer (`.mrk.json`): lists of points with labels, by kind, frame and unit."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from cmfsim.errors import LandmarkInputError
+from cmfsim.io.files.reading_writing import MAX_WHOLE, check_readable, parsed_json, replacing
+from cmfsim.values.checks import Floats
+
+__all__ = [
+    "Markup",
+    "MarkupPoint",
+    "as_position",
+    "frame_name",
+    "frame_signs",
+    "markup_of",
+    "markup_text",
+    "markups_of",
+    "markups_text",
+    "write_markups",
+]
+
+# A landmark file above this size is not what it says it is, bytes.
+MAX_LANDMARK_TEXT = 16 * 2**20
+# Slicer's names of its two frames; the numbers are those of older versions.
+FRAME_NAMES: Mapping[str, str] = MappingProxyType(
+    {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
+)
+UNIT_LENGTHS: Mapping[str, float] = MappingProxyType(
+    {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
+)
+SCHEMA = (
+    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/"
+    "Resources/Schema/markups-schema-v1.0.3.json#"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkupPoint:
+    """A point of a markup: label, place in LPS mm (None if never placed), description."""
+
+    label: object
+    position: Floats | None
+    description: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Markup:
+    """One markup of a file: its kind, its frame where the file states it, its points."""
+
+    kind: str
+    frame: str | None
+    entries: tuple[MarkupPoint, ...]
+
+
+def markup_text(path: Path) -> str:
+    """The text of a file of landmarks.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    LandmarkError
+        (also `ValueError`) A folder, too large, not UTF-8.
+    """
+    check_readable(path, LandmarkInputError)
+    size = path.stat().st_size
+    if size > MAX_LANDMARK_TEXT:
+        raise LandmarkInputError(
+            f"{path.name}: has {size} bytes, landmarks {MAX_LANDMARK_TEXT} at most"
+        )
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise LandmarkInputError(f"{path.name}: is not UTF-8 text ({error})") from error
+
+
+def markups_of(text: str, unstated: str) -> list[Markup]:
+    """The markups of a JSON text, in LPS mm; `unstated` is the frame of one that states none."""
+    try:
+        document = parsed_json(text)
+    except (ValueError, RecursionError) as error:
+        raise LandmarkInputError(f"is not JSON ({error})") from error
+    markups = document.get("markups") if isinstance(document, dict) else None
+    if not isinstance(markups, list) or not all(isinstance(m, dict) for m in markups):
+        raise LandmarkInputError("has no list 'markups': it is not a markups file of 3D Slicer")
+    found: list[Markup] = []
+    number = 0
+    for markup in markups:
+        entries = markup.get("controlPoints", [])
+        if not isinstance(entries, list):
+            raise LandmarkInputError("'controlPoints' is not a list")
+        frame = frame_name(markup.get("coordinateSystem"))
+        scale = frame_signs(frame or unstated) * _unit_length(markup.get("coordinateUnits", "mm"))
+        points: list[MarkupPoint] = []
+        for entry in entries:
+            number += 1
+            if not isinstance(entry, dict):
+                raise LandmarkInputError(f"point {number} is not a table of names and values")
+            placed = entry.get("positionStatus", "defined") == "defined"
+            place = scale * as_position(number, entry.get("position")) if placed else None
+            said = entry.get("description")
+            points.append(
+                MarkupPoint(entry.get("label"), place, said if isinstance(said, str) else "")
+            )
+        found.append(Markup(str(markup.get("type", "")), frame, tuple(points)))
+    return found
+
+
+def markup_of(
+    kind: str,
+    points: Iterable[tuple[str, Floats]],
+    descriptions: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """A markup as Slicer writes it, LPS mm, with a description of each point by label."""
+    said = descriptions or {}
+    return {
+        "type": kind,
+        "coordinateSystem": "LPS",
+        "coordinateUnits": "mm",
+        "controlPoints": [
+            {
+                "id": str(number),
+                "label": label,
+                **({"description": said[label]} if label in said else {}),
+                "position": position.tolist(),
+                "positionStatus": "defined",
+            }
+            for number, (label, position) in enumerate(points, start=1)
+        ],
+    }
+
+
+def write_markups(path: Path, markups: Sequence[Mapping[str, Any]]) -> None:
+    """Replaces a `.mrk.json` file in one step."""
+    text = markups_text(markups)
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def markups_text(markups: Sequence[Mapping[str, Any]]) -> str:
+    """The text of a `.mrk.json` file."""
+    return json.dumps({"@schema": SCHEMA, "markups": markups}, indent=1, allow_nan=False)
+
+
+def as_position(number: int, position: object) -> Floats:
+    """Three finite numbers, or an error with the number of the point."""
+    if not isinstance(position, list) or len(position) != 3:
+        raise LandmarkInputError(f"point {number} is at {position!r}: three numbers are needed")
+    for value in position:
+        is_number = isinstance(value, int | float | np.integer | np.floating)
+        if isinstance(value, bool) or not is_number:
+            raise LandmarkInputError(f"point {number} has the coordinate {value!r}: no number")
+        if isinstance(value, int) and abs(value) > MAX_WHOLE:
+            raise LandmarkInputError(f"point {number} has a coordinate of more than 308 digits")
+        if not math.isfinite(value):
+            raise LandmarkInputError(f"point {number} has the coordinate {value}: must be finite")
+    return np.array(position, dtype=np.float64)
+
+
+def frame_name(value: object) -> str | None:
+    """The frame, "LPS" or "RAS", for what a file calls it; None where it says nothing."""
+    if value is None or value == "":
+        return None
+    name = FRAME_NAMES.get(str(value))
+    if name is None:
+        raise LandmarkInputError(f"is in the frame {value!r}: LPS (or 1) and RAS (or 0) are read")
+    return name
+
+
+def frame_signs(frame: str) -> Floats:
+    """What coordinates of a frame are multiplied by to be LPS."""
+    return np.array([-1.0, -1.0, 1.0] if frame == "RAS" else [1.0, 1.0, 1.0])
+
+
+def _unit_length(value: object) -> float:
+    """The length of a file's unit in mm; Slicer may write [code, scheme, meaning]."""
+    name = value[0] if isinstance(value, list) and value else value
+    if not isinstance(name, str) or name not in UNIT_LENGTHS:
+        known = ", ".join(UNIT_LENGTHS)
+        raise LandmarkInputError(f"has coordinateUnits {value!r}: {known} are read")
+    return UNIT_LENGTHS[name]

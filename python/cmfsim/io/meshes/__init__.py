@@ -1,0 +1,1 @@
+"""Surfaces and tet meshes of any format, one format a file."""

@@ -1,0 +1,1 @@
+"""The VTK formats: legacy and XML, read and written."""

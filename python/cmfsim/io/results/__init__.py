@@ -1,0 +1,1 @@
+"""Results: predictions, metrics, models, calibrations."""

@@ -1,0 +1,371 @@
+"""The output folder of `cmfsim predict`: skin, tissue and a summary for each model."""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.errors import CaseInputError
+from cmfsim.io.files.folders import finish_writing, replacing_files
+from cmfsim.io.files.reading_writing import replacing
+from cmfsim.io.files.summaries import checked_file, hashes_of, read_summary, write_summary
+from cmfsim.io.meshes.mesh_files import read_mesh
+from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
+from cmfsim.io.results.metrics import (
+    EVALUATION_FILE,
+    REPORT_FILE,
+    is_evaluation_file,
+    read_evaluation,
+    read_picture,
+)
+from cmfsim.io.results.prediction_schema import PREDICTION, is_prediction_file
+from cmfsim.io.results.result_files import write_result
+from cmfsim.io.surfaces import write_surface
+from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = [
+    "fill_prediction",
+    "is_result_file",
+    "predictions_of",
+    "read_parts",
+    "read_prediction",
+    "read_prediction_picture",
+    "stale_results",
+    "write_prediction",
+    "write_timings",
+]
+
+PREDICTION_FILE = "prediction.json"
+TIMINGS_FILE = "timings.json"
+AGAIN = "run cmfsim predict again"
+
+
+def is_result_file(name: str) -> bool:
+    """Whether predictions and evaluations of a case are written as files of this name.
+
+    Parameters
+    ----------
+    name : str
+        From the case's output folder; those of several models lie in a folder for each.
+    """
+    model, _, plain_name = name.rpartition("/")
+    if model:
+        return model in MODELS and is_prediction_file(plain_name)
+    return is_prediction_file(name) or is_evaluation_file(name)
+
+
+def read_prediction(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """What `prediction.json` in a folder holds, which `write_prediction` wrote there.
+
+    Parameters
+    ----------
+    folder : path
+
+    Returns
+    -------
+    dict of str to plain values
+
+    Raises
+    ------
+    FileNotFoundError
+        There is none: another program's folder, or a run that was stopped.
+    CaseError
+        (also `ValueError`) It was changed, or holds what a prediction does not.
+    """
+    return read_summary(Path(folder) / PREDICTION_FILE, PREDICTION, AGAIN)
+
+
+def read_prediction_picture(
+    folder: str | os.PathLike[str], summary: Mapping[str, Any], name: str
+) -> bytes | None:
+    """A picture of a prediction as it was written; None where it was not drawn.
+
+    Raises
+    ------
+    FileNotFoundError
+        It is missing.
+    CaseError
+        (also `ValueError`) It is another file than was written, or no PNG.
+    """
+    if name not in summary["files"]:
+        return None
+    return read_picture(checked_file(Path(folder), summary, name, AGAIN))
+
+
+def predictions_of(folder: str | os.PathLike[str]) -> dict[Path, dict[str, Any]]:
+    """The predictions in a case's output folder, all of one plan, by the folder of each.
+
+    What a stopped run had still to put in place is put there first.
+
+    Parameters
+    ----------
+    folder : path
+        That of the case, or of one model.
+
+    Returns
+    -------
+    dict of Path to mapping
+        What `read_prediction` gives, in the order of the models; each model once.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no prediction.
+    CaseError
+        (also `ValueError`) Predictions of different plans, inputs or versions lie there together,
+        or one that was changed: names them.
+    """
+    folder = Path(folder)
+    places = [folder, *(folder / model for model in MODELS)]
+    for place in places:
+        if place.is_dir() and not place.is_symlink():
+            finish_writing(place)
+    there = [
+        place
+        for place in places
+        if not (place.is_symlink() and place != folder) and (place / PREDICTION_FILE).exists()
+    ]
+    if not there:
+        raise FileNotFoundError(
+            f"{folder}: holds no prediction.json, or a run was stopped while it wrote: run cmfsim "
+            "predict or evaluate first"
+        )
+    found = {place: read_prediction(place) for place in there}
+    if len({summary["case_key"] for summary in found.values()}) > 1:
+        names = ", ".join(str(place / PREDICTION_FILE) for place in found)
+        raise CaseInputError(
+            f"{names}: belong to different plans, inputs or versions; {AGAIN}, or name the folder "
+            "of one of them"
+        )
+    by_model = {summary["model"]: place for place, summary in reversed(found.items())}
+    ordered = [by_model[model] for model in MODELS if model in by_model]
+    return {place: found[place] for place in ordered}
+
+
+def stale_results(folder: Path, key: str) -> list[str]:
+    """The names of results in a case's output folder that belong to another plan than a key.
+
+    Parameters
+    ----------
+    folder : Path
+    key : str
+        The "case_key" of the results that are about to be put there.
+
+    Returns
+    -------
+    list of str
+        Files of predictions, of their comparison and their report, with the folder of the model.
+    """
+    stale: list[str] = []
+    for place in ("", *MODELS):
+        base = folder / place
+        if (place and base.is_symlink()) or not os.path.lexists(base / PREDICTION_FILE):
+            continue
+        if _key_of(read_prediction, base) != key:
+            names = sorted(path.name for path in base.iterdir() if is_prediction_file(path.name))
+            stale += [f"{place}/{name}".lstrip("/") for name in names]
+    if os.path.lexists(folder / EVALUATION_FILE) and _key_of(read_evaluation, folder) != key:
+        stale += sorted(path.name for path in folder.iterdir() if is_evaluation_file(path.name))
+    if stale and os.path.lexists(folder / REPORT_FILE):
+        stale.append(REPORT_FILE)
+    return [*dict.fromkeys(stale)]
+
+
+def _key_of(read: Callable[[Path], Mapping[str, Any]], folder: Path) -> str | None:
+    try:
+        return str(read(folder)["case_key"])
+    except (OSError, ValueError):
+        return None
+
+
+def write_prediction(
+    folder: str | os.PathLike[str],
+    prediction: Prediction,
+    draw: Callable[[Path], Iterable[str]] | None = None,
+) -> list[str]:
+    """The names of the files of a prediction, written to a folder, which is created if necessary.
+
+    `prediction.vtp` (the mesh's skin at rest with its `displacement`, and with its band where it
+    has one), `prediction.stl` (the same where it goes), `face.vtp` and `face.stl` (the whole skin
+    in full detail, after the operation), `face_before.vtp` (the same before it; both with the
+    `displacement` between them), `prediction.vtu` (tissue with `displacement`, `force`, muscle
+    `fraction` and `fibre`), `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments
+    before the operation, with their `displacement`) and `muscles.vtp`, each vertex with the number
+    of its `part` (the summary lists their names), `timings.json`, and `prediction.json` (counts,
+    parameters, findings, versions, hashes). All files are moved into place together, or none is.
+    Predictions, a comparison and a report in the folder that belong to another plan are removed.
+
+    Parameters
+    ----------
+    folder : path
+    prediction : Prediction
+    draw : callable, optional
+        Draws pictures into the folder that it is given, and returns their names.
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    OSError
+        The folder cannot be created or written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> names = cmfsim.write_prediction("out", prediction)  # doctest: +SKIP
+    """
+    folder = Path(folder)
+    key = str(prediction.summary.get("case_key", ""))
+    return replacing_files(
+        folder,
+        PREDICTION_FILE,
+        is_result_file,
+        lambda fresh: fill_prediction(fresh, prediction, draw),
+        lambda: stale_results(folder, key),
+    )
+
+
+def fill_prediction(
+    fresh: Path, prediction: Prediction, draw: Callable[[Path], Iterable[str]] | None = None
+) -> list[str]:
+    """The names of the files of a prediction, written into a folder that has none of them."""
+    names = [f"prediction.{ending}" for ending in ("vtp", "stl", "vtu", "npz")]
+    names += ["face.vtp", "face.stl", "face_before.vtp"]
+    result, skin = prediction.result, prediction.skin_before
+    with replacing(fresh / names[0]) as file:
+        moved = {
+            "displacement": prediction.skin_displacements,
+            "node": prediction.skin_nodes.astype(np.int64),
+            **({} if prediction.band is None else prediction.band.arrays()),
+        }
+        write_triangles(file, skin.vertices, skin.triangles, moved)
+    write_surface(fresh / names[1], prediction.skin)
+    face, before = prediction.face, prediction.face_before
+    carried = face.vertices - before.vertices
+    for name, places in ((names[4], face.vertices), (names[6], before.vertices)):
+        with replacing(fresh / name) as file:
+            write_triangles(file, places, before.triangles, {"displacement": carried})
+    write_surface(fresh / names[5], face)
+    with replacing(fresh / names[2]) as file:
+        points = {"displacement": result.displacements, "force": result.forces}
+        write_tets(file, result.nodes, result.tets, points, _muscle_data(prediction))
+    write_result(fresh / names[3], result)
+    parts = _write_parts(fresh, prediction)
+    names.extend(f"{name}.vtp" for name in parts)
+    # While pictures are drawn.
+    sealed = hashes_of(fresh, names)
+    if draw is not None:
+        more = list(draw(fresh))
+        sealed |= hashes_of(fresh, more)
+        names.extend(more)
+    summary = {"case_key": "", **prediction.summary, "parts": parts}
+    own = [TIMINGS_FILE, PREDICTION_FILE]
+    summary["files"] = [*names, *own]
+    # Timings are for people: what comes after the prediction is added to them.
+    write_timings(fresh, prediction.summary["timings"])
+    write_summary(fresh / PREDICTION_FILE, summary, sealed)
+    return [*names, *own]
+
+
+def write_timings(folder: Path, seconds: Mapping[str, float]) -> None:
+    """Writes the seconds of each stage, in their order, to `timings.json` of a prediction."""
+    _write_json(folder / TIMINGS_FILE, seconds)
+
+
+def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
+    """The names of the parts in the file of each kind: bones, and muscles where there are any."""
+    parts = {"bones": prediction.bones}
+    if prediction.muscles is not None:
+        still = {m.name: (m.surface, m.surface.vertices) for m in prediction.muscles}
+        parts["muscles"] = still
+    for kind, surfaces in parts.items():
+        before = [surface.vertices for surface, _ in surfaces.values()]
+        counts = [len(vertices) for vertices in before]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        triangles = [
+            surface.triangles.astype(np.int64) + start
+            for (surface, _), start in zip(surfaces.values(), starts, strict=False)
+        ]
+        moved = [after - at for (_, after), at in zip(surfaces.values(), before, strict=True)]
+        with replacing(folder / f"{kind}.vtp") as file:
+            data: dict[str, NDArray[Any]] = {
+                "part": np.repeat(np.arange(len(counts), dtype=np.uint32), counts)
+            }
+            if kind == "bones":
+                data["displacement"] = np.concatenate(moved)
+            # To be looked at: single precision, 10 nm on a head, halves the largest of the files.
+            points = np.concatenate(before).astype(np.float32)
+            write_triangles(file, points, np.concatenate(triangles), data)
+    return {kind: list(surfaces) for kind, surfaces in parts.items()}
+
+
+def read_parts(
+    folder: str | os.PathLike[str],
+) -> dict[str, dict[str, tuple[SurfaceData, NDArray[np.float64]]]]:
+    """The surfaces of a prediction that was written, with their vertices after the operation.
+
+    Parameters
+    ----------
+    folder : path
+        That `write_prediction` filled.
+
+    Returns
+    -------
+    dict of str to dict of str to (SurfaceData, (v, 3) float64)
+        "skin", "bones" and, in models with muscles, "muscles"; then by name. Muscles stay.
+
+    Raises
+    ------
+    FileNotFoundError
+        A file is missing: another program's folder, or an older version's.
+    CaseError
+        (also `ValueError`) A file that cannot be read, or is not the one that was written with the
+        others; PyVista is missing.
+    """
+    folder = Path(folder)
+    summary = read_prediction(folder)
+    found = {
+        "skin": _read_part_file(checked_file(folder, summary, "face_before.vtp", AGAIN), ["skin"])
+    }
+    for kind, names in summary["parts"].items():
+        path = checked_file(folder, summary, f"{kind}.vtp", AGAIN)
+        found[kind] = _read_part_file(path, names)
+    return found
+
+
+def _read_part_file(
+    path: Path, names: Sequence[str]
+) -> dict[str, tuple[SurfaceData, NDArray[np.float64]]]:
+    mesh = read_mesh(path)
+    points = mesh.points
+    triangles = mesh.cells_dict["triangle"]
+    number = mesh.point_data.get("part", np.zeros(len(points), dtype=np.int64))
+    moved = points + mesh.point_data.get("displacement", 0.0)
+    found = {}
+    for part, name in enumerate(names):
+        mine = np.flatnonzero(number == part)
+        corners = triangles[(number[triangles] == part).all(axis=1)]
+        if not len(mine) or not len(corners):
+            raise CaseInputError(f"{path.name}: part {part} ({name}) has no triangles")
+        surface = SurfaceData(points[mine], np.searchsorted(mine, corners))
+        found[name] = (surface, moved[mine])
+    return found
+
+
+def _muscle_data(prediction: Prediction) -> dict[str, np.ndarray]:
+    patient = prediction.patient
+    if prediction.muscles is None or patient.fraction is None or patient.fibre is None:
+        return {}
+    return {"fraction": patient.fraction, "fibre": patient.fibre}
+
+
+def _write_json(path: Path, value: object) -> None:
+    text = json.dumps(value, indent=1, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")

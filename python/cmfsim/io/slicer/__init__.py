@@ -1,0 +1,1 @@
+"""3D Slicer: scenes, transforms, and bundles for it."""

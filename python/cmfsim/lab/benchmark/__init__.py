@@ -1,0 +1,18 @@
+"""The open benchmark: displacements of the skin, by any method, scored on virtual patients."""
+
+from cmfsim.lab.benchmark.running import Benchmark, run_benchmark
+from cmfsim.lab.benchmark.skin_predictions import (
+    SkinPrediction,
+    read_skin_prediction,
+    write_skin_prediction,
+)
+from cmfsim.lab.benchmark.tables.benchmark_table import BenchmarkTable
+
+__all__ = [
+    "Benchmark",
+    "BenchmarkTable",
+    "SkinPrediction",
+    "read_skin_prediction",
+    "run_benchmark",
+    "write_skin_prediction",
+]

@@ -1,0 +1,116 @@
+"""Errors of one prediction at the vertices of each region."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from cmfsim.lab.benchmark.patients import BenchmarkPatient
+from cmfsim.lab.benchmark.skin_predictions import SkinPrediction
+from cmfsim.values.calibration import BandFactor
+from cmfsim.values.checks import Floats
+
+__all__ = ["WITHIN", "RegionScore", "score"]
+
+# What is usually called acceptable, mm.
+WITHIN = 2.0
+# Decimals of figures in files, mm and shares: beyond what a prediction in single precision has.
+DECIMALS = 6
+
+
+@dataclass(frozen=True)
+class RegionScore:
+    """Errors of a prediction in a region of one patient.
+
+    Attributes
+    ----------
+    mean, p95 : float, mm
+        Of the length of the difference from the true displacement, over vertices.
+    within : float
+        Share of vertices with 2 mm or less.
+    normal : float, mm
+        Mean size of the difference along the normal of the skin: without sliding along itself.
+    covered : bool or None
+        Whether the true skin lies within the stated band at all vertices; None without a band.
+    half_width : float, mm, or None
+        Mean of that band.
+    """
+
+    mean: float
+    p95: float
+    within: float
+    normal: float
+    covered: bool | None = None
+    half_width: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with their unit in the name."""
+        names = {
+            "mean": "mean_mm",
+            "p95": "p95_mm",
+            "within": "share_within_2mm",
+            "normal": "normal_mm",
+            "covered": "covered",
+            "half_width": "half_width_mm",
+        }
+        return {names[name]: value for name, value in asdict(self).items() if value is not None}
+
+
+def score(
+    patient: BenchmarkPatient,
+    prediction: SkinPrediction,
+    factors: Mapping[str, BandFactor] = MappingProxyType({}),
+) -> dict[str, RegionScore]:
+    """The scores of a prediction by region.
+
+    Parameters
+    ----------
+    patient : BenchmarkPatient
+    prediction : SkinPrediction
+    factors : mapping of str to BandFactor
+        How many standard deviations of the prediction its band has in a region; none without a
+        calibration.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) The prediction is of another skin.
+    """
+    prediction.check_vertices(patient.skin)
+    off = prediction.displacement - patient.truth
+    length = np.linalg.norm(off, axis=1)
+    along = np.abs(np.einsum("vi,vi->v", off, patient.normals))
+    found = {}
+    for name, part in patient.regions.items():
+        errors = length[part]
+        covered = half_width = None
+        band = _widths(prediction, factors.get(name))
+        if band is not None:
+            widths = band[part]
+            # A region with a vertex that has no band is not covered.
+            covered = bool((along[part] <= widths).all())
+            half_width = _rounded(np.nanmean(widths)) if np.isfinite(widths).any() else None
+        found[name] = RegionScore(
+            _rounded(errors.mean()),
+            _rounded(np.percentile(errors, 95.0)),
+            _rounded((errors <= WITHIN).mean()),
+            _rounded(along[part].mean()),
+            covered,
+            half_width,
+        )
+    return found
+
+
+def _widths(prediction: SkinPrediction, factor: BandFactor | None) -> Floats | None:
+    """The half widths of the band that a region is scored by, (v,) mm."""
+    if prediction.half_width is not None:
+        return prediction.half_width
+    if prediction.sd is None or factor is None:
+        return None
+    return factor.factor * prediction.sd
+
+
+def _rounded(value: Any) -> float:
+    return round(float(value), DECIMALS)

@@ -1,0 +1,250 @@
+"""The rows of a frontier as plain values: what was chosen, how far off it is, what it costs."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from cmfsim.evaluation import DistanceStatistics
+from cmfsim.lab.frontier.choice import Choice
+from cmfsim.lab.frontier.pareto import pareto_front
+from cmfsim.lab.frontier.skin_points import WHOLE
+
+__all__ = ["Frontier", "FrontierRow", "Spread", "unbeaten", "with_front"]
+
+# Errors are told apart in steps of this, mm: two methods that solve the same system differ by less.
+ERROR_STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Repeated measurements of one quantity.
+
+    Attributes
+    ----------
+    median, low, high : float
+    count : int
+    """
+
+    median: float
+    low: float
+    high: float
+    count: int
+
+    @staticmethod
+    def of(values: Sequence[float]) -> "Spread":
+        """The spread of at least one value."""
+        return Spread(float(np.median(values)), min(values), max(values), len(values))
+
+
+@dataclass(frozen=True, eq=False)
+class FrontierRow:
+    """The cost and the error of one choice.
+
+    Attributes
+    ----------
+    choice : Choice
+    is_base, is_reference : bool
+        Whether it is the case's own choice, or the choice with which the others are compared.
+    error : mapping of str to DistanceStatistics
+        |u - u_ref|, mm, over the face, its regions and the whole skin; empty where it failed.
+    build_wall, build_cpu : float or None, s
+        From the files to the scene, of one run.
+    solve_wall, solve_cpu : Spread or None, s
+        From the scene to the displacements.
+    ratio : Spread or None
+        `solve_wall` over that of the base in the same round.
+    build_peak, solve_peak : float or None, MB
+        Largest resident memory of the process, interpreter and scene included.
+    n_tets, n_unknowns : int or None
+    details : mapping
+        Residual, iterations and contact of the solution, seconds of each stage.
+    failure : str
+        Why there is no prediction; empty if there is one.
+    on_front : bool
+        Whether no other row is as accurate (to 0.001 mm in the mean) in less time. The reference,
+        whose error is 0 by definition, is not a candidate.
+    """
+
+    choice: Choice
+    is_base: bool = False
+    is_reference: bool = False
+    error: Mapping[str, DistanceStatistics] = field(default_factory=dict)
+    build_wall: float | None = None
+    build_cpu: float | None = None
+    solve_wall: Spread | None = None
+    solve_cpu: Spread | None = None
+    ratio: Spread | None = None
+    build_peak: float | None = None
+    solve_peak: float | None = None
+    n_tets: int | None = None
+    n_unknowns: int | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)
+    failure: str = ""
+    on_front: bool = False
+
+    @property
+    def total_wall(self) -> float | None:
+        """Seconds from the files to the face; None where it failed."""
+        if self.build_wall is None or self.solve_wall is None:
+            return None
+        return self.build_wall + self.solve_wall.median
+
+    @property
+    def mean(self) -> float | None:
+        """The mean error over the face, mm; None where it failed."""
+        return self.error[WHOLE].mean if WHOLE in self.error else None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with their unit in the name, as JSON holds them."""
+        return {
+            "choice": asdict(self.choice),
+            "is_base": self.is_base,
+            "is_reference": self.is_reference,
+            "on_front": self.on_front,
+            "failure": self.failure,
+            "error": {name: figures.as_dict() for name, figures in self.error.items()},
+            "total_wall_s": self.total_wall,
+            "build_wall_s": self.build_wall,
+            "build_cpu_s": self.build_cpu,
+            "solve_wall_s": _plain(self.solve_wall),
+            "solve_cpu_s": _plain(self.solve_cpu),
+            "solve_ratio": _plain(self.ratio),
+            "build_peak_mb": self.build_peak,
+            "solve_peak_mb": self.solve_peak,
+            "n_tets": self.n_tets,
+            "n_unknowns": self.n_unknowns,
+            "details": dict(self.details),
+        }
+
+
+@dataclass(frozen=True)
+class Frontier:
+    """Error against run time of many ways to predict one face.
+
+    Attributes
+    ----------
+    case : str
+        The name of the case.
+    rows : tuple of FrontierRow
+        The base first, the reference last.
+    n_points : int
+        On the skin, at which predictions are compared.
+    moved : float, mm
+        Mean movement of these points in the reference.
+    machine : mapping
+        Processor, threads, versions, commit.
+    """
+
+    case: str
+    rows: tuple[FrontierRow, ...]
+    n_points: int
+    moved: float
+    machine: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def base(self) -> FrontierRow:
+        """The case's own choice."""
+        return next(row for row in self.rows if row.is_base)
+
+    @property
+    def reference(self) -> FrontierRow:
+        """The row with which all others are compared."""
+        return next(row for row in self.rows if row.is_reference)
+
+    @property
+    def front(self) -> tuple[FrontierRow, ...]:
+        """The rows that no other row beats, fastest first."""
+        rows = [row for row in self.rows if row.on_front]
+        return tuple(sorted(rows, key=lambda row: row.total_wall or 0.0))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "case": self.case,
+            "n_points": self.n_points,
+            "reference_movement_mm": self.moved,
+            "machine": dict(self.machine),
+            "rows": [row.as_dict() for row in self.rows],
+        }
+
+    def csv(self) -> str:
+        """One line for each row; an error column for each region's mean, mm."""
+        regions = list(dict.fromkeys(name for row in self.rows for name in row.error))
+        names = list(asdict(self.base.choice))
+        titles = [
+            *names,
+            "role",
+            "on_front",
+            "mean_mm",
+            "p95_mm",
+            "max_mm",
+            *(f"{name} mean_mm" for name in regions if name != WHOLE),
+            "total_wall_s",
+            "build_wall_s",
+            "build_cpu_s",
+            "solve_wall_s",
+            "solve_wall_low_s",
+            "solve_wall_high_s",
+            "solve_cpu_s",
+            "repeats",
+            "ratio",
+            "ratio_low",
+            "ratio_high",
+            "build_peak_mb",
+            "solve_peak_mb",
+            "n_tets",
+            "n_unknowns",
+            "failure",
+        ]
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(titles)
+        for row in self.rows:
+            whole = row.error.get(WHOLE)
+            writer.writerow(
+                [
+                    *asdict(row.choice).values(),
+                    "base" if row.is_base else "reference" if row.is_reference else "",
+                    int(row.on_front),
+                    *((whole.mean, whole.p95, whole.max) if whole else ("", "", "")),
+                    *(row.error[n].mean if n in row.error else "" for n in regions if n != WHOLE),
+                    row.total_wall,
+                    row.build_wall,
+                    row.build_cpu,
+                    *_three(row.solve_wall),
+                    row.solve_cpu.median if row.solve_cpu else "",
+                    row.solve_wall.count if row.solve_wall else "",
+                    *_three(row.ratio),
+                    row.build_peak,
+                    row.solve_peak,
+                    row.n_tets,
+                    row.n_unknowns,
+                    row.failure,
+                ]
+            )
+        return text.getvalue()
+
+
+def with_front(rows: Sequence[FrontierRow]) -> tuple[FrontierRow, ...]:
+    """The rows with those marked that no other one beats in mean error and total time."""
+    able = [i for i, row in enumerate(rows) if row.mean is not None and not row.is_reference]
+    front = unbeaten([rows[i].total_wall or 0.0 for i in able], [rows[i].mean or 0.0 for i in able])
+    marked = {i for i, on in zip(able, front, strict=True) if on}
+    return tuple(replace(row, on_front=i in marked) for i, row in enumerate(rows))
+
+
+def unbeaten(seconds: Sequence[float], errors: Sequence[float]) -> list[bool]:
+    """Which rows no other one beats in time and in error, as far as errors are worth telling."""
+    return [bool(on) for on in pareto_front(seconds, np.round(np.array(errors) / ERROR_STEP))]
+
+
+def _plain(spread: Spread | None) -> dict[str, Any] | None:
+    return None if spread is None else asdict(spread)
+
+
+def _three(spread: Spread | None) -> tuple[float | str, ...]:
+    return ("", "", "") if spread is None else (spread.median, spread.low, spread.high)

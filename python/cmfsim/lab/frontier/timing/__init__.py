@@ -1,0 +1,1 @@
+"""Time and memory of one run, measured in a process of its own."""

@@ -1,0 +1,192 @@
+"""Who the embedded case is, what is done to the jaws, and the files that say so."""
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cmfsim.errors import CaseInputError
+from cmfsim.io import Case, write_surface
+from cmfsim.io.files.reading_writing import replacing
+from cmfsim.lab.virtual.demo.truth import DemoTruth, read_demo_truth
+from cmfsim.lab.virtual.people import PATIENTS
+from cmfsim.phantom import PhantomHead, make_head
+from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.checks import as_positive
+
+__all__ = ["DEMO_PARAMETERS", "DemoCase", "write_demo_case"]
+
+# Of class III: a long mandible with a strong chin under a maxilla that lies back.
+DEMO_PATIENT = PATIENTS[1]
+DEMO_PARAMETERS = DEMO_PATIENT.parameters
+# Le Fort I: forwards and up, and turned about the transverse axis through a landmark. Sagittal
+# split: the mandible back and up with the maxilla.
+MAXILLA, MANDIBLE = DEMO_PATIENT.plan["maxilla"], DEMO_PATIENT.plan["mandible_body"]
+# Height up to which there is tissue, mm: the scalp above takes two fifths of the tets and stays.
+TISSUE_TOP = 75.0
+# The head's voxels, in edges of the tets, and their bounds, mm: finer ones cost time and change
+# nothing, on coarser ones teeth and lips melt.
+VOXELS_PER_EDGE = 4.0
+VOXEL_BOUNDS = (1.5, 3.0)
+# More triangles than a head's surface has at the finest voxels: nothing is decimated.
+MOST_TRIANGLES = 1_000_000
+
+MARK = "# cmfsim demo: written by this command, and overwritten by it."
+NOTE = (
+    "Not a patient, but a synthetic head (class III) and an operation of ordinary size. Skin, "
+    "bones and airway are computed from the formulas that define the head, so nothing was scanned "
+    "or segmented (cmfsim phantom writes a head with its CT). Landmarks are found automatically, "
+    "more accurately than on real heads. The tets are coarse, for speed."
+)
+IN_SILICO = (
+    " The post-operative face is computed as well, by other equations on a finer mesh with "
+    "other muscles (in silico). Errors show how the models differ from it, not how accurate they "
+    "are on patients."
+)
+CASE = """\
+{mark}
+# Change the plan, then run: cmfsim {command} case.toml
+format = "cmfsim-case"
+version = 1
+name = "demo"
+note = "{note}"
+
+[surfaces]
+skin = "skin.ply"
+
+[surfaces.bones]
+cranium = "cranium.ply"
+mandible = "mandible.ply"
+
+# No [landmarks]: they are found automatically. To check them: cmfsim landmarks case.toml
+[[osteotomies]]
+procedure = "le_fort_1"
+
+[[osteotomies]]
+procedure = "bsso"
+
+[plan.maxilla]                    # P is backwards: -5 is 5 mm forwards
+translation = {maxilla}
+angle = {turn}
+axis = [1, 0, 0]
+centre = {centre}
+
+[plan.mandible_body]
+translation = {mandible}
+
+[muscles]
+template = "default"
+samples = 32
+
+[region]                          # the vault above the forehead does not move
+upper = {upper}
+
+[mesh]
+edge_length = {edge_length}
+
+{after}[output]
+folder = "out"
+"""
+AFTER = """\
+[postoperative]
+skin = "after.ply"
+
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class DemoCase:
+    """The embedded case on disk, with the anatomy that its surfaces were made from.
+
+    Attributes
+    ----------
+    case : Case
+    anatomy : Anatomy
+    truth : DemoTruth or None
+        None where the package holds no face after the operation.
+    """
+
+    case: Case
+    anatomy: Anatomy
+    truth: DemoTruth | None
+
+
+def write_demo_case(
+    folder: str | os.PathLike[str], *, edge_length: float = 6.0, truth: Path | None = None
+) -> DemoCase:
+    """The embedded case, written as `case.toml` with surfaces, and without any landmark.
+
+    Parameters
+    ----------
+    folder : path
+        Made if it is not there; empty, or an earlier demo's.
+    edge_length : float, mm
+        Of the tets.
+    truth : Path, optional
+        An archive with the face after the operation, instead of the package's own.
+
+    Returns
+    -------
+    DemoCase
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A folder with other files in it; an archive of another head;
+        scikit-image is missing.
+    OSError
+        The folder cannot be made or written to.
+
+    Examples
+    --------
+    >>> from cmfsim.lab.virtual.demo import write_demo_case
+    >>> made = write_demo_case("cmfsim-demo")  # doctest: +SKIP
+    >>> prediction = cmfsim.predict(made.case, model="M")  # doctest: +SKIP
+    """
+    edge_length = as_positive("edge length", edge_length)
+    folder = Path(folder)
+    _check_folder(folder)
+    after = read_demo_truth(asdict(DEMO_PARAMETERS), truth)
+    head = make_head(DEMO_PARAMETERS)
+    anatomy = head.anatomy(float(np.clip(edge_length / VOXELS_PER_EDGE, *VOXEL_BOUNDS)))
+    folder.mkdir(parents=True, exist_ok=True)
+    # First, so that a run that stops here leaves a folder that the next one knows.
+    with replacing(folder / "case.toml") as file:
+        file.write(_case_text(head, edge_length, after).encode())
+    options = SurfaceOptions(max_triangles=MOST_TRIANGLES, smoothing=0)
+    for name, level in {"skin": anatomy.skin, **anatomy.bones}.items():
+        write_surface(folder / f"{name}.ply", surface_of_level(name, level, options))
+    if after is not None:
+        write_surface(folder / "after.ply", after.skin)
+    return DemoCase(Case.load(folder / "case.toml"), anatomy, after)
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuses a folder that holds what the demo did not write."""
+    if folder.exists() and not folder.is_dir():
+        raise CaseInputError(f"{folder}: is a file; choose a folder for the demo")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    case = folder / "case.toml"
+    if not case.is_file() or not case.read_bytes().startswith(MARK.encode()):
+        raise CaseInputError(
+            f"{folder}: contains files that are not the demo's; choose a new or empty folder"
+        )
+
+
+def _case_text(head: PhantomHead, edge_length: float, after: DemoTruth | None) -> str:
+    centre = [round(float(x), 3) for x in head.skull_landmarks[MAXILLA.centre]]
+    return CASE.format(
+        mark=MARK,
+        command="predict" if after is None else "evaluate",
+        note=NOTE if after is None else NOTE + IN_SILICO,
+        maxilla=list(MAXILLA.translation),
+        turn=MAXILLA.angle,
+        centre=centre,
+        mandible=list(MANDIBLE.translation),
+        upper=TISSUE_TOP,
+        edge_length=edge_length,
+        after="" if after is None else AFTER,
+    )

@@ -1,0 +1,415 @@
+"""Frictionless, one-sided contact of the lips on their deformed surfaces.
+
+This contact belongs to the true face. It is a penalty on distances between deformed triangles, and
+shares neither the seam, nor the active set, nor any code with the models under test.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.errors import CaseInputError, third_party
+from cmfsim.lab.virtual.mechanics.equilibrium import Contact
+from cmfsim.lab.virtual.open_mouth import MARGIN, MouthSlit
+from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
+
+__all__ = ["ContactSum", "Lip", "LipContact", "lips_of"]
+
+# Pressure per depth of penetration, MPa/mm: under the pressures between lips (a few kPa), they
+# penetrate by less than a tenth of a millimetre. With a stiffer contact, Newton's method stalls
+# where rough surfaces slide.
+STIFFNESS = 0.2
+# Depth over which the stiffness grows to its full value, mm.
+ONSET = 0.05
+# Number of triangles, those with the nearest centroids, searched for a node's closest point.
+CANDIDATES = 32
+# A node deeper than this, mm, lies behind the other lip, not in it: lips are more than twice as
+# thick, and a Newton step that leads further is shortened.
+DEEPEST = 4.0
+# Smallest cosine between the direction to the border of a lip's surface and the normal there for
+# which a node counts as behind the surface.
+BEHIND = 0.7
+# Barycentric weights below this count as zero: the closest point is on an edge or at a corner.
+ON_EDGE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Lip:
+    """The surface of one lip.
+
+    Attributes
+    ----------
+    triangles : (t, 3) whole numbers
+        Boundary triangles, outward normals.
+    nodes : (k,) whole numbers
+        Nodes of the triangles that may touch the other lip.
+    area : (k,) float64, mm²
+        Boundary area around each.
+    """
+
+    triangles: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    area: Floats
+
+    @classmethod
+    def of(cls, triangles: NDArray[Any], area: Floats, nodes: NDArray[Any] | None = None) -> "Lip":
+        """The lip of boundary triangles (t, 3); area (n,) mm² of every node of the mesh.
+
+        By default, all nodes of the triangles may touch the other lip.
+        """
+        chosen = np.unique(triangles if nodes is None else nodes).astype(np.int64)
+        return cls(triangles.astype(np.int64), chosen, area[chosen])
+
+    @cached_property
+    def neighbours(self) -> NDArray[np.int64]:
+        """The triangle across the edge opposite each corner, (t, 3); −1 at the border."""
+        t = len(self.triangles)
+        ends = [np.roll(self.triangles, shift, axis=1) for shift in (-1, 1)]
+        edges = np.sort(np.stack(ends, axis=2), axis=2).reshape(-1, 2)
+        number = np.unique(edges, axis=0, return_inverse=True)[1].reshape(-1)
+        order = np.argsort(number, kind="stable")
+        pairs = np.flatnonzero(number[order][1:] == number[order][:-1])
+        found = np.full(3 * t, -1, dtype=np.int64)
+        one, other = order[pairs], order[pairs + 1]
+        found[one], found[other] = other // 3, one // 3
+        return found.reshape(t, 3)
+
+    @cached_property
+    def border_nodes(self) -> NDArray[np.int64]:
+        """Nodes of edges that belong to a single triangle."""
+        bare = self.neighbours < 0
+        ends = [self.triangles[np.roll(bare, shift, axis=1)] for shift in (1, 2)]
+        return np.unique(np.concatenate(ends))
+
+
+def lips_of(
+    slit: MouthSlit, nodes: Floats, boundary: NDArray[Any], area: Floats
+) -> tuple[Lip, Lip]:
+    """The upper and the lower lip: boundary triangles whose three nodes belong to one of them.
+
+    Parameters
+    ----------
+    slit : MouthSlit
+    nodes : (n, 3) float64, mm
+    boundary : (t, 3) uint32
+        Boundary triangles of the mesh.
+    area : (n,) float64, mm²
+        Boundary area around each node.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) The mesh has no upper or no lower lip, or the two are not separate.
+    """
+    side, inner = slit.lips(nodes)[boundary], slit.lips(nodes, MARGIN)
+    lips = []
+    for name, which in (("upper", 1), ("lower", -1)):
+        triangles = boundary[(side == which).all(axis=1)]
+        meeting = np.intersect1d(triangles, np.flatnonzero(inner == which))
+        if not len(meeting):
+            raise CaseInputError(f"the mesh has no surface of the {name} lip")
+        lips.append(Lip.of(triangles, area, meeting))
+    return lips[0], lips[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Touch:
+    """Nodes of one lip that are inside the other, with their closest points on it.
+
+    Attributes
+    ----------
+    corners : (c, 4) int64
+        The node, and the three of the triangle.
+    parts : (c, 4) float64
+        1, and the negative weights of the closest point: parts @ places is the vector from the
+        closest point to the node.
+    normal : (c, 3) float64
+        Unit vectors along which the distance grows.
+    swing : (c, 3, 3) float64
+        Projections onto the directions in which a moving node rotates the normal: none on a face,
+        one on an edge, two at a corner.
+    depth, area : (c,) float64, mm and mm²
+    """
+
+    corners: NDArray[np.int64]
+    parts: Floats
+    normal: Floats
+    swing: Floats
+    depth: Floats
+    area: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class LipContact:
+    """Two lips that push each other apart, without friction.
+
+    The nodes of each lip are pushed out of the other with half the pressure, so that neither lip is
+    the master. Pressure depends on depth as in `BoneContact`, but is higher.
+
+    Attributes
+    ----------
+    points : (n, 3) float64, mm
+        All nodes at rest, where the lips do not penetrate each other.
+    upper, lower : Lip
+    stiffness : float, MPa/mm
+    onset : float, mm
+        Depth over which the stiffness grows to its full value.
+    """
+
+    points: Floats
+    upper: Lip
+    lower: Lip
+    stiffness: float = STIFFNESS
+    onset: float = ONSET
+
+    def __post_init__(self) -> None:
+        as_rows("points", self.points, 3)
+        as_positive("stiffness", self.stiffness)
+        as_positive("onset", self.onset)
+        for name, lip in (("upper", self.upper), ("lower", self.lower)):
+            as_index_rows(f"{name} lip", lip.triangles, 3, len(self.points), "points")
+        shared = np.intersect1d(self.upper.triangles, self.lower.triangles)
+        if len(shared):
+            x, y, z = self.points[shared[0]]
+            raise CaseInputError(
+                f"node {shared[0]} at ({x:.1f}, {y:.1f}, {z:.1f}) mm belongs to both lips: "
+                "surfaces that touch must be separate"
+            )
+
+    def penetration(self, displacements: Floats) -> float:
+        """Largest depth of a node inside the other lip, mm."""
+        return max(float(touch.depth.max(initial=0.0)) for touch in self._touches(displacements))
+
+    def touching(self, displacements: Floats) -> int:
+        """Number of nodes, of both lips, that press on the other lip."""
+        return sum(int(np.count_nonzero(t.depth > 0.0)) for t in self._touches(displacements))
+
+    def energy(self, displacements: Floats, part: float) -> float:
+        """∫ ∫ pressure d(depth) d(area), N·mm, half of it from each lip."""
+        del part
+        total = 0.0
+        for touch in self._touches(displacements):
+            d, onset = touch.depth, self.onset
+            shallow = d**3 / (6.0 * onset)
+            deep = 0.5 * (d - 0.5 * onset) ** 2 + onset**2 / 24.0
+            total += 0.5 * float(touch.area @ np.where(d < onset, shallow, deep))
+        return self.stiffness * total
+
+    def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
+        """The gradient of the energy, (n, 3) N; blocks of single nodes are in `coupling`."""
+        del part
+        force = np.zeros_like(self.points)
+        for touch in self._touches(displacements):
+            weight = -self._pressing(touch)
+            shares = (weight[:, None] * touch.parts)[:, :, None] * touch.normal[:, None, :]
+            np.add.at(force, touch.corners, shares)
+        return force, np.zeros((len(self.points), 3, 3))
+
+    def _pressing(self, touch: _Touch) -> Floats:
+        """Half of the contact force on each node, (c,) N: the other lip adds its half."""
+        d, onset = touch.depth, self.onset
+        pressure = np.where(d < onset, 0.5 * d**2 / onset, d - 0.5 * onset)
+        return 0.5 * self.stiffness * touch.area * pressure
+
+    def coupling(self, displacements: Floats, part: float) -> Any:
+        """∂ forces / ∂ displacements, (3n, 3n) N/mm, with the closest feature of each node frozen.
+
+        On a face, the normal is frozen as well; on an edge or at a corner it rotates and stiffens.
+        """
+        del part
+        rows, columns, data = [], [], []
+        for touch in self._touches(displacements):
+            rise = 0.5 * self.stiffness * touch.area * np.minimum(touch.depth / self.onset, 1.0)
+            along = rise[:, None, None] * touch.normal[:, :, None] * touch.normal[:, None, :]
+            lever = self._pressing(touch) / np.maximum(touch.depth, np.finfo(np.float64).tiny)
+            along += lever[:, None, None] * touch.swing
+            pairs = touch.parts[:, :, None] * touch.parts[:, None, :]
+            rows.append(np.repeat(touch.corners, 4, axis=1).ravel())
+            columns.append(np.tile(touch.corners, (1, 4)).ravel())
+            data.append((pairs.reshape(-1, 16, 1, 1) * along[:, None]).reshape(-1, 3, 3))
+        n = len(self.points)
+        return _block_matrix(np.concatenate(rows), np.concatenate(columns), np.concatenate(data), n)
+
+    def _touches(self, displacements: Floats) -> tuple[_Touch, _Touch]:
+        """The nodes of the upper lip in the lower, and those of the lower in the upper."""
+        places = self.points + displacements
+        return (
+            _touch(places, self.upper, self.lower),
+            _touch(places, self.lower, self.upper),
+        )
+
+
+def _touch(places: Floats, lip: Lip, other: Lip) -> _Touch:
+    """The nodes of a lip that are inside the other."""
+    triangle, weights = _closest(places[lip.nodes], places, other.triangles)
+    at = other.triangles[triangle]
+    way = places[lip.nodes] - np.einsum("ck,cki->ci", weights, places[at])
+    normal = _outward(places, other, triangle, weights)
+    distance = np.linalg.norm(way, axis=1)
+    behind = -(way * normal).sum(axis=1)
+    # A node closest to the border is inside only if it is nearly straight behind it.
+    least = np.where(_on_border(other, triangle, weights), BEHIND * distance, 0.0)
+    inside = (behind > least) & (distance < DEEPEST)
+    at, weights, depth = at[inside], weights[inside], distance[inside]
+    # On the surface itself, the direction is undefined and the force zero.
+    along = -way[inside] / np.maximum(depth, np.finfo(np.float64).tiny)[:, None]
+    nodes = lip.nodes[inside]
+    swing = _swing(along, places[at], weights)
+    return _Touch(
+        np.column_stack([nodes, at]),
+        np.column_stack([np.ones(len(nodes)), -weights]),
+        along,
+        swing,
+        depth,
+        lip.area[inside],
+    )
+
+
+def _swing(normal: Floats, corners: Floats, weights: Floats) -> Floats:
+    """The projections of `_Touch.swing`, (c, 3, 3), at points of triangles (c, 3, 3)."""
+    none = weights <= ON_EDGE
+    count = none.sum(axis=1)
+    found = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    found[count == 0] = 0.0
+    edge = np.flatnonzero(count == 1)
+    opposite = none[edge].argmax(axis=1)
+    way = corners[edge, (opposite + 2) % 3] - corners[edge, (opposite + 1) % 3]
+    way /= np.maximum(np.linalg.norm(way, axis=1), np.finfo(np.float64).tiny)[:, None]
+    found[edge] -= way[:, :, None] * way[:, None, :]
+    return found
+
+
+def _closest(
+    points: Floats, places: Floats, triangles: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Floats]:
+    """The triangle closest to each point, and the weights of its closest point.
+
+    Only the `CANDIDATES` triangles with the nearest centroids are searched.
+    """
+    spatial = third_party("scipy.spatial", "contact of virtual patients is found", "study")
+    tree = spatial.cKDTree(places[triangles].mean(axis=1))
+    count = min(CANDIDATES, len(triangles))
+    tried = tree.query(points, k=count)[1].reshape(len(points), count)
+    best = np.full(len(points), np.inf)
+    triangle = np.zeros(len(points), dtype=np.int64)
+    weights = np.zeros((len(points), 3))
+    for candidate in tried.T:
+        corners = places[triangles[candidate]]
+        found = _weights(points, corners)
+        apart = np.linalg.norm(points - np.einsum("ck,cki->ci", found, corners), axis=1)
+        # The lower index wins a tie, so that the result does not depend on the order.
+        closer = (apart < best) | ((apart == best) & (candidate < triangle))
+        best[closer], triangle[closer] = apart[closer], candidate[closer]
+        weights[closer] = found[closer]
+    return triangle, weights
+
+
+def _weights(points: Floats, corners: Floats) -> Floats:
+    """Barycentric weights of the points of triangles (c, 3, 3) closest to points (c, 3).
+
+    The projection onto the plane if it is inside the triangle, otherwise the closest edge point.
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    square = (normal * normal).sum(axis=1)
+    square = np.maximum(square, np.finfo(np.float64).tiny)
+    beta = (np.cross(points - a, c - a) * normal).sum(axis=1) / square
+    gamma = (np.cross(b - a, points - a) * normal).sum(axis=1) / square
+    weights = np.column_stack([1.0 - beta - gamma, beta, gamma])
+    outside = np.flatnonzero((weights < 0.0).any(axis=1))
+    best = np.full(len(outside), np.inf)
+    for first in range(3):
+        last = (first + 1) % 3
+        start, edge = corners[outside, first], corners[outside, last] - corners[outside, first]
+        length = np.maximum((edge * edge).sum(axis=1), np.finfo(np.float64).tiny)
+        t = np.clip(((points[outside] - start) * edge).sum(axis=1) / length, 0.0, 1.0)
+        apart = np.linalg.norm(points[outside] - start - t[:, None] * edge, axis=1)
+        closer = apart < best
+        best[closer] = apart[closer]
+        found = np.zeros((len(outside), 3))
+        found[:, first], found[:, last] = 1.0 - t, t
+        weights[outside[closer]] = found[closer]
+    return weights
+
+
+def _outward(places: Floats, lip: Lip, triangle: NDArray[np.int64], weights: Floats) -> Floats:
+    """Outward unit vectors at points of triangles, (c, 3), also right on edges and corners.
+
+    Angle-weighted normals (Bærentzen & Aanæs 2005): of one face in its interior, of both faces on
+    an edge, of all adjacent faces at a corner.
+    """
+    triangles = lip.triangles
+    corners = places[triangles]
+    edges = np.roll(corners, -1, axis=1) - corners
+    face = np.cross(edges[:, 0], edges[:, 1])
+    face /= np.maximum(np.linalg.norm(face, axis=1), np.finfo(np.float64).tiny)[:, None]
+    unit = edges / np.maximum(np.linalg.norm(edges, axis=2), np.finfo(np.float64).tiny)[:, :, None]
+    cosine = -(unit * np.roll(unit, 1, axis=1)).sum(axis=2)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    at_node = np.zeros_like(places)
+    np.add.at(at_node, triangles, angle[:, :, None] * face[:, None, :])
+    found = face[triangle]
+    none = weights <= ON_EDGE
+    on_corner = none.sum(axis=1) == 2
+    corner = triangles[triangle, weights.argmax(axis=1)]
+    found[on_corner] = at_node[corner[on_corner]]
+    on_edge = np.flatnonzero(none.sum(axis=1) == 1)
+    neighbour = lip.neighbours[triangle[on_edge], none[on_edge].argmax(axis=1)]
+    two = neighbour >= 0
+    found[on_edge[two]] += face[neighbour[two]]
+    length = np.linalg.norm(found, axis=1, keepdims=True)
+    normals: Floats = found / np.maximum(length, np.finfo(np.float64).tiny)
+    return normals
+
+
+def _on_border(lip: Lip, triangle: NDArray[np.int64], weights: Floats) -> NDArray[np.bool_]:
+    """Whether points of triangles lie on the border of the surface, (c,)."""
+    none = weights <= ON_EDGE
+    edge = (none & (lip.neighbours[triangle] < 0)).any(axis=1)
+    corner = lip.triangles[triangle, weights.argmax(axis=1)]
+    border: NDArray[np.bool_] = edge | ((none.sum(axis=1) == 2) & np.isin(corner, lip.border_nodes))
+    return border
+
+
+def _block_matrix(rows: NDArray[np.int64], columns: NDArray[np.int64], data: Floats, n: int) -> Any:
+    """The sum of 3 × 3 blocks at rows and columns, (3n, 3n), scipy BSR."""
+    sparse = third_party("scipy.sparse", "contact of virtual patients is solved", "study")
+    key, place = np.unique(rows * n + columns, return_inverse=True)
+    blocks = np.zeros((len(key), 3, 3))
+    np.add.at(blocks, place.reshape(-1), data)
+    starts = np.searchsorted(key // n, np.arange(n + 1))
+    return sparse.bsr_array((blocks, key % n, starts), shape=(3 * n, 3 * n))
+
+
+@dataclass(frozen=True, eq=False)
+class ContactSum:
+    """Several contacts together.
+
+    Attributes
+    ----------
+    contacts : tuple of Contact
+        One or more.
+    """
+
+    contacts: tuple[Contact, ...]
+
+    def energy(self, displacements: Floats, part: float) -> float:
+        """Sum of the energies, N·mm."""
+        return sum(contact.energy(displacements, part) for contact in self.contacts)
+
+    def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
+        """Sums of the forces, N, and of the nodes' stiffness, N/mm."""
+        found = [contact.forces(displacements, part) for contact in self.contacts]
+        return (
+            np.asarray(sum(force for force, _ in found)),
+            np.asarray(sum(blocks for _, blocks in found)),
+        )
+
+    def coupling(self, displacements: Floats, part: float) -> Any:
+        """Sum of the couplings; None if no contact couples nodes."""
+        found = [contact.coupling(displacements, part) for contact in self.contacts]
+        coupled = [matrix for matrix in found if matrix is not None]
+        return sum(coupled[1:], start=coupled[0]) if coupled else None

@@ -1,0 +1,309 @@
+"""The operation on the true tissue: nodes attached to bone, stripped off it, and pushed by it."""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface, signed_distance_image
+from cmfsim.errors import CaseInputError, third_party
+from cmfsim.lab.virtual.mechanics.bone_contact import BoneContact, SmoothDistance
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.motion import decompose_motion, rigid_motion
+from cmfsim.values.node_kinds import NodeKinds
+
+__all__ = [
+    "Operation",
+    "bone_distances",
+    "node_areas",
+    "operate",
+    "screw",
+    "without_bite",
+    "without_gaps",
+]
+
+# Tissue is stripped off both sides of a cut, as a surgeon lifts the periosteum there: over this
+# length, mm, plus this multiple of the distance by which the two sides separate.
+STRIPPED, STRIPPED_PER_SHIFT = 5.0, 1.5
+# Shifts below this count as zero, mm.
+LEAST_SHIFT = 1e-6
+# There is no tissue between bones that move relative to each other, within their shift plus this,
+# mm; cosine of the angle between the directions to them above which they count as one wall.
+BETWEEN, SAME_SIDE = 2.0, 0.5
+# Smallest ratio of volumes of a tet with all four nodes attached to bone.
+LEAST_HELD_RATIO = 0.3
+# Distances to bone are known within this reach, on a grid of this spacing with this margin around
+# the tissue, mm: more than bones move in a step, and more than the width of a gap.
+REACH, SPACING, ROOM = 12.0, 1.5, 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """The action of the bones on the tissue.
+
+    Attributes
+    ----------
+    held : (k,) int64
+        Nodes attached to bone, or fixed where the tissue ends.
+    owner : (k,) int64
+        Segment to which each is joined, as an index into `motion`; −1 if it does not move.
+    motion : mapping of str to callable
+        Rigid motion (4, 4) of each segment after a fraction of it, 0 to 1.
+    contact : BoneContact
+    stripped : int
+        Number of nodes that the operation detached from bone.
+    points : (k, 3) float64, mm
+        The held nodes at rest.
+    """
+
+    held: NDArray[np.int64]
+    owner: NDArray[np.int64]
+    motion: Mapping[str, Callable[[float], Floats]]
+    contact: BoneContact
+    stripped: int
+    points: Floats
+
+    def path(self, part: float) -> Floats:
+        """Displacements of the held nodes after a fraction of the motion, (k, 3) mm."""
+        moved = np.zeros_like(self.points)
+        for number, motion in enumerate(self.motion.values()):
+            mine = self.owner == number
+            matrix = motion(part)
+            points = self.points[mine]
+            moved[mine] = points @ matrix[:3, :3].T + matrix[:3, 3] - points
+        return moved
+
+
+def screw(matrix: Floats, centre: Floats) -> Callable[[float], Floats]:
+    """The rigid motion (4, 4) after a fraction of it: rotation and translation grow together.
+
+    Parameters
+    ----------
+    matrix : (4, 4) float64, mm
+        The whole motion.
+    centre : (3,) float64, mm
+    """
+    whole = decompose_motion(matrix, centre)
+
+    def after(part: float) -> Floats:
+        if part == 1.0:
+            return matrix
+        return rigid_motion(part * whole.translation, part * whole.angle, whole.axis, centre)
+
+    return after
+
+
+def bone_distances(nodes: Floats, segments: Mapping[str, BoneSegment]) -> dict[str, ImageData]:
+    """Depth inside each segment, negative outside, mm, in the bounding box of nodes plus `ROOM`.
+
+    A segment's level is a distance only within two voxels of its surface, this one up to `REACH`.
+
+    Parameters
+    ----------
+    nodes : (n, 3) float64, mm
+    segments : mapping of str to BoneSegment
+    """
+    lowest = nodes.min(axis=0) - ROOM
+    shape = np.ceil((np.ptp(nodes, axis=0) + 2.0 * ROOM) / SPACING).astype(int) + 1
+    spacing = (SPACING, SPACING, SPACING)
+    found = {}
+    for name, segment in segments.items():
+        surface = Surface(segment.surface.vertices, segment.surface.triangles)
+        x, y, z = lowest.tolist()
+        depth = signed_distance_image(
+            surface, tuple(shape.tolist()), spacing, (x, y, z), band=REACH
+        )
+        found[name] = ImageData(depth, spacing, lowest)
+    return found
+
+
+def without_bite(
+    nodes: Floats, tets: NDArray[Any], upper: ImageData, lower: ImageData, gap: float
+) -> NDArray[np.bool_]:
+    """Which tets are tissue, (m,): those outside the gap between the tooth rows.
+
+    Parameters
+    ----------
+    nodes, tets : (n, 3) mm, (m, 4)
+    upper, lower : ImageData
+        Depths inside the bones that bear the teeth.
+    gap : float, mm
+        A tet lies between them if the distances of its centroid to both add up to less than this.
+    """
+    middles = nodes[tets].mean(axis=1)
+    return -upper.sample(middles) - lower.sample(middles) >= gap
+
+
+def without_gaps(
+    nodes: Floats,
+    tets: NDArray[Any],
+    distances: Mapping[str, ImageData],
+    motions: Mapping[str, Floats],
+    kept_between: Collection[str] = (),
+) -> NDArray[np.bool_]:
+    """Which tets are tissue, (m,): those not in the gap of two bones that move apart or together.
+
+    A surgeon opens these gaps, strips the tissue in them and removes bone where segments meet. A
+    tet lies between two bones if the distances of its centroid to both add up to less than their
+    shift plus `BETWEEN`, and the bones are not on the same side of it.
+
+    Parameters
+    ----------
+    nodes, tets : (n, 3) mm, (m, 4)
+    distances : mapping of str to ImageData
+        As returned by `bone_distances`.
+    motions : mapping of str to (4, 4) float64, mm
+        Of each of them.
+    kept_between : collection of str
+        Bones between which tissue is kept: jaws that no cut separates, if the mouth is open.
+    """
+    middles = nodes[tets].mean(axis=1)
+    kept = np.ones(len(middles), dtype=bool)
+    outside = {name: -depth.sample(middles) for name, depth in distances.items()}
+    for one, other in combinations(distances, 2):
+        if one in kept_between and other in kept_between:
+            continue
+        apart = motions[one] - motions[other]
+        shift = np.linalg.norm(middles @ apart[:3, :3].T + apart[:3, 3], axis=1)
+        near = outside[one] + outside[other] < shift + BETWEEN
+        ids = np.flatnonzero(near & (shift > LEAST_SHIFT))
+        facing = [_towards(distances[name], middles[ids]) for name in (one, other)]
+        kept[ids[(facing[0] * facing[1]).sum(axis=1) < SAME_SIDE]] = False
+    return kept
+
+
+def _towards(depth: ImageData, points: Floats) -> Floats:
+    """Unit vectors towards a bone, (k, 3)."""
+    steps = np.diag(depth.spacing)
+    slope = np.column_stack([depth.sample(points + s) - depth.sample(points - s) for s in steps])
+    length = np.linalg.norm(slope, axis=1, keepdims=True)
+    normals: Floats = slope / np.maximum(length, np.finfo(np.float64).tiny)
+    return normals
+
+
+def operate(
+    nodes: Floats,
+    tets: NDArray[Any],
+    boundary: NDArray[Any],
+    kinds: NodeKinds,
+    *,
+    distances: Mapping[str, ImageData],
+    centres: Mapping[str, Floats],
+    plan: Mapping[str, Floats],
+    bared: NDArray[Any] | None = None,
+) -> Operation:
+    """The operation that carries out a plan on tissue with classified nodes.
+
+    Joined and fixed nodes near a cut whose sides separate are stripped off the bone. Like sliding
+    nodes, they are then free, and bone can only push them.
+
+    Parameters
+    ----------
+    nodes : (n, 3) float64, mm
+    tets : (m, 4) uint32
+    boundary : (t, 3) uint32
+        Boundary triangles.
+    kinds : NodeKinds
+    distances : mapping of str to ImageData
+        Depth inside each segment.
+    centres : mapping of str to (3,) float64, mm
+        Centre about which each segment rotates.
+    plan : mapping of str to (4, 4) float64, mm
+        Segments that are not named do not move.
+    bared : (k,) whole numbers, optional
+        Other free nodes that may touch bone, because the tissue next to them was opened.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) The plan names an unknown segment; scipy is not installed.
+    """
+    for name in plan:
+        if name not in distances:
+            raise CaseInputError(f"the plan moves {name!r}; segments are: {', '.join(distances)}")
+    names = list(distances)
+    matrices = [plan.get(name, np.eye(4)) for name in names]
+    motion = {
+        name: screw(matrix, centres[name]) for name, matrix in zip(names, matrices, strict=True)
+    }
+    kind = kinds.kind
+    owner = np.full(len(nodes), -1, dtype=np.int64)
+    joined = kinds.nodes("joined")
+    of_kinds = np.array([names.index(name) for name in kinds.segments])
+    owner[joined] = of_kinds[kinds.segment[joined]]
+    held = np.isin(kind, (1, 2))
+    targets = np.zeros_like(nodes)
+    for number, matrix in enumerate(matrices):
+        mine = owner == number
+        targets[mine] = nodes[mine] @ matrix[:3, :3].T + matrix[:3, 3] - nodes[mine]
+    loose = _near_cuts(nodes, held, targets) | _crushed(nodes, tets, held, targets)
+    held &= ~loose
+    opened = np.zeros(len(nodes), dtype=bool)
+    opened[bared if bared is not None else []] = True
+    touching = np.flatnonzero(loose | (kind == 3) | (opened & ~held))
+    contact = BoneContact(
+        nodes,
+        touching,
+        node_areas(nodes, boundary)[touching],
+        {name: SmoothDistance(depth) for name, depth in distances.items()},
+        motion,
+    )
+    ids = np.flatnonzero(held)
+    return Operation(ids, owner[ids], motion, contact, int(loose.sum()), nodes[ids])
+
+
+def _near_cuts(nodes: Floats, held: NDArray[np.bool_], targets: Floats) -> NDArray[np.bool_]:
+    """Which held nodes are stripped, being close to held nodes that move differently."""
+    spatial = third_party("scipy.spatial", "virtual patients are made", "study")
+    ids = np.flatnonzero(held)
+    tree = spatial.cKDTree(nodes[ids])
+    # Twice the largest motion bounds the shift between any two nodes.
+    most = float(np.linalg.norm(targets[ids], axis=1).max(initial=0.0))
+    reach = STRIPPED + STRIPPED_PER_SHIFT * 2.0 * most
+    found = np.zeros(len(nodes), dtype=bool)
+    if most <= LEAST_SHIFT:
+        return found
+    moving = np.flatnonzero(np.linalg.norm(targets[ids], axis=1) > LEAST_SHIFT)
+    for one in moving:
+        near = np.array(tree.query_ball_point(nodes[ids[one]], reach))
+        shift = np.linalg.norm(targets[ids[near]] - targets[ids[one]], axis=1)
+        apart = np.linalg.norm(nodes[ids[near]] - nodes[ids[one]], axis=1)
+        # Within a rigid segment, rotation shifts neighbours by its angle times their distance.
+        torn = (shift > 0.5 * apart) & (apart < STRIPPED + STRIPPED_PER_SHIFT * shift)
+        if torn.any():
+            found[ids[one]] = True
+            found[ids[near[torn]]] = True
+    return found
+
+
+def _crushed(
+    nodes: Floats, tets: NDArray[Any], held: NDArray[np.bool_], targets: Floats
+) -> NDArray[np.bool_]:
+    """Which nodes belong to tets that are attached to bone at every node and would be inverted."""
+    found = np.zeros(len(nodes), dtype=bool)
+    whole = tets[held[tets].all(axis=1)]
+    if len(whole):
+        before, after = _volumes(nodes, whole), _volumes(nodes + targets, whole)
+        found[whole[after < LEAST_HELD_RATIO * before]] = True
+    return found
+
+
+def _volumes(nodes: Floats, tets: NDArray[Any]) -> Floats:
+    edges = nodes[tets[:, 1:]] - nodes[tets[:, :1]]
+    triple = np.einsum("ti,ti->t", np.cross(edges[:, 0], edges[:, 1]), edges[:, 2])
+    volumes: Floats = triple / 6.0
+    return volumes
+
+
+def node_areas(nodes: Floats, triangles: NDArray[Any]) -> Floats:
+    """A third of the area of the boundary triangles around each node, mm²."""
+    corners = nodes[triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1) / 6.0
+    ends = triangles.T.ravel()
+    return np.bincount(ends, np.tile(area, 3), len(nodes)).astype(np.float64)

@@ -1,0 +1,515 @@
+"""A virtual patient on disk: the case before the operation, and the truth after it."""
+
+import json
+import logging
+import os
+import platform
+import shutil
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmfsim._core import __version__
+from cmfsim.errors import CaseInputError
+from cmfsim.io import Case, write_image, write_landmarks, write_surface
+from cmfsim.io.cases.cohorts import COHORT_FORMAT
+from cmfsim.io.files.reading_writing import replacing
+from cmfsim.lab.virtual.carried_skin import scanned
+from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
+from cmfsim.lab.virtual.people import (
+    DRAWN,
+    PATIENTS,
+    Relocation,
+    TrueTissue,
+    VirtualPatient,
+    patient_named,
+)
+from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth
+from cmfsim.phantom import PhantomHead, make_head
+from cmfsim.values.checks import Floats, as_number, as_positive
+from cmfsim.values.progress import Progress, no_progress
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = [
+    "EXECUTED",
+    "PATIENTS_WITH_JOINED_LIPS",
+    "TRUTH",
+    "case_text",
+    "cohort_text",
+    "is_made",
+    "patient_settings",
+    "virtual_patients",
+    "write_virtual_patient",
+]
+
+_log = logging.getLogger(__name__)
+
+
+# Standard deviations, mm: of a landmark along each axis, on the skull for one operator and on the
+# skin for the mean of several; of a surface scanner's noise at a point, and of its waves.
+SKULL_NOISE, SKIN_NOISE = 0.7, 0.3
+SCAN_WHITE, SCAN_SMOOTH = 0.1, 0.2
+# Numbers that make the draws of one patient independent, next to seed and patient number.
+CT_DRAW, SKULL_DRAW, SKIN_DRAW, SCAN_DRAW, AFTER_DRAW = range(5)
+# Edge length of the mesh in the case file, relative to the true mesh.
+COARSER = 1.25
+# Patients made by default.
+PATIENTS_WITH_JOINED_LIPS = tuple(n for n, p in PATIENTS.items() if not p.separate_lips)
+TRUTH = "truth"
+RECORD = "truth.json"
+TIMES = "times.json"
+# The skin before the operation, whose vertices a prediction moves.
+SKIN = "skin.ply"
+COHORT = "cohort.toml"
+# The case with the operation as it was carried out, where it departs from the plan; and the cohort
+# of these.
+EXECUTED = "executed.toml"
+
+
+def virtual_patients(
+    folder: str | os.PathLike[str],
+    numbers: Iterable[int] = PATIENTS_WITH_JOINED_LIPS,
+    *,
+    seed: int = 0,
+    edge_length: float = 6.0,
+    spacing: float = 2.0,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """The case files of virtual patients, each in its own folder with the truth.
+
+    Patients who exist already with the same settings are kept. `cohort.toml` in the folder lists
+    the complete ones, for `cmfsim study`.
+
+    Parameters
+    ----------
+    folder : path
+        Patient n goes to `folder/Pn`.
+    numbers : iterable of int
+        1 to 6. Those whose lips meet, 5 and 6, take many times as long and are made on request.
+    seed : int
+        Of all noise; the same seed produces the same files.
+    edge_length : float, mm
+        Of the true mesh.
+    spacing : float, mm
+        Of the CT.
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    CmfsimError
+        (also `ValueError` where the input is at fault) As `write_virtual_patient`.
+    OSError
+        A folder cannot be written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cases = cmfsim.virtual_patients("insilico", [1, 2])  # doctest: +SKIP
+    """
+    patients = [patient_named(number) for number in numbers]
+    paths = []
+    for patient in patients:
+        place = Path(folder) / patient.name
+        settings = patient_settings(patient, seed, edge_length, spacing)
+        if is_made(place, settings):
+            _log.info("%s already exists", patient.name)
+            paths.append(place / "case.toml")
+            continue
+
+        def stage(name: str, of: VirtualPatient = patient) -> None:
+            if progress is not None:
+                progress(f"{of.name}: {name}")
+
+        paths.append(
+            write_virtual_patient(
+                place,
+                patient.number,
+                seed=seed,
+                edge_length=edge_length,
+                spacing=spacing,
+                progress=stage,
+            )
+        )
+    _write_cohort(Path(folder))
+    return paths
+
+
+def _write_cohort(folder: Path) -> None:
+    """The study of every patient who is complete in the folder."""
+    names = [p.name for p in PATIENTS.values() if (folder / p.name / TRUTH / RECORD).exists()]
+    with replacing(folder / COHORT) as file:
+        file.write(cohort_text("virtual patients", names).encode())
+
+
+def cohort_text(name: str, patients: Iterable[str], *, executed: bool = False) -> str:
+    """The text of a `cohort.toml` next to the folders of patients."""
+    lines = [
+        "# `cmfsim study` with this file predicts every patient by every model.",
+        f'format = "{COHORT_FORMAT}"',
+        "version = 1",
+        f'name = "{name}"',
+        'note = "in silico: synthetic heads and computed operations; no patients"',
+        'output = "executed"' if executed else 'output = "study"',
+    ]
+    for patient in patients:
+        file = f"{TRUTH}/{EXECUTED}" if executed else "case.toml"
+        lines += ["", "[[cases]]", f'name = "{patient}"', f'file = "{patient}/{file}"']
+    return "\n".join([*lines, ""])
+
+
+def write_virtual_patient(  # noqa: PLR0913 (options by name)
+    folder: str | os.PathLike[str],
+    patient: int | VirtualPatient,
+    *,
+    seed: int = 0,
+    edge_length: float = 6.0,
+    refine: bool = False,
+    spacing: float = 2.0,
+    grid: float = 1.5,
+    skin_spacing: float = 2.0,
+    options: EquilibriumOptions | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """The `case.toml` of a virtual patient, with CT and landmarks; the truth lies in `truth`.
+
+    *In silico*: a synthetic head and a computed operation. Its tissue, mesh, muscles and contact
+    differ from those of the models under test; see docs/virtual_patients.md.
+
+    Parameters
+    ----------
+    folder : path
+        Created if needed. An earlier truth in it is replaced once the new one is complete.
+    patient : int or VirtualPatient
+        1 to 6, or a result of `drawn_patient`.
+    seed : int
+        Of the noise of CT, landmarks and scan.
+    edge_length : float, mm
+        Of the true mesh.
+    refine : bool
+        Whether tets are smaller where tissue is thin; always so if the lips are separate.
+    spacing : float, mm
+        Of the CT.
+    grid : float, mm
+        Spacing of the level images from which the true mesh is made.
+    skin_spacing : float, mm
+        Of the marching cubes that make the skin.
+    options : EquilibriumOptions, optional
+    progress : callable, optional
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No such patient, a length that is not positive, a missing package of
+        the extra "study".
+    SolverError
+        The equilibrium was not found.
+    OSError
+        The folder cannot be written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> case = cmfsim.write_virtual_patient("P1", 1)  # doctest: +SKIP
+    """
+    if not isinstance(patient, VirtualPatient):
+        patient = patient_named(patient)
+    for name, value in (("edge_length", edge_length), ("spacing", spacing), ("grid", grid)):
+        as_positive(name, value)
+    as_positive("skin_spacing", skin_spacing)
+    if as_number("seed", seed) < 0 or int(seed) != seed:
+        raise CaseInputError(f"seed is {seed!r}: a whole number from 0 is needed")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    stage = progress or no_progress
+    begun = time.perf_counter()
+    head = make_head(patient.parameters)
+    stage("imaging the head")
+    case = _write_case(folder, patient, head, seed, spacing=spacing, edge_length=edge_length)
+    truth = postoperative_truth(
+        patient,
+        head,
+        case,
+        edge_length=edge_length,
+        refine=refine,
+        grid=grid,
+        skin_spacing=skin_spacing,
+        options=options,
+        progress=progress,
+    )
+    stage("writing the truth")
+    write_surface(folder / SKIN, truth.skin_before)
+    fresh = folder / f".{TRUTH}.new"
+    shutil.rmtree(fresh, ignore_errors=True)
+    _write_truth(fresh, truth, _scan(truth, patient, seed), _landmarks_after(truth, patient, seed))
+    if patient.departures:
+        text = case_text(patient, {}, COARSER * edge_length, executed=truth.motions)
+        (fresh / EXECUTED).write_text(text, encoding="utf-8")
+    settings = patient_settings(patient, seed, edge_length, spacing)
+    _write_json(fresh / RECORD, _record(patient, truth, settings))
+    # In a separate file: the record is reproduced to the last byte by the same seed.
+    times = {"seconds": time.perf_counter() - begun, "solve_seconds": truth.equilibrium.seconds}
+    _write_json(fresh / TIMES, times)
+    shutil.rmtree(folder / TRUTH, ignore_errors=True)
+    fresh.rename(folder / TRUTH)
+    return folder / "case.toml"
+
+
+def _write_case(
+    folder: Path,
+    patient: VirtualPatient,
+    head: PhantomHead,
+    seed: int,
+    *,
+    spacing: float,
+    edge_length: float,
+) -> Case:
+    """The case before the operation, read back from the files written: CT, landmarks, case file."""
+    ct = head.ct((spacing, spacing, spacing), seed=_draw(seed, patient, CT_DRAW))
+    write_image(ct, folder / "ct.nrrd")
+    skull = _placed(head.skull_landmarks, SKULL_NOISE, [seed, patient.number, SKULL_DRAW])
+    write_landmarks(folder / "skull.mrk.json", skull)
+    skin = _placed(head.skin_landmarks, SKIN_NOISE, [seed, patient.number, SKIN_DRAW])
+    write_landmarks(folder / "skin.mrk.json", skin)
+    with replacing(folder / "case.toml") as file:
+        file.write(case_text(patient, skull, COARSER * edge_length).encode())
+    return Case.load(folder / "case.toml")
+
+
+def _scan(truth: PostoperativeTruth, patient: VirtualPatient, seed: int) -> SurfaceData:
+    """The true skin after the operation as a surface scanner measures it."""
+    draw = [seed, patient.number, SCAN_DRAW]
+    return scanned(truth.skin, white=SCAN_WHITE, smooth=SCAN_SMOOTH, seed=draw)
+
+
+def _landmarks_after(
+    truth: PostoperativeTruth, patient: VirtualPatient, seed: int
+) -> dict[str, Floats]:
+    return _placed(truth.skin_landmarks, SKIN_NOISE, [seed, patient.number, AFTER_DRAW])
+
+
+def _record(
+    patient: VirtualPatient, truth: PostoperativeTruth, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Content of `truth.json`: how the patient was made, and the properties of the truth."""
+    return {
+        "what": "in silico: a synthetic head and a computed operation; no patient",
+        "settings": settings,
+        "patient": _described(patient),
+        "motions": {name: matrix.tolist() for name, matrix in truth.motions.items()},
+        "noise_mm": {
+            "skull_landmarks": SKULL_NOISE,
+            "skin_landmarks": SKIN_NOISE,
+            "scan_white": SCAN_WHITE,
+            "scan_smooth": SCAN_SMOOTH,
+        },
+        "truth": _measured(truth),
+        "versions": {"cmfsim": __version__, "python": platform.python_version()},
+    }
+
+
+def _write_json(path: Path, values: Mapping[str, Any]) -> None:
+    with replacing(path) as file:
+        file.write(json.dumps(values, indent=1, allow_nan=False).encode())
+
+
+def _draw(seed: int, patient: VirtualPatient, draw: int) -> int:
+    """The seed of one draw for one patient."""
+    return int(np.random.SeedSequence([seed, patient.number, draw]).generate_state(1)[0])
+
+
+def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> dict[str, Floats]:
+    """Landmarks with placement noise along each axis."""
+    generator = np.random.default_rng(seed)
+    return {
+        label: point + noise * generator.standard_normal(3) for label, point in landmarks.items()
+    }
+
+
+def case_text(
+    patient: VirtualPatient,
+    skull: Mapping[str, Floats],
+    edge_length: float,
+    *,
+    executed: Mapping[str, Floats] | None = None,
+) -> str:
+    """The text of `case.toml`, or of the case with the operation as it was carried out.
+
+    Parameters
+    ----------
+    patient : VirtualPatient
+    skull : mapping of str to (3,) float64, mm
+        Landmarks about which the turns of the plan are.
+    edge_length : float, mm
+        Of the mesh.
+    executed : mapping of str to (4, 4) float64, mm, optional
+        True motions of the segments, which replace the plan in a file in the folder of the truth.
+    """
+    place, truth = ("", f"{TRUTH}/") if executed is None else ("../", "")
+    what = (
+        "# `cmfsim evaluate case.toml` predicts the face and compares it with the truth in truth/."
+        if executed is None
+        else "# Its plan is what the operation did: errors are those of the tissue alone."
+    )
+    lines = [
+        f"# Virtual patient {patient.name} ({patient.label}), in silico: no patient.",
+        what,
+        'format = "cmfsim-case"',
+        "version = 1",
+        f'name = "{patient.name}-in-silico"',
+        "",
+        "[image]",
+        f'file = "{place}ct.nrrd"',
+        "",
+        "[landmarks]",
+        f'skull = "{place}skull.mrk.json"',
+        f'skin = "{place}skin.mrk.json"',
+    ]
+    for procedure in patient.osteotomies:
+        lines += ["", "[[osteotomies]]", f'procedure = "{procedure}"']
+    for segment, move in patient.plan.items():
+        motion = (
+            _motion_lines(move, skull)
+            if executed is None
+            else [f"matrix = {executed[segment].tolist()}"]
+        )
+        lines += ["", f"[plan.{segment}]", *motion]
+    lines += [
+        "",
+        "[mesh]",
+        f"edge_length = {edge_length:g}",
+        "",
+        "[muscles]",
+        "",
+        "[postoperative]",
+        f'skin = "{truth}skin.ply"',
+        f'landmarks = "{truth}skin.mrk.json"',
+        "",
+        "[output]",
+        'folder = "out"',
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _motion_lines(move: Relocation, skull: Mapping[str, Floats]) -> list[str]:
+    lines = [f"translation = {list(move.translation)}"]
+    if move.angle:
+        centre = [round(float(x), 3) for x in skull[move.centre]]
+        lines += [
+            f"angle = {move.angle}",
+            f"axis = {list(move.axis)}",
+            f"centre = {centre}   # {move.centre}",
+        ]
+    return lines
+
+
+def patient_settings(
+    patient: VirtualPatient, seed: int, edge_length: float, spacing: float
+) -> dict[str, Any]:
+    """The settings that determine a patient's files; `truth.json` stores them for comparison."""
+    # A drawn patient depends on the distributions of this version.
+    # Through JSON, so that tuples equal the lists that are read back.
+    drawn = patient.number > DRAWN
+    person = {"person": json.loads(json.dumps(_described(patient)))} if drawn else {}
+    return {
+        **person,
+        "version": __version__,
+        "patient": patient.number,
+        "seed": int(seed),
+        "edge_length": float(edge_length),
+        "spacing": float(spacing),
+    }
+
+
+def _described(patient: VirtualPatient) -> dict[str, Any]:
+    return {
+        "name": patient.name,
+        "label": patient.label,
+        "head": asdict(patient.parameters),
+        "muscle_thickness": patient.muscle_thickness,
+        "muscle_stiffness": patient.muscle_stiffness,
+        "osteotomies": list(patient.osteotomies),
+        "plan": {name: asdict(move) for name, move in patient.plan.items()},
+        "departures": {name: asdict(move) for name, move in patient.departures.items()},
+        "thickness_change": patient.thickness_change,
+        "tissue": {f.name: _plain(getattr(patient.tissue, f.name)) for f in fields(TrueTissue)},
+    }
+
+
+def _plain(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else value
+
+
+def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
+    """Figures of the solution."""
+    found = truth.equilibrium
+    moved = truth.skin.vertices - truth.skin_before.vertices
+    lips = truth.lips
+    contact: dict[str, Any] = {}
+    if lips is not None:
+        contact = {
+            "lip_nodes": len(lips.upper.nodes) + len(lips.lower.nodes),
+            "lip_nodes_touching": lips.touching(truth.displacements),
+            "lip_penetration_mm": lips.penetration(truth.displacements),
+        }
+    return {
+        **contact,
+        "nodes": len(truth.nodes),
+        "tets": len(truth.tets),
+        "muscle_fraction": float(truth.fraction.mean()),
+        "stripped_nodes": truth.operation.stripped,
+        "residual": found.residual,
+        "newton_iterations": len(found.history),
+        "linear_iterations": found.linear_iterations,
+        "energy_Nmm": found.energy,
+        "penetration_mm": truth.penetration,
+        "last_skin_step_mm": truth.last_step,
+        "volume_ratio": [float(truth.volume_ratios.min()), float(truth.volume_ratios.max())],
+        "largest_skin_move_mm": float(np.linalg.norm(moved, axis=1).max()),
+    }
+
+
+def _write_truth(
+    folder: Path, truth: PostoperativeTruth, scan: SurfaceData, placed: Mapping[str, Floats]
+) -> None:
+    folder.mkdir()
+    write_surface(folder / "skin.ply", scan)
+    write_surface(folder / "skin_exact.ply", truth.skin)
+    write_surface(folder / "skin_before.ply", truth.skin_before)
+    write_landmarks(folder / "skin.mrk.json", placed)
+    write_landmarks(folder / "skin_exact.mrk.json", truth.skin_landmarks)
+    write_landmarks(folder / "skull_exact.mrk.json", truth.skull_landmarks)
+    for name in ("bones", "bones_before"):
+        (folder / name).mkdir()
+    for name, segment in truth.segments.items():
+        before, matrix = segment.surface.vertices, truth.motions[name]
+        after = before @ matrix[:3, :3].T + matrix[:3, 3]
+        write_surface(folder / "bones_before" / f"{name}.ply", segment.surface)
+        write_surface(
+            folder / "bones" / f"{name}.ply", SurfaceData(after, segment.surface.triangles)
+        )
+
+
+def is_made(folder: Path, settings: Mapping[str, Any]) -> bool:
+    """Whether a complete patient with these settings exists."""
+    record = folder / TRUTH / RECORD
+    if not record.exists() or not (folder / "case.toml").exists():
+        return False
+    try:
+        found = json.loads(record.read_text(encoding="utf-8"))
+    except ValueError:
+        return False
+    return isinstance(found, dict) and found.get("settings") == settings

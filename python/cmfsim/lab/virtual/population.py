@@ -1,0 +1,268 @@
+"""Virtual patients drawn at random: shape, tissue, operation, plan and how it is carried out.
+
+docs/virtual_patients.md lists the distributions with their sources. A patient depends on seed and
+index only, so that a population can be made in any order, in parts, and extended.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from cmfsim.errors import CaseInputError
+from cmfsim.lab.virtual.people import DRAWN, Relocation, TrueTissue, VirtualPatient
+from cmfsim.phantom import HeadParameters
+from cmfsim.phantom.geometry.courses import COURSES
+from cmfsim.values.checks import as_number, check_one_of
+from cmfsim.values.uncertainty import ADDED, PLAN
+
+__all__ = ["OWN", "PHANTOM", "TRUTHS", "drawn_patient"]
+
+# Mean, standard deviation and largest departure from the mean.
+Distribution = tuple[float, float, float]
+
+# Osteotomies, and the share of patients who have them.
+OPERATIONS = (
+    (("le_fort_1", "bsso"), 0.5),
+    (("bsso",), 0.25),
+    (("le_fort_1", "bsso", "genioplasty"), 0.15),
+    (("le_fort_1",), 0.1),
+)
+LABELS: Mapping[str, str] = {"le_fort_1": "Mx", "bsso": "M", "genioplasty": "G"}
+# By how much the mandible of a patient is too long or too short, mm; half of them each.
+DISCREPANCY: Distribution = (4.0, 1.2, 2.0)
+# Motions of a plan, mm.
+MAXILLA_FORWARDS: Distribution = (4.0, 1.9, 3.0)
+MAXILLA_UP: Distribution = (0.5, 1.5, 3.0)
+CHIN_FORWARDS: Distribution = (3.0, 1.5, 3.0)
+# Motion of the mandible beyond the correction of its length, and the share of the maxilla's motion
+# that it follows.
+MANDIBLE_BEYOND: Distribution = (0.0, 1.0, 2.0)
+MANDIBLE_UP: Distribution = (0.5, 0.5, 1.0)
+FOLLOWS = 0.5
+# Share of the patients whose mandible is too long.
+LONGER = 0.5
+# Turns about the transverse axis, degrees.
+PITCH: Distribution = (0.0, 1.5, 3.0)
+# The shortest motion of a mandible that is operated, mm.
+LEAST_WAY = 2.0
+# Of the logarithm of the ratio of a person's muscles to the phantom's.
+MUSCLE_THICKNESS: Distribution = (0.0, 0.12, 0.25)
+MUSCLE_STIFFNESS: Distribution = (0.0, 0.5, 1.0)
+# Gap between the lips, mm, as in a patient who is scanned at rest; and between the teeth.
+LIP_GAP: Distribution = (2.0, 0.5, 1.0)
+BITE_GAP = 2.5
+# Errors of execution are limited to this many standard deviations.
+MOST_ERRORS = 2.0
+# Of a chin relative to the jaw from which it is cut, mm along each axis.
+CHIN_ERROR = 0.5
+# Of the soft tissue, as a share of its depth.
+THICKNESS_CHANGE = next(source.sd for source in ADDED if source.name == "thickness change")
+# Central share of a `HeadParameters` range from which values are drawn: no person is at the ends of
+# several ranges at once.
+MIDDLE = 0.7
+SHAPES = (
+    "scale",
+    "face_height",
+    "nose_length",
+    "nose_projection",
+    "lip_fullness",
+    "chin_projection",
+    "jaw_width",
+    "fat_thickness",
+    "asymmetry",
+)
+
+
+# How the true tissue is made: with muscles, moduli and sliding of its own, or with those that the
+# models assume, as the phantom has them from which the built-in template was drawn.
+TRUTHS = OWN, PHANTOM = "own", "phantom"
+# Number that makes the draws of a person's tissue independent of all others.
+TISSUE_DRAW = 1
+# Young's modulus of muscle along its fibres, MPa, log-uniform: from the masseter at rest in
+# elastography to the constants of Kim et al. 2010 (docs/moduli.md); and the ratio of it to that
+# across, about whose direction sources disagree.
+MUSCLE_YOUNG = (0.007, 0.79)
+ALONG_OVER_ACROSS = (0.5, 2.0)
+# Of fat, uniform: what tissue squeezed for weeks loses in volume is not known.
+FAT_POISSON = (0.3, 0.48)
+# Of skin, MPa, log-uniform, and its thickness, mm, uniform.
+SKIN_YOUNG = (0.01, 0.5)
+SKIN_THICKNESS = (1.0, 2.0)
+# Offset of a muscle along each axis, mm: 5 mm in all.
+MUSCLE_OFFSET: Distribution = (0.0, 2.9, 5.8)
+# Share of persons who lack a muscle of expression on both sides, and the muscles nobody lacks.
+LACKING = 0.1
+NEVER_LACKING = (
+    "masseter",
+    "temporalis",
+    "medial_pterygoid",
+    "buccinator",
+    "orbicularis_oris",
+    "orbicularis_oculi",
+)
+# Depth of the vestibule beyond that which the models assume, mm.
+VESTIBULE: Distribution = (0.0, 2.0, 4.0)
+
+
+class _Draws:
+    """The random numbers of one patient."""
+
+    def __init__(self, *seed: int) -> None:
+        self.generator = np.random.default_rng(seed)
+
+    def within(self, distribution: Distribution) -> float:
+        """A normal draw, limited to the largest departure and rounded as in a plan."""
+        mean, sd, most = distribution
+        off = float(np.clip(sd * self.generator.standard_normal(), -most, most))
+        return round(mean + off, 2)
+
+    def error(self, sd: float) -> float:
+        """A normal draw about zero."""
+        return self.within((0.0, sd, MOST_ERRORS * sd))
+
+    def uniform(self, low: float, high: float) -> float:
+        """A number between two others, rounded to a thousandth."""
+        return round(float(self.generator.uniform(low, high)), 3)
+
+    def log_uniform(self, low: float, high: float) -> float:
+        """A number whose logarithm is uniform, rounded to three digits."""
+        return float(f"{np.exp(self.generator.uniform(np.log(low), np.log(high))):.3g}")
+
+
+def drawn_patient(seed: int, index: int, *, truth: str = OWN) -> VirtualPatient:
+    """One patient of the population that belongs to a seed.
+
+    Parameters
+    ----------
+    seed : int
+        0 or more.
+    index : int
+        1 or more; the patient is named D with this number.
+    truth : str
+        "own": the person's muscles lie elsewhere than the phantom's, some are absent, all have
+        their own moduli, fat and skin too, and tissue slides on bone; "phantom": muscles, moduli of
+        fat and sliding are what the models assume. Shape, operation, plan and errors are the same.
+
+    Returns
+    -------
+    VirtualPatient
+        Always the same for the same seed, index and truth.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A seed or index that is not a whole number in its range; another truth.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.drawn_patient(0, 1) == cmfsim.drawn_patient(0, 1)
+    True
+    """
+    for name, value, least in (("seed", seed, 0), ("index", index, 1)):
+        if as_number(name, value) < least or int(value) != value:
+            raise CaseInputError(f"{name} is {value!r}: a whole number from {least} is needed")
+    check_one_of("truth", truth, TRUTHS)
+    draws = _Draws(int(seed), int(index))
+    shares = np.array([share for _, share in OPERATIONS])
+    osteotomies = OPERATIONS[int(draws.generator.choice(len(OPERATIONS), p=shares))][0]
+    person = _person(draws, only_maxilla=osteotomies == ("le_fort_1",))
+    plan = _plan(draws, person, osteotomies)
+    patient = VirtualPatient(
+        DRAWN + int(index),
+        ", ".join(LABELS[procedure] for procedure in osteotomies),
+        person,
+        round(float(np.exp(draws.within(MUSCLE_THICKNESS))), 3),
+        round(float(np.exp(draws.within(MUSCLE_STIFFNESS))), 3),
+        osteotomies,
+        plan,
+        departures=_departures(draws, plan),
+        thickness_change=round(0.01 * draws.error(100.0 * THICKNESS_CHANGE), 4),
+    )
+    if truth == PHANTOM:
+        return patient
+    tissue = _own_tissue(_Draws(int(seed), int(index), TISSUE_DRAW))
+    return replace(patient, muscle_stiffness=1.0, tissue=tissue)
+
+
+def _own_tissue(draws: _Draws) -> TrueTissue:
+    """Tissue about which the models know nothing but that it lies between bones and skin."""
+    along = draws.log_uniform(*MUSCLE_YOUNG)
+    across = float(f"{along / draws.log_uniform(*ALONG_OVER_ACROSS):.3g}")
+    offsets: dict[str, tuple[float, float, float]] = {}
+    absent: list[str] = []
+    for name, course in COURSES.items():
+        sides = [f"{name}_{side}" for side in "LR"] if course.paired else [name]
+        lacking = draws.generator.random() < LACKING
+        if lacking and name not in NEVER_LACKING:
+            absent += sides
+        for side in sides:
+            left, back, up = (draws.within(MUSCLE_OFFSET) for _ in range(3))
+            offsets[side] = (left, back, up)
+    return TrueTissue(
+        muscle_young=(along, across),
+        fat_poisson=draws.uniform(*FAT_POISSON),
+        skin_young=draws.log_uniform(*SKIN_YOUNG),
+        skin_thickness=draws.uniform(*SKIN_THICKNESS),
+        offsets={name: offset for name, offset in offsets.items() if name not in absent},
+        absent=tuple(absent),
+        slides_on="bone",
+        vestibule=draws.within(VESTIBULE),
+    )
+
+
+def _person(draws: _Draws, *, only_maxilla: bool) -> HeadParameters:
+    """A head whose jaws do not meet."""
+    extreme = HeadParameters.random(int(draws.generator.integers(2**31)))
+    ordinary = HeadParameters()
+    values = {}
+    for name in SHAPES:
+        middle = getattr(ordinary, name)
+        values[name] = round(middle + MIDDLE * (getattr(extreme, name) - middle), 4)
+    longer = bool(draws.generator.random() < LONGER)
+    excess = draws.within(DISCREPANCY)
+    # A maxilla is advanced alone if the mandible is too long.
+    values["mandible_advance"] = excess if longer or only_maxilla else -excess
+    return replace(ordinary, **values, lip_gap=draws.within(LIP_GAP), bite_gap=BITE_GAP)
+
+
+def _plan(
+    draws: _Draws, person: HeadParameters, osteotomies: tuple[str, ...]
+) -> dict[str, Relocation]:
+    """The plan that a surgeon would make for the person."""
+    plan = {}
+    forwards, up, pitch = (draws.within(d) for d in (MAXILLA_FORWARDS, MAXILLA_UP, PITCH))
+    if "le_fort_1" in osteotomies:
+        plan["maxilla"] = Relocation((0.0, -forwards, up), pitch)
+    follow = FOLLOWS * forwards if "maxilla" in plan else 0.0
+    back = person.mandible_advance - follow + draws.within(MANDIBLE_BEYOND)
+    back = round(float(np.copysign(max(abs(back), LEAST_WAY), back)), 2)
+    up, pitch = draws.within(MANDIBLE_UP), draws.within(PITCH)
+    left = round(-person.asymmetry, 2)
+    if "bsso" in osteotomies:
+        plan["mandible_body"] = Relocation((left, back, up), pitch, centre="infradentale")
+    chin = draws.within(CHIN_FORWARDS)
+    if "genioplasty" in osteotomies:
+        # Moves with the body of the mandible, and further forward.
+        way = (left, round(back - chin, 2), up)
+        plan["chin"] = Relocation(way, pitch, centre="infradentale")
+    return plan
+
+
+def _departures(draws: _Draws, plan: Mapping[str, Relocation]) -> dict[str, Relocation]:
+    """The deviation of the operation from the plan.
+
+    If both jaws are operated, they depart together, since a splint holds them in occlusion.
+    """
+    left, back, up, pitch, roll, yaw = (draws.error(source.sd) for source in PLAN)
+    angle = float(np.linalg.norm([pitch, roll, yaw]))
+    axis = (pitch / angle, roll / angle, yaw / angle) if angle > 0.0 else (1.0, 0.0, 0.0)
+    centre = "supradentale" if "maxilla" in plan else "infradentale"
+    both = Relocation((left, back, up), angle, axis, centre)
+    found = {name: both for name in plan if name != "chin"}
+    own = [draws.error(CHIN_ERROR) for _ in range(3)]
+    if "chin" in plan:
+        way = (left + own[0], back + own[1], up + own[2])
+        found["chin"] = replace(both, translation=way)
+    return found

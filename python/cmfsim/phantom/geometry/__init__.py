@@ -1,0 +1,1 @@
+"""Curves and shapes that the synthetic head is made of."""

@@ -1,0 +1,451 @@
+"""Building blocks of anatomy: levels that are positive inside, and how they melt together.
+
+A level is close to the signed distance in mm near its surface. Coordinates come as three arrays
+that broadcast, so that a grid is evaluated from its axes and what depends on one axis alone is
+computed once per line. Shapes further than REACH from the requested box are skipped. They could not
+have moved what is near a surface, so that levels there do not depend on which points are asked
+together; far outside a level is merely negative.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from cmfsim.phantom.geometry.curves import Level, Table, clipped, smooth_max, smooth_step
+from cmfsim.values.checks import Floats
+
+__all__ = [
+    "REACH",
+    "Blend",
+    "Box",
+    "Egg",
+    "Engraving",
+    "FlatTube",
+    "Loft",
+    "Plane",
+    "Shape",
+    "Step",
+    "Tube",
+    "Within",
+]
+
+# Shapes further away than this are left out, mm: twice the widest melt, so that not even a melt of
+# melts feels them.
+REACH = 24.0
+# No section of a loft is larger than this, mm.
+LARGEST_RADIUS = 150.0
+# The level where no shape is near, mm.
+FAR = -REACH
+# Smallest length that is divided by, mm.
+TINY = 1e-6
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box, mm."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def grown(self, margin: float) -> "Box":
+        """The box with a margin on every side."""
+        x, y, z = self.low
+        u, v, w = self.high
+        return Box((x - margin, y - margin, z - margin), (u + margin, v + margin, w + margin))
+
+
+EVERYWHERE = Box((-np.inf, -np.inf, -np.inf), (np.inf, np.inf, np.inf))
+
+
+class Shape(Protocol):
+    """Something with an inside."""
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The level at points, positive inside, mm."""
+
+
+def _root(total: Level, n: Level | float) -> Level:
+    """total^(1/n) for totals above 0; log and exp are faster than the power of float32."""
+    if isinstance(n, float) and n == 2.0:
+        return np.sqrt(total)
+    return np.exp(np.log(np.maximum(total, TINY)) / n)
+
+
+@dataclass(frozen=True, eq=False)
+class Egg:
+    """A superellipsoid whose radii differ between the lower and the upper side of each axis.
+
+    Attributes
+    ----------
+    centre : (3,) mm
+    low, high : (3,) mm
+        Radii towards smaller and larger coordinates; `high` as `low` where left out.
+    power : float
+        2 is an ellipsoid, more is boxier.
+    turn : (3, 3) or None
+        Rows are the egg's own axes.
+    """
+
+    centre: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float] | None = None
+    power: float = 2.0
+    turn: Floats | None = None
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+        c = np.asarray(self.centre)
+        high = self.low if self.high is None else self.high
+        if self.turn is not None:
+            reach = float(max(*self.low, *high)) * (1.8 if self.power > 2.0 else 1.0)
+            lows, highs = c - reach, c + reach
+        else:
+            lows, highs = np.subtract(c, self.low), np.add(c, high)
+        return Box(tuple(lows.tolist()), tuple(highs.tolist()))
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """Value over gradient length of the homogeneous form: (1 − g)/|∇g|."""
+        parts = [x - self.centre[0], y - self.centre[1], z - self.centre[2]]
+        if self.turn is not None:
+            u, v, w = parts
+            parts = [row[0] * u + row[1] * v + row[2] * w for row in self.turn.tolist()]
+        high = self.low if self.high is None else self.high
+        n = self.power
+        total: Level = np.zeros(1, dtype=x.dtype)
+        slope: Level = np.zeros(1, dtype=x.dtype)
+        for part, low, up in zip(parts, self.low, high, strict=True):
+            radius = low if low == up else np.where(part < 0.0, low, up).astype(x.dtype)
+            q = np.abs(part) / radius
+            power = q * q if n == 2.0 else q**n
+            total = total + power
+            slope = slope + (power / np.maximum(q, TINY) / radius) ** 2
+        g = _root(total, n)
+        # ∇g = g^(1−n) (q^(n−1)/r); near the centre the level stays below the smallest radius.
+        slope_length = np.sqrt(slope) * g / np.maximum(total, TINY)
+        smallest = float(min(*self.low, *high))
+        return np.where(
+            g < 0.25, (1.0 - g) * smallest, (1.0 - g) / np.maximum(slope_length, TINY)
+        ).astype(x.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Reaches:
+    """Boxes of many things, to find those that come near an asked box.
+
+    Attributes
+    ----------
+    low, high : (n, 3) mm
+        Grown by how far each thing matters.
+    """
+
+    low: Floats
+    high: Floats
+
+    @classmethod
+    def of_line(cls, points: Floats, radius: Floats) -> "Reaches":
+        """The boxes of the segments of a tube."""
+        low, high = points - radius[:, None], points + radius[:, None]
+        return cls(np.minimum(low[:-1], low[1:]) - REACH, np.maximum(high[:-1], high[1:]) + REACH)
+
+    def near(self, x: Level, y: Level, z: Level) -> list[int]:
+        """The things that matter where the points lie."""
+        low = np.array([x.min(), y.min(), z.min()])
+        high = np.array([x.max(), y.max(), z.max()])
+        meets = (self.low <= high) & (self.high >= low)
+        return np.flatnonzero(meets.all(axis=1)).tolist()
+
+
+@dataclass(frozen=True, eq=False)
+class Tube:
+    """A round tube of changing radius along a polyline.
+
+    Attributes
+    ----------
+    points : (n, 4)
+        Place and radius, mm.
+    """
+
+    points: Floats
+
+    @cached_property
+    def segments(self) -> Reaches:
+        """Where each segment matters."""
+        return Reaches.of_line(self.points[:, :3], self.points[:, 3])
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+        place, radius = self.points[:, :3], self.points[:, 3:]
+        return Box(
+            tuple((place - radius).min(axis=0).tolist()),
+            tuple((place + radius).max(axis=0).tolist()),
+        )
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """Radius less distance, of the best segment."""
+        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), FAR, dtype=x.dtype)
+        rows = self.points.tolist()
+        for i in self.segments.near(x, y, z):
+            (ax, ay, az, ar), (bx, by, bz, br) = rows[i], rows[i + 1]
+            ux, uy, uz = bx - ax, by - ay, bz - az
+            size = max(ux * ux + uy * uy + uz * uz, TINY)
+            px, py, pz = x - ax, y - ay, z - az
+            t = clipped((px * ux + py * uy + pz * uz) / size)
+            d = np.sqrt((px - t * ux) ** 2 + (py - t * uy) ** 2 + (pz - t * uz) ** 2)
+            best = np.maximum(best, ar + t * (br - ar) - d)
+        return best
+
+
+@dataclass(frozen=True, eq=False)
+class FlatTube:
+    """A tube of elliptic section along a polyline: a strap.
+
+    Attributes
+    ----------
+    points : (n, 3) mm
+    normals : (n, 3)
+        Unit vectors along which the strap is thin.
+    thick, wide : (n,) mm
+        Half axes of the section, along the normal and across it.
+    """
+
+    points: Floats
+    normals: Floats
+    thick: Floats
+    wide: Floats
+
+    @cached_property
+    def segments(self) -> Reaches:
+        """Where each segment matters."""
+        return Reaches.of_line(self.points, np.maximum(self.thick, self.wide))
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+        reach = np.maximum(self.thick, self.wide)[:, None]
+        return Box(
+            tuple((self.points - reach).min(axis=0).tolist()),
+            tuple((self.points + reach).max(axis=0).tolist()),
+        )
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The level of the ellipse in the section through the closest point of the polyline."""
+        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), FAR, dtype=x.dtype)
+        for i in self.segments.near(x, y, z):
+            ax, ay, az = self.points[i].tolist()
+            ux, uy, uz = (self.points[i + 1] - self.points[i]).tolist()
+            size = max(ux * ux + uy * uy + uz * uz, TINY)
+            px, py, pz = x - ax, y - ay, z - az
+            t = clipped((px * ux + py * uy + pz * uz) / size)
+            qx, qy, qz = px - t * ux, py - t * uy, pz - t * uz
+            d2 = qx * qx + qy * qy + qz * qz
+            n, dn = self.normals[i].tolist(), (self.normals[i + 1] - self.normals[i]).tolist()
+            off = qx * (n[0] + t * dn[0]) + qy * (n[1] + t * dn[1]) + qz * (n[2] + t * dn[2])
+            thick = self.thick[i] + t * (self.thick[i + 1] - self.thick[i])
+            wide = self.wide[i] + t * (self.wide[i + 1] - self.wide[i])
+            u2 = off * off
+            v2 = np.maximum(d2 - u2, 0.0)
+            # iq's bound of the distance to an ellipse: k₀(1 − k₀)/k₁.
+            k0 = np.sqrt(u2 / thick**2 + v2 / wide**2)
+            k1 = np.sqrt(u2 / thick**4 + v2 / wide**4)
+            value = np.where(k0 < 0.05, thick, k0 * (1.0 - k0) / np.maximum(k1, TINY))
+            best = np.maximum(best, value)
+        return best.astype(x.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The half-space on the side that the normal looks away from.
+
+    Attributes
+    ----------
+    point : (3,) mm
+    normal : (3,)
+        Unit vector, outward.
+    """
+
+    point: Sequence[float]
+    normal: Sequence[float]
+
+    @property
+    def box(self) -> Box:
+        """Everywhere: a half-space has no end."""
+        return EVERYWHERE
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The distance behind the plane."""
+        p, n = self.point, self.normal
+        depth: Level = (p[0] - x) * n[0] + (p[1] - y) * n[1] + (p[2] - z) * n[2]
+        return depth
+
+
+@dataclass(frozen=True, eq=False)
+class Loft:
+    """A body whose horizontal sections are superellipses that change with height.
+
+    Attributes
+    ----------
+    middle : float, mm
+        y of the widest place of every section.
+    front, back, width, power : Table
+        Of z: y of the foremost and hindmost point, half width, and the exponent of the section.
+    box : Box
+    """
+
+    middle: float
+    front: Table
+    back: Table
+    width: Table
+    power: Table
+    box: Box
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """Value over gradient length of the homogeneous form of the section."""
+        n, w = self.power.at(z), self.width.at(z)
+        forward = y < self.middle
+        f = np.where(forward, self.middle - self.front.at(z), self.back.at(z) - self.middle)
+        df = np.where(forward, -self.front.slope(z), self.back.slope(z))
+        qx = np.maximum(np.abs(x) / w, TINY)
+        qy = np.maximum(np.abs(y - self.middle) / f, TINY)
+        px, py = qx**n, qy**n
+        total = np.maximum(px + py, TINY)
+        g = _root(total, n)
+        gx, gy = px / qx / w, py / qy / f
+        gz = px * self.width.slope(z) / w + py * df / f
+        slope = np.sqrt(gx * gx + gy * gy + gz * gz) * g / total
+        # Deep inside, where the form is flat, the level stays below its largest radius.
+        level: Level = (1.0 - g) / np.maximum(slope, 1.0 / LARGEST_RADIUS)
+        return level.astype(x.dtype, copy=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Engraving:
+    """A groove or ridge along a curve drawn on the face as seen from in front.
+
+    Attributes
+    ----------
+    curve : (n, 2) mm
+        x and z.
+    width : float, mm
+        Half width, where the groove ends with no corner.
+    depth : (n,) mm
+        How far the surface moves in; negative moves out.
+    behind : float, mm
+        y beyond which nothing is engraved.
+    """
+
+    curve: Floats
+    width: float
+    depth: Floats
+    behind: float = -40.0
+
+    @property
+    def box(self) -> Box:
+        """Where something is engraved."""
+        (x, z), (u, w) = self.curve.min(axis=0) - self.width, self.curve.max(axis=0) + self.width
+        return Box((x, -200.0, z), (u, self.behind, w))
+
+    def shift(self, x: Level, y: Level, z: Level) -> Level:
+        """How far the level sinks."""
+        near: Level = np.full(np.broadcast_shapes(x.shape, z.shape), np.inf, dtype=x.dtype)
+        depth: Level = np.zeros_like(near)
+        for i in range(len(self.curve) - 1):
+            (ax, az), (bx, bz) = self.curve[i].tolist(), self.curve[i + 1].tolist()
+            ux, uz = bx - ax, bz - az
+            px, pz = x - ax, z - az
+            t = clipped((px * ux + pz * uz) / max(ux * ux + uz * uz, TINY))
+            d2 = (px - t * ux) ** 2 + (pz - t * uz) ** 2
+            value = self.depth[i] + t * (self.depth[i + 1] - self.depth[i])
+            depth = np.where(d2 < near, value, depth)
+            near = np.minimum(near, d2)
+        bump = np.maximum(1.0 - near / self.width**2, 0.0) ** 2
+        fade = smooth_step(y, self.behind, self.behind - 10.0)
+        shift: Level = depth * bump * fade
+        return shift.astype(x.dtype, copy=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What one shape does to the shapes before it.
+
+    Attributes
+    ----------
+    how : str
+        "join" adds the shape, "cut" takes it away, "meet" keeps what lies in both.
+    shape : Shape
+    melt : float, mm
+        Width of the rounding.
+    """
+
+    how: str
+    shape: Shape
+    melt: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Within:
+    """What of a shape lies at least `depth` mm below the surface of another."""
+
+    shape: Shape
+    outer: Shape
+    depth: float
+
+    @property
+    def box(self) -> Box:
+        """Where the level can be above 0."""
+        return self.shape.box
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The lesser of both levels."""
+        inside = self.outer.level(x, y, z) - self.depth
+        level: Level = np.minimum(self.shape.level(x, y, z), inside)
+        return level
+
+
+@dataclass(frozen=True, eq=False)
+class Blend:
+    """Shapes joined, cut and engraved one after another."""
+
+    steps: tuple[Step | Engraving, ...]
+    box: Box
+
+    @cached_property
+    def _reaches(self) -> Reaches:
+        """Where each step matters: within REACH of its box."""
+        low, high = [], []
+        for step in self.steps:
+            if isinstance(step, Engraving):
+                box, margin = step.box, 0.0
+            elif step.how == "meet":
+                box, margin = EVERYWHERE, 0.0
+            else:
+                box, margin = step.shape.box, REACH
+            low.append(np.subtract(box.low, margin))
+            high.append(np.add(box.high, margin))
+        return Reaches(np.array(low), np.array(high))
+
+    def level(self, x: Level, y: Level, z: Level) -> Level:
+        """The level after the last step."""
+        shape = np.broadcast_shapes(x.shape, y.shape, z.shape)
+        value: Level = np.full(shape, FAR, dtype=x.dtype)
+        for i in self._reaches.near(x, y, z):
+            step = self.steps[i]
+            if isinstance(step, Engraving):
+                value = value - step.shift(x, y, z)
+                continue
+            other = step.shape.level(x, y, z)
+            if step.how == "join":
+                value = smooth_max(value, other, step.melt)
+            elif step.how == "cut":
+                value = -smooth_max(-value, other, step.melt)
+            else:
+                value = -smooth_max(-value, -other, step.melt)
+        return value.astype(x.dtype, copy=False)

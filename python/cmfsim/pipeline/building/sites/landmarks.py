@@ -1,0 +1,216 @@
+"""Landmarks of a case that gives none or few: found on its head; where they come from in words."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from cmfsim.doctor.surgery.bone_overlap import jaw_of
+from cmfsim.errors import LandmarkError, LandmarkInputError
+from cmfsim.io import Case
+from cmfsim.pipeline.building.inputs import read_placed_sites
+from cmfsim.pipeline.building.parts import Head
+from cmfsim.pipeline.building.stages import Stages
+from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.case_parts import FEW_SITES
+from cmfsim.values.checks import Floats
+from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import is_lower_site
+from cmfsim.values.proposed_landmarks import ProposedLandmarks
+
+__all__ = ["found_landmarks", "is_to_be_found", "landmark_summary", "needs_lower_jaw"]
+
+
+# Found sites of which one lies farther than this from where it was placed, mm, are of no use:
+# landmarks of unseen heads are 2 to 5 mm off on average.
+DISAGREE = 12.0
+# Sites of one jaw, and those of the other that lie opposite.
+OPPOSITE = (
+    ("supradentale", "infradentale"),
+    ("supra_m2_L", "sub_m2_L"),
+    ("supra_m2_R", "sub_m2_R"),
+)
+
+
+def is_to_be_found(case: Case, placed: Mapping[str, Mapping[str, Floats]]) -> bool:
+    """Whether landmarks are found automatically: all, or those that a few placed ones leave."""
+    if case.landmarks.fills:
+        return True
+    if case.landmarks.proposed:
+        return not placed
+    is_needed = case.muscles is not None or any(cut.procedure for cut in case.osteotomies)
+    return is_needed and case.landmarks.is_completed(len(placed.get("skull", {})))
+
+
+def found_landmarks(
+    case: Case,
+    anatomy: Anatomy,
+    stages: Stages,
+    placed: Mapping[str, Mapping[str, Floats]],
+    *,
+    is_read: bool,
+) -> Head:
+    """A head with the landmarks found on it, by which its jaws may be separated.
+
+    Placed sites stay where they are, and the others follow them. Without any landmarks, with a
+    warning, where the head shows no face: what cannot do without them is refused where it is
+    reached.
+
+    Parameters
+    ----------
+    case : Case
+    anatomy : Anatomy
+    stages : Stages
+    placed : mapping of str to mapping of str to (3,) float64, mm
+        The landmarks that the case gives, if any: "skull" and "skin".
+    is_read : bool
+        Whether the anatomy was made of the case's own files: the jaws of another one stay.
+
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) What was taken for the mandible in the image cannot be one, and the plan
+        needs it.
+    """
+    # A case with landmarks loads nothing of the synthetic heads that others are compared with.
+    from cmfsim.pipeline.filling import filled_landmarks  # noqa: PLC0415
+    from cmfsim.pipeline.proposing import (  # noqa: PLC0415
+        BY_SHAPE,
+        proposed_head,
+        unproposed_head,
+    )
+
+    stages.begin("finding the landmarks")
+    skull = placed.get("skull", {})
+    try:
+        head = proposed_head(case, anatomy, stages.begin, is_read=is_read, placed=skull)
+    except LandmarkError as error:
+        if not case.landmarks.fills:
+            stages.add([_not_found(str(error), len(skull))])
+            return Head(case, placed, anatomy)
+        head = unproposed_head(anatomy, str(error))
+    reason = _contradiction(case, head.landmarks, skull)
+    if reason:
+        stages.add([_not_found(reason, len(skull))])
+        return Head(case, placed, anatomy)
+    found = filled_landmarks(head, read_placed_sites(case)) if placed else head.landmarks
+    points = dict(found.points)
+    findings = found.findings
+    read, anatomy = anatomy, head.anatomy
+    if found.impossible_jaw and case.image is not None:
+        if needs_lower_jaw(case):
+            raise LandmarkInputError(
+                f"{case.where('image.file')}: the jaws in the image could not be separated, "
+                f"because the part taken for the mandible is not one: {found.impossible_jaw}. "
+                "Place infradentale, sub_m2_L and sub_m2_R by hand and name the file under "
+                "[landmarks], or give surfaces of both bones"
+            )
+        anatomy = _with_one_bone(anatomy)
+        points["skull"] = {n: p for n, p in points["skull"].items() if not is_lower_site(n)}
+        stages.add([_without_mandible(found.impossible_jaw)])
+        findings = tuple(f for f in findings if f.code != "jaw-doubtful")
+    elif anatomy is not read:
+        stages.drop({BY_SHAPE})
+    stages.add(head.findings)
+    stages.add(findings)
+    return Head(case, points, anatomy, found, head.skin)
+
+
+def needs_lower_jaw(case: Case) -> bool:
+    """Whether cuts or plan are about the lower jaw, as far as the case shows."""
+    if case.achieved:
+        return True
+    names = [*case.plan, *(n for cut in case.osteotomies for n in (*cut.segments, cut.bone or ""))]
+    return any(jaw_of(name) == "lower" for name in names)
+
+
+def _contradiction(case: Case, found: ProposedLandmarks, skull: Mapping[str, Floats]) -> str:
+    """Why found sites are of no use beside placed ones; empty if they are."""
+    apart = _apart(found, skull)
+    _check_jaw_of_placed(case, found, skull, apart)
+    if all(size <= DISAGREE for size in apart.values()):
+        return ""
+    listed = ", ".join(f"{name} by {size:.0f} mm" for name, size in apart.items())
+    return f"those found differ from those placed by hand: {listed}"
+
+
+def _apart(found: ProposedLandmarks, skull: Mapping[str, Floats]) -> dict[str, float]:
+    """How far found sites lie from placed ones, mm."""
+    return {
+        name: float(np.linalg.norm(site.point - skull[name]))
+        for name, site in found.skull.items()
+        if name in skull
+    }
+
+
+def _check_jaw_of_placed(
+    case: Case,
+    found: ProposedLandmarks,
+    skull: Mapping[str, Floats],
+    apart: Mapping[str, float],
+) -> None:
+    """Refuses placed sites that lie where the opposite ones of the other jaw were found."""
+    wrong = []
+    for pair in OPPOSITE:
+        for own, other in (pair, pair[::-1]):
+            if own not in apart or other not in found.skull or apart[own] < 0.5 * DISAGREE:
+                continue
+            near = float(np.linalg.norm(found.skull[other].point - skull[own]))
+            if near < 0.5 * apart[own]:
+                wrong.append(f"{own} ({near:.1f} mm from the {other} found, {apart[own]:.1f} mm "
+                             "from its own)")  # fmt: skip
+    if wrong:
+        raise LandmarkInputError(
+            f"{case.where('landmarks.skull')}: sites placed by hand seem to lie on the other jaw, "
+            f"which the plan would move: {', '.join(wrong)}; check them in 3D Slicer. If they are "
+            f"right, place {FEW_SITES} landmarks or more: none is then found automatically"
+        )
+
+
+def _with_one_bone(anatomy: Anatomy) -> Anatomy:
+    """The anatomy with its bones as one skull, as where jaws are not separated."""
+    levels = list(anatomy.bones.values())
+    whole = np.maximum.reduce([level.values for level in levels])
+    return replace(anatomy, bones={"skull": levels[0].with_values(whole)})
+
+
+def _not_found(reason: str, count: int) -> Finding:
+    if count:
+        return Finding(
+            "landmarks-not-completed",
+            f"the case names {count} landmarks of the skull, and no others were found "
+            f"automatically: {reason}",
+            where="landmarks",
+        )
+    return Finding(
+        "landmarks-not-found",
+        f"the case names no landmarks, and none were found automatically: {reason}",
+        where="landmarks",
+    )
+
+
+def _without_mandible(reason: str) -> Finding:
+    return Finding(
+        "mandible-left-out",
+        f"the mandible is not separated from the skull, because the part taken for it is not one: "
+        f"{reason}; the plan does not need it",
+        where="bone",
+    )
+
+
+def landmark_summary(found: ProposedLandmarks) -> dict[str, Any]:
+    """Where landmarks come from, for the summary of a model."""
+    sites = (*found.skull.values(), *found.skin.values())
+    is_all = not any(site.state.by_person for site in sites)
+    return {
+        "source": "found automatically" if is_all else "placed by hand and filled in",
+        **{
+            kind: {
+                name: {"error": round(site.error, 2), "doubt": site.doubt}
+                for name, site in sites.items()
+            }
+            for kind, sites in (("skull", found.skull), ("skin", found.skin))
+        },
+        "missing": [*found.missing_skull, *(f"{name} (skin)" for name in found.missing_skin)],
+    }

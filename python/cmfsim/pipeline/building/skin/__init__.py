@@ -1,0 +1,1 @@
+"""The skin of a case: its part of the mesh, its check, its lips."""

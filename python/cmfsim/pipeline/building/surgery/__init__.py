@@ -1,0 +1,1 @@
+"""What the operation changes: motions of bone, bodies cut loose, the scan afterwards."""

@@ -1,0 +1,300 @@
+"""The motions of the bone segments of a case; a segment is cut where its motion is torn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cmfsim.bones import part_segment
+from cmfsim.bones.motion import sound_motion, torn_pieces
+from cmfsim.doctor.surgery.moved_bones import check_pairs
+from cmfsim.errors import CaseInputError
+from cmfsim.io import Case, read_surface
+from cmfsim.pipeline.building.inputs import motion_source, read_motion
+from cmfsim.pipeline.building.surgery.motion_findings import motion_findings, plan_key
+from cmfsim.pipeline.building.surgery.postoperative import (
+    REFERENCES,
+    Postoperative,
+    read_postoperative,
+)
+from cmfsim.surfaces.repair import clean_surface
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.checks import Floats
+from cmfsim.values.finding import Finding
+from cmfsim.values.frozen import frozen_mapping
+from cmfsim.values.surface_data import MovedSurface, SurfaceData, joined_surface
+
+if TYPE_CHECKING:
+    from cmfsim.bones.achieved import AchievedMotion, AchievedPlan
+
+__all__ = ["PlannedBones", "planned_bones"]
+
+Motions = Mapping[str, Floats | MovedSurface]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedBones:
+    """The bone segments of a case with their motions.
+
+    Attributes
+    ----------
+    segments : tuple of BoneSegment
+    motions : mapping of str to (4, 4) float64, mm, or MovedSurface
+        Of the segments that the plan moves.
+    findings : tuple of Finding
+    achieved : AchievedPlan or None
+        How they were found, where the plan is the achieved one.
+    fits : mapping of str to AchievedMotion
+        How the motions that a plan gives by surfaces were found.
+    sources : mapping of str to str
+        Where each motion comes from and how it was understood, in words.
+    """
+
+    segments: tuple[BoneSegment, ...]
+    motions: Motions
+    findings: tuple[Finding, ...] = ()
+    achieved: AchievedPlan | None = None
+    fits: Mapping[str, AchievedMotion] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)
+
+
+def planned_bones(
+    case: Case, segments: tuple[BoneSegment, ...], after: Postoperative | None = None
+) -> PlannedBones:
+    """The segments of a case with the motions that its plan, or the operation, gives them.
+
+    Parameters
+    ----------
+    case : Case
+    segments : tuple of BoneSegment
+        Cut already.
+    after : Postoperative, optional
+        What `read_postoperative` gives, where it is known already.
+
+    Raises
+    ------
+    CaseError, BoundaryError, RegistrationError
+        (also `ValueError`) A segment that there is not; a motion that cannot be read or meant.
+    """
+    known = [segment.name for segment in segments]
+    for name in case.plan:
+        if name not in known:
+            raise CaseInputError(
+                f"{case.where(f'plan.{name}')}: there is no segment {name!r}; segments are: "
+                f"{', '.join(known)}; an osteotomy makes others"
+            )
+    if case.achieved:
+        return _achieved_bones(case, segments, after or read_postoperative(case))
+    fits: dict[str, AchievedMotion] = {}
+    motions: dict[str, Floats | MovedSurface] = {}
+    for name, motion in case.plan.items():
+        given = read_motion(case, motion)
+        motions[name] = _laid(name, given, segments, fits) if isinstance(given, tuple) else given
+    planned = _with_motions(case, segments, motions, fits)
+    return replace(
+        planned,
+        findings=(*planned.findings, *_fit_findings(case, known, fits)),
+        fits=frozen_mapping(fits),
+        sources={name: motion_source(motion) for name, motion in case.plan.items()},
+    )
+
+
+def _laid(
+    name: str,
+    pair: tuple[SurfaceData, SurfaceData],
+    segments: tuple[BoneSegment, ...],
+    fits: dict[str, AchievedMotion],
+) -> Floats | MovedSurface:
+    """The rigid motion of a bone that has different triangles before and after, entered in `fits`.
+
+    It is found on the surfaces as given: those of segments are as coarse as their voxels.
+    """
+    from cmfsim.bones.achieved import achieved_plan  # noqa: PLC0415
+
+    before, after = (clean_surface(surface) for surface in pair)
+    others = [segment.surface for segment in segments if segment.name != name]
+    found = achieved_plan({name: before}, {name: after}, beside=others)
+    fits[name] = found.motions[name]
+    return found.plan[name]
+
+
+def _fit_findings(
+    case: Case, names: list[str], fits: Mapping[str, AchievedMotion]
+) -> Iterator[Finding]:
+    """Findings about the motions that were found from surfaces before and after."""
+    skull = next((fits[name].fit for name in REFERENCES if name in fits), None)
+    for name, found in fits.items():
+        # A torn bone's pieces are numbered after it.
+        bone = name if name in names else name.rsplit("_", 1)[0]
+        where = case.where(plan_key(case, bone))
+        yield from motion_findings(found, name, where, skull, is_still=name in REFERENCES)
+
+
+def _with_motions(
+    case: Case,
+    segments: tuple[BoneSegment, ...],
+    motions: Motions,
+    measured: dict[str, AchievedMotion],
+) -> PlannedBones:
+    """The segments with their motions, separated where these are torn.
+
+    Motions by vertices come from surfaces before and after: what vertices slid along the bone is
+    subtracted, and what was found is entered in `measured`.
+    """
+    findings: list[Finding] = []
+    parted: list[BoneSegment] = []
+    planned: dict[str, Floats | MovedSurface] = {}
+    for segment in segments:
+        motion = motions.get(segment.name)
+        if not isinstance(motion, MovedSurface):
+            parted.append(segment)
+            if motion is not None:
+                planned[segment.name] = motion
+            continue
+        motion = sound_motion(motion)
+        # Vertices over resected bone are squeezed, as if torn off: the whole is asked first.
+        found = _measured(motion, is_still=segment.name in REFERENCES)
+        whole = found.method == "shape" or found.is_rigid
+        pieces = [(segment, motion)] if whole else _parted(case, segment, motion, findings)
+        for piece, its_own in pieces:
+            if len(pieces) > 1:
+                found = _measured(its_own, is_still=piece.name in REFERENCES)
+            parted.append(piece)
+            measured[piece.name] = found
+            by_vertex = found.moved if found.method == "vertices" else None
+            planned[piece.name] = found.plan if by_vertex is None else by_vertex
+    return PlannedBones(tuple(parted), planned, tuple(findings))
+
+
+def _measured(motion: MovedSurface, *, is_still: bool) -> AchievedMotion:
+    """The motion of a piece without slip, noise and bone that was removed."""
+    from cmfsim.bones.achieved import measure_pair  # noqa: PLC0415
+
+    after = SurfaceData(motion.moved_vertices, motion.surface.triangles)
+    return measure_pair(motion.surface, after, is_still=is_still)
+
+
+def _achieved_bones(
+    case: Case, segments: tuple[BoneSegment, ...], after: Postoperative
+) -> PlannedBones:
+    """The segments with the motions measured on the post-operative bones (paper 3, Figure 5).
+
+    A bone with the same triangles after says where each vertex went, less what vertices slid along
+    it; any other segment is laid on the bone of its name, or on all of them.
+    """
+    names = [segment.name for segment in segments]
+    by_vertex = {
+        name: moved
+        for name in names
+        if name in after.bones and (moved := _same_bone(case, name, after.bones[name])) is not None
+    }
+    pairs = {name: _paired(case, name, moved) for name, moved in by_vertex.items()}
+    searched = [segment for segment in segments if segment.name not in by_vertex]
+    reference = next((name for name in REFERENCES if name in names), None)
+    if searched and reference is not None and reference not in by_vertex:
+        if after.bones.keys() & {reference, "bone"}:
+            still = [s for s in searched if s.name == reference]
+        else:
+            # Nothing is known of it after the operation, in which it was not touched.
+            still, reference = [], None
+            searched = [s for s in searched if s.name not in REFERENCES]
+    else:
+        still, reference = [], None
+    unknown = [n for n in after.bones if n not in names and n not in _sources(case) and n != "bone"]
+    if unknown:
+        raise CaseInputError(
+            f"{case.where(f'postoperative.bones.{unknown[0]}')}: there is no bone or segment "
+            f"{unknown[0]!r}; use one of: {', '.join(names)}"
+        )
+    from cmfsim.bones.achieved import AchievedPlan, achieved_plan  # noqa: PLC0415
+
+    motions: dict[str, Floats | MovedSurface] = dict(by_vertex)
+    measured: dict[str, AchievedMotion] = {}
+    achieved = AchievedPlan(measured, np.eye(4), None)
+    if searched:
+        bones = {name: clean_surface(surface) for name, surface in after.bones.items()}
+        whole = joined_surface(list(bones.values()))
+        achieved = achieved_plan(
+            {s.name: s for s in (*still, *(s for s in searched if s not in still))},
+            {s.name: bones.get(s.name, whole) for s in searched},
+            reference=reference,
+            beside=[s.surface for s in segments if s not in searched],
+        )
+        motions |= {name: found for name, found in achieved.plan.items() if name != reference}
+    made = _with_motions(case, segments, motions, measured)
+    motions_found = {**achieved.motions, **measured}
+    noticed = [
+        finding
+        for name, found in pairs.items()
+        for finding in found
+        # By shape the size is known with an interval, and is no part of the motion.
+        if not (finding.code == "moved-scaled" and measured[name].method == "shape")
+    ]
+    noticed += _fit_findings(case, names, motions_found)
+    return replace(
+        made,
+        findings=(*made.findings, *noticed),
+        achieved=replace(achieved, motions=frozen_mapping(motions_found)),
+    )
+
+
+def _sources(case: Case) -> tuple[str, ...]:
+    """Bones of the case, as they are called before they are cut."""
+    return ("cranium", "mandible", "skull") if case.surfaces is None else tuple(case.surfaces.bones)
+
+
+def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None:
+    """The motion of a bone whose surface has the same triangles before and after; else none."""
+    given = case.postoperative
+    before = None if case.surfaces is None else case.surfaces.bones.get(name)
+    if before is None or given is None or case.surfaces is None:
+        return None
+    here = read_surface(before, units=case.surfaces.units, frame=case.surfaces.frame)
+    same = len(here.vertices) == len(there.vertices) and np.array_equal(
+        here.triangles, there.triangles
+    )
+    return MovedSurface(here, there.vertices) if same else None
+
+
+def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
+    """Findings about a bone that is followed vertex by vertex.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Its surfaces are no bone that moved: mirrored, shuffled, in two units.
+    """
+    found = list(check_pairs(name, case.where(plan_key(case, name)), moved))
+    for finding in found:
+        if finding.severity == "error":
+            raise CaseInputError(f"{finding.where}: {finding.what}; {finding.fix}")
+    return found
+
+
+def _parted(
+    case: Case, segment: BoneSegment, motion: MovedSurface, findings: list[Finding]
+) -> list[tuple[BoneSegment, MovedSurface]]:
+    """The pieces of a segment that moved apart, each with its motion."""
+    pieces = torn_pieces(motion)
+    if len(pieces) == 1:
+        return [(segment, pieces[0])]
+    named = {_numbered(segment.name, n): piece for n, piece in enumerate(pieces)}
+    made = part_segment(segment, {name: piece.surface for name, piece in named.items()})
+    findings.append(
+        Finding(
+            "motion-pieces",
+            f"{segment.name} moved as {len(made)} pieces: {', '.join(p.name for p in made)}",
+            where=case.where(plan_key(case, segment.name)),
+            why="neighbouring vertices moved apart by millimetres between them, so the bone was "
+            "cut there: no tissue is joined to the gap, and each piece has its own contact "
+            "surface",
+        )
+    )
+    return [(piece, named[piece.name]) for piece in made]
+
+
+def _numbered(name: str, number: int) -> str:
+    return name if number == 0 else f"{name}_{number + 1}"

@@ -1,0 +1,1 @@
+"""The tissue of a case: mesh, ends, clefts, node kinds, contacts, muscles."""

@@ -1,6 +1,0 @@
-"""The surfaces of a case, their unit and their frame, with the reasons."""
-
-from cmfsim.pipeline.drafting.surfaces.anatomy import Anatomy, Question
-from cmfsim.pipeline.drafting.surfaces.choosing import choose_surfaces
-
-__all__ = ["Anatomy", "Question", "choose_surfaces"]

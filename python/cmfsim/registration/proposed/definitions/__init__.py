@@ -1,0 +1,1 @@
+"""Landmarks by their definitions on skull and skin."""

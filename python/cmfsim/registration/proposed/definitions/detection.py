@@ -1,0 +1,118 @@
+"""The sites of one head by their definitions, and what templates say of the definitions' bias."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cmfsim._core import Surface
+from cmfsim.registration.proposed.definitions.depth_maps import depth_map
+from cmfsim.registration.proposed.definitions.skin_sites import find_skin_sites
+from cmfsim.registration.proposed.definitions.skull_sites import (
+    FRONT_REACH,
+    find_skull_sites,
+    skull_views,
+)
+from cmfsim.registration.proposed.pose import Pose, surface_samples
+from cmfsim.registration.proposed.template_head import TemplateHead
+from cmfsim.values.checks import Floats
+from cmfsim.values.surface_data import SurfaceData
+
+__all__ = ["Detected", "HeadSurfaces", "biases", "detect", "is_lower"]
+
+# Points on a surface per mm² for depth maps: some four in a cell.
+DENSITY = 6.0
+MOST_POINTS = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Detected:
+    """Sites of a head, (3,) each, in the frame and size of the average head.
+
+    Names of the skull that begin with "_" are no landmarks, but what others are found from.
+    """
+
+    skull: Mapping[str, Floats]
+    skin: Mapping[str, Floats]
+
+
+@dataclass(frozen=True, eq=False)
+class HeadSurfaces:
+    """The surfaces of a head, with points that lie densely on each, (n, 3) mm, made once.
+
+    Attributes
+    ----------
+    upper : SurfaceData
+        The bones without the mandible.
+    lower, skin : SurfaceData or None
+    """
+
+    upper: SurfaceData
+    lower: SurfaceData | None
+    skin: SurfaceData | None = None
+
+    @cached_property
+    def upper_points(self) -> Floats:
+        """Points on the upper bones."""
+        return _points(self.upper)
+
+    @cached_property
+    def lower_points(self) -> Floats:
+        """Points on the mandible; none without one."""
+        return np.zeros((0, 3)) if self.lower is None else _points(self.lower)
+
+    @cached_property
+    def skin_points(self) -> Floats:
+        """Points on the skin; none without it."""
+        return np.zeros((0, 3)) if self.skin is None else _points(self.skin)
+
+    def draw(self) -> None:
+        """Draws the points of all surfaces, which are kept."""
+        for points in (self.upper_points, self.lower_points, self.skin_points):
+            points.setflags(write=False)
+
+
+def detect(head: HeadSurfaces, pose: Pose, *, skin: bool = True) -> Detected:
+    """The sites of a head that lies in a known pose: of cranium, mandible and, if asked, skin."""
+
+    def placed(points: Floats) -> Floats:
+        return pose.into(points) / pose.size
+
+    skull = find_skull_sites(skull_views(placed(head.upper_points), placed(head.lower_points)))
+    if head.skin is None or not skin:
+        return Detected(skull, {})
+    front = depth_map(placed(head.skin_points), (0, 2, 1), 1.0, FRONT_REACH)
+    return Detected(skull, find_skin_sites(front, skull))
+
+
+def is_lower(name: str) -> bool:
+    """Whether a bone of this name moves with the lower jaw."""
+    words = name.casefold()
+    return any(word in words for word in ("mandible", "lower", "ramus", "chin"))
+
+
+def _points(surface: SurfaceData) -> Floats:
+    area = Surface(surface.vertices, surface.triangles).area
+    count = min(MOST_POINTS, int(DENSITY * float(area)))
+    return surface_samples(surface, max(count, 1000))[0]
+
+
+def biases(
+    template: TemplateHead, head: HeadSurfaces, pose: Pose
+) -> tuple[dict[str, Floats], dict[str, Floats]]:
+    """How far the landmarks of a template lie from where its sites are found, (3,) each.
+
+    Of skull and skin, in the frame and size of the average head.
+    """
+    found = detect(head, pose)
+    pairs = ((found.skull, template.skull), (found.skin, template.skin_landmarks))
+    skull, skin = (
+        {
+            name: pose.into(true[name][None])[0] / pose.size - place
+            for name, place in sites.items()
+            if name in true
+        }
+        for sites, true in pairs
+    )
+    return skull, skin

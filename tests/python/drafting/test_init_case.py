@@ -1,0 +1,511 @@
+"""`cmfsim init`: a folder becomes a case file, and nothing unclear is decided silently."""
+
+import json
+import os
+import re
+import sys
+
+import numpy as np
+import pytest
+
+import cmfsim
+import head_case
+from cmfsim.cli import main
+from cmfsim.doctor import examine
+from cmfsim.drafting import init_case
+from cmfsim.drafting.case_lines import quoted
+from cmfsim.drafting.roles import name_role
+from cmfsim.io.files.reading_writing import toml_module
+from dicom_series import axial, write_series
+from synthetic_head import made_head
+
+pytest.importorskip("SimpleITK")
+
+FORWARDS = cmfsim.rigid_motion((0.0, -4.0, 1.0))
+
+
+@pytest.fixture
+def head(tmp_path):
+    """The files of the head of ellipsoids, without a case file."""
+    head_case.HeadCase().write_parts(tmp_path)
+    return tmp_path
+
+
+def text_of(folder):
+    return (folder / "case.toml").read_text(encoding="utf-8")
+
+
+def refusal(folder):
+    """What the doctor refuses the case with."""
+    with pytest.raises(cmfsim.CaseError) as error:
+        cmfsim.Case.load(folder)
+    return str(error.value)
+
+
+def vtp_without_frame(folder, name, surface, scale=1.0):
+    """A surface that states neither frame nor unit."""
+    moved = cmfsim.SurfaceData(np.asarray(surface.vertices) * scale, surface.triangles)
+    cmfsim.write_surface(folder / f"{name}.vtp", moved)
+
+
+def test_a_folder_of_surfaces_becomes_a_case_without_findings(head):
+    draft = init_case(head)
+    assert not draft.questions
+    case = cmfsim.Case.load(head)
+    assert set(case.surfaces.bones) == {"cranium", "mandible"}
+    assert case.landmarks.skull.name == "skull.mrk.json"
+    assert not [f for f in cmfsim.diagnose(case) if f.severity == "error"]
+    taken = {entry.label: entry for entry in draft.taken}
+    assert taken["skin.ply"].taken_for == "skin"
+    assert taken["skull.mrk.json"].frame == "LPS"
+    assert "14 of" not in taken["skull.mrk.json"].why
+
+
+def test_a_case_file_is_replaced_only_by_force(head, capsys):
+    init_case(head)
+    before = text_of(head)
+    assert main(["init", str(head), "-q"]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert text_of(head) == before
+    assert main(["init", str(head), "-q", "--force"]) == 0
+
+
+def test_two_mandibles_are_a_question_that_doctor_repeats(head, capsys):
+    (head / "jaw2.ply").write_bytes((head / "mandible.ply").read_bytes())
+    init_case(head)
+    line = next(n for n, row in enumerate(text_of(head).splitlines(), 1) if '"?"' in row and n > 4)
+    assert main(["doctor", str(head)]) == 2
+    words = capsys.readouterr().err
+    assert f"case.toml:{line}: surfaces.bones.mandible" in words
+    assert "jaw2.ply or mandible.ply" in words
+
+
+def test_a_slicer_transform_is_inverted_and_stated_in_words(head):
+    """Among files that Slicer saved, an ITK file is from-parent, and the case states it."""
+    ply = head / "mandible.ply"
+    ply.write_bytes(ply.read_bytes().replace(b"comment LPS mm\n", b"comment SPACE=LPS\n"))
+    path = head / "mandible_move.tfm"
+    cmfsim.write_transform(path, FORWARDS, direction="from-parent")
+    without_comment(path)
+    init_case(head)
+    case = cmfsim.Case.load(head)
+    motion = cmfsim.read_transform(
+        case.plan["mandible"].transform, direction=case.plan["mandible"].direction
+    )
+    assert np.abs(motion - FORWARDS).max() < 1e-12
+    text = text_of(head).replace("\n# ", " ")
+    assert "It moves the mandible 4.0 mm forwards, 1.0 mm up" in text
+    assert "4.0 mm backwards, 1.0 mm down" in text
+
+
+def test_init_doctor_and_predict_state_one_plan_alike(head):
+    """Without landmarks each stated it at a point of its own surface: three sets of numbers."""
+    for name in ("skull", "skin"):
+        (head / f"{name}.mrk.json").unlink()
+    turned = cmfsim.rigid_motion((0.0, -4.0, 1.0), 8.0, (1.0, 0.2, 0.1), (3.0, -100.0, 1450.0))
+    cmfsim.write_transform(head / "mandible.tfm", turned, direction="from-parent")
+    init_case(head)
+    path = head / "case.toml"
+    text = path.read_text(encoding="utf-8")
+    # As coarse as a mesh can be: the segment's own surface ends 0.4 mm behind the bone.
+    path.write_text(
+        text.replace("[output]", "[mesh]\nedge_length = 12\n\n[output]"), encoding="utf-8"
+    )
+    case = cmfsim.Case.load(path)
+    stated = examine(case).plan["mandible"]
+    assert "pitch −7.8°" in stated.text
+    assert f"moves the mandible {stated.text}" in text.replace("\n# ", " ")
+    solved = cmfsim.predict(case, model="H", check=False).summary["plan"]["mandible"]["clinical"]
+    assert solved["text"].replace(f" [{solved['source']}]", "") == stated.text
+    assert np.allclose(solved["point"], stated.point, atol=1e-9)
+
+
+def without_comment(path):
+    """An ITK file as other programs write it: without the comment of cmfsim."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if "mm, LPS" not in line), encoding="utf-8")
+
+
+def test_a_transform_of_unknown_origin_is_a_question_with_both_answers(head):
+    for name in ("skin", "cranium", "mandible"):
+        surface = cmfsim.read_surface(head / f"{name}.ply")
+        (head / f"{name}.ply").unlink()
+        vtp_without_frame(head, name, surface)
+    path = head / "mandible.tfm"
+    cmfsim.write_transform(path, FORWARDS, direction="to-parent")
+    without_comment(path)
+    init_case(head)
+    words = refusal(head)
+    assert "plan.mandible.transform.direction" in words
+    assert '"from-parent" (as 3D Slicer saves it): moves the mandible 4.0 mm backwards' in words
+    assert '"to-parent" (as ITK registers it): moves the mandible 4.0 mm forwards' in words
+
+
+def test_a_typed_matrix_without_a_frame_is_a_question(head):
+    rows = "\n".join(" ".join(str(v) for v in row) for row in FORWARDS)
+    (head / "mandible.txt").write_text(rows, encoding="utf-8")
+    (head / "notes.txt").write_text("call the patient", encoding="utf-8")
+    init_case(head)
+    assert "plan.mandible.transform.frame" in refusal(head)
+    assert "notes.txt: not used (is no transform" in text_of(head)
+
+
+def test_a_stated_direction_is_kept(head):
+    cmfsim.write_transform(head / "mandible.tfm", FORWARDS, direction="to-parent")
+    init_case(head)
+    assert cmfsim.Case.load(head).plan["mandible"].direction == "to-parent"
+
+
+def test_a_transform_that_is_not_rigid_is_a_question_with_the_reason(head):
+    text = (
+        "#Insight Transform File V1.0\nTransform: AffineTransform_double_3_3\n"
+        "Parameters: 1.2 0 0 0 1 0 0 0 1 0 0 0\nFixedParameters: 0 0 0\n"
+    )
+    (head / "mandible.tfm").write_text(text, encoding="utf-8")
+    init_case(head)
+    assert "scale" in refusal(head)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "m"), (0.1, "cm"), (1 / 25.4, "inch")])
+def test_other_units_are_a_question_that_names_the_fitting_one(head, factor, unit):
+    for name in ("skin", "cranium", "mandible"):
+        surface = cmfsim.read_surface(head / f"{name}.ply")
+        (head / f"{name}.ply").unlink()
+        vtp_without_frame(head, name, surface, factor)
+    init_case(head)
+    words = refusal(head)
+    assert "surfaces.units" in words
+    assert f'"{unit}": then it is 2' in words
+
+
+def test_an_unstated_frame_is_read_off_what_states_its_own(head):
+    """In RAS the head lies on the other side of the origin than its landmarks."""
+    flip = np.array([-1.0, -1.0, 1.0])
+    for name in ("skin", "cranium", "mandible"):
+        surface = cmfsim.read_surface(head / f"{name}.ply")
+        (head / f"{name}.ply").unlink()
+        turned = cmfsim.SurfaceData(np.asarray(surface.vertices) * flip, surface.triangles)
+        vtp_without_frame(head, name, turned)
+    init_case(head)
+    case = cmfsim.Case.load(head)
+    assert case.surfaces.frame == "RAS"
+    assert "read as RAS they are where" in text_of(head)
+    skin = cmfsim.read_surface(case.surfaces.skin, frame=case.surfaces.frame)
+    assert np.asarray(skin.vertices)[:, 1].mean() == pytest.approx(-100.0, abs=1.0)
+
+
+def test_an_unstated_frame_of_a_head_at_the_origin_shows_by_its_jaw(tmp_path):
+    """The jaw lies in front of the cranium's middle: −P in LPS."""
+    for name, surface in head_case.surfaces().items():
+        centred = np.asarray(surface.vertices) - [3.0, -100.0, 1500.0]
+        vtp_without_frame(tmp_path, name, cmfsim.SurfaceData(centred, surface.triangles))
+    init_case(tmp_path)
+    assert "read as LPS mandible lies" in text_of(tmp_path)
+    assert cmfsim.Case.load(tmp_path).surfaces.frame == "LPS"
+
+
+def test_an_unstated_frame_that_nothing_shows_is_a_question(tmp_path):
+    for name in ("skin", "cranium"):
+        surface = head_case.ellipsoid(name)
+        centred = np.asarray(surface.vertices) - np.asarray(surface.vertices).mean(axis=0)
+        vtp_without_frame(tmp_path, name, cmfsim.SurfaceData(centred, surface.triangles))
+    init_case(tmp_path)
+    assert "surfaces.frame" in refusal(tmp_path)
+
+
+def test_a_bone_that_is_there_twice_is_a_question(head):
+    centre, axes = np.array([3.0, -125.0, 1505.0]), np.array([15.0, 10.0, 8.0])
+    vertices, triangles = head_case.icosphere(2)
+    piece = cmfsim.SurfaceData(vertices * axes + centre, triangles)
+    cmfsim.write_surface(head / "maxilla_lefort1.ply", piece)
+    init_case(head)
+    words = refusal(head)
+    assert "surfaces.bones.maxilla" in words
+    assert "twice" in words
+    assert "le_fort_1" in words
+
+
+def test_a_surface_without_a_known_name_is_a_question(head):
+    (head / "Segment_3.ply").write_bytes((head / "mandible.ply").read_bytes())
+    init_case(head)
+    assert "surfaces.bones.Segment_3" in refusal(head)
+
+
+def test_an_unnamed_surface_round_all_others_is_the_skin(head):
+    (head / "skin.ply").rename(head / "Segment_1.ply")
+    draft = init_case(head)
+    assert cmfsim.Case.load(head).surfaces.skin.name == "Segment_1.ply"
+    assert any("encloses every other" in entry.why for entry in draft.taken)
+
+
+def test_faces_after_the_operation_go_to_their_own_table(head):
+    (head / "skin_postop.ply").write_bytes((head / "skin.ply").read_bytes())
+    (head / "mandible_postop.ply").write_bytes((head / "mandible.ply").read_bytes())
+    init_case(head)
+    case = cmfsim.Case.load(head)
+    assert case.achieved
+    assert case.postoperative.skin.name == "skin_postop.ply"
+    assert set(case.postoperative.bones) == {"mandible"}
+
+
+def test_faces_after_in_the_other_frame_are_noticed_by_their_place(head):
+    """A skin in RAS lies 200 mm away, unless its frame is stated."""
+    skin = cmfsim.read_surface(head / "skin.ply")
+    turned = np.asarray(skin.vertices) * [-1.0, -1.0, 1.0]
+    vtp_without_frame(head, "skin_postop", cmfsim.SurfaceData(turned, skin.triangles))
+    init_case(head)
+    after = cmfsim.Case.load(head).postoperative
+    assert after.frame == "RAS"
+    assert after.aligned
+    assert "0 mm apart" in text_of(head)
+
+
+def test_a_face_of_another_scan_is_not_aligned(head):
+    skin = cmfsim.read_surface(head / "skin.ply")
+    moved = np.asarray(skin.vertices) + [0.0, 60.0, 0.0]
+    cmfsim.write_surface(head / "skin_postop.ply", cmfsim.SurfaceData(moved, skin.triangles))
+    init_case(head)
+    assert not cmfsim.Case.load(head).postoperative.aligned
+
+
+def test_a_ct_is_taken_before_its_surfaces_which_stay_as_a_comment(head):
+    image(head / "ct.nrrd", -1000.0)
+    init_case(head)
+    case = cmfsim.Case.load(head)
+    assert case.image.file.name == "ct.nrrd"
+    assert '# skin = "skin.ply"' in text_of(head)
+
+
+def image(path, low, shape=(40, 50, 60)):
+    """A block of tissue in air, round the head of ellipsoids."""
+    values = np.full(shape, low, dtype=np.int16)
+    values[10:30, 10:40, 10:50] = int(low) + 1040
+    origin = (-77.0, -200.0, 1380.0)
+    cmfsim.write_image(cmfsim.ImageData(values, (4.0, 4.0, 4.0), origin), path)
+
+
+def test_two_cts_are_a_question(tmp_path):
+    image(tmp_path / "a.nrrd", -1000.0)
+    image(tmp_path / "b.nrrd", -1000.0)
+    init_case(tmp_path)
+    words = refusal(tmp_path)
+    assert "image.file" in words
+    assert "a.nrrd or b.nrrd" in words
+
+
+def test_a_ct_that_is_not_in_hounsfield_units_is_a_question(tmp_path):
+    """Air and one tissue without any bone: no scale is clear."""
+    image(tmp_path / "ct.nrrd", 0.0)
+    init_case(tmp_path)
+    assert "image.rescale" in refusal(tmp_path)
+    assert "[1, -1024]" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(("slope", "asked"), [(1.0, False), (0.6, True)])
+def test_a_clear_scale_is_stated_with_its_error_and_not_asked(tmp_path, slope, asked):
+    """Of steps of 1 HU with a usual offset; one tissue peak leaves open whether it is fat."""
+    whole = made_head().image
+    values = np.round(slope * (whole.values.astype(float) + 1024.0)).astype(np.int16)
+    cmfsim.write_image(whole.with_values(values), tmp_path / "ct.nrrd")
+    init_case(tmp_path)
+    text = re.sub(r"\s*\n# +", " ", text_of(tmp_path))
+    assert ("which are not HU" in text) is not asked
+    assert ("How do they become HU?" in text) is asked
+    if not asked:
+        assert "1·value -1024, to within 10 HU at bone" in text
+        assert cmfsim.Case.load(tmp_path).image.rescale is None
+
+
+def test_without_landmarks_a_head_gets_those_that_are_found_and_muscles(head):
+    for name in ("skull", "skin"):
+        (head / f"{name}.mrk.json").unlink()
+    init_case(head)
+    case = cmfsim.Case.load(head)
+    assert case.landmarks.proposed
+    assert case.muscles is not None
+    assert "cmfsim landmarks case.toml" in text_of(head)
+    assert [f.severity for f in cmfsim.diagnose(case) if f.code == "landmarks-automatic"] == [
+        "note"
+    ]
+
+
+def test_with_landmarks_of_the_skin_alone_muscles_wait_for_those_of_the_skull(head):
+    (head / "skull.mrk.json").unlink()
+    init_case(head)
+    case = cmfsim.Case.load(head)
+    assert case.muscles is None
+    assert not case.landmarks.proposed
+    assert "add an empty [muscles]" in re.sub(r"\s*\n# +", " ", text_of(head))
+
+
+def test_landmarks_without_a_frame_are_read_where_the_head_is(head):
+    file = head / "skull.mrk.json"
+    document = json.loads(file.read_text(encoding="utf-8"))
+    for markup in document["markups"]:
+        del markup["coordinateSystem"]
+    file.write_text(json.dumps(document), encoding="utf-8")
+    init_case(head)
+    assert cmfsim.Case.load(head).landmarks.frame == "LPS"
+
+
+def test_a_damaged_surface_is_reported_and_left_out(head):
+    whole = (head / "mandible.ply").read_bytes()
+    (head / "mandible.ply").write_bytes(whole[: len(whole) // 2])
+    draft = init_case(head)
+    entry = next(entry for entry in draft.taken if entry.label == "mandible.ply")
+    assert entry.taken_for == "not used"
+    assert "cut short" in entry.why
+
+
+def test_a_folder_with_nothing_is_an_error_that_lists_what_is_read(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("nothing", encoding="utf-8")
+    assert main(["init", str(tmp_path), "-q"]) == 2
+    assert "NRRD" in capsys.readouterr().err
+    assert main(["init", str(tmp_path / "absent"), "-q"]) == 2
+    assert not (tmp_path / "case.toml").exists()
+
+
+def test_names_cannot_write_lines_of_the_case(head):
+    """A line break in a file's name stays inside its comment and its text."""
+    name = 'mandible"\n[output]\nfolder = "elsewhere'
+    try:
+        (head / f"{name}.ply").write_bytes((head / "mandible.ply").read_bytes())
+    except OSError:
+        pytest.skip("the system has no such names")
+    (head / "mandible.ply").unlink()
+    init_case(head)
+    assert len(re.findall(r"^\[output\]", text_of(head), re.MULTILINE)) == 1
+    assert cmfsim.Case.load(head).surfaces.bones["mandible"].name == f"{name}.ply"
+
+
+needs_bytes = pytest.mark.skipif(
+    sys.platform != "linux", reason="names of any bytes are those of Linux"
+)
+
+
+@needs_bytes
+def test_a_folder_whose_name_is_not_utf_8_gets_a_case_that_is_read(head, capsys):
+    """An umlaut in Latin-1, as archives of Windows unpack it."""
+    folder = head / os.fsdecode(b"Pati\xe9nt")
+    folder.mkdir()
+    for name in ("skin.ply", "cranium.ply", "mandible.ply"):
+        (head / name).rename(folder / name)
+    assert main(["init", str(folder)]) == 0
+    assert "Pati\\udce9nt" in capsys.readouterr().out
+    assert cmfsim.Case.load(folder).name == "Pati\xe9nt"
+
+
+@needs_bytes
+def test_a_file_that_no_case_can_name_is_reported_with_a_remedy(head):
+    (head / "mandible.ply").rename(head / os.fsdecode(b"Unterkiefer m\xfcde mandible.ply"))
+    draft = init_case(head)
+    (why,) = [entry.why for entry in draft.taken if "Unterkiefer" in entry.label]
+    assert "not UTF-8" in why
+    assert "rename it" in why
+    assert set(cmfsim.Case.load(head).surfaces.bones) == {"cranium"}
+
+
+@pytest.mark.parametrize("text", ["\N{SNOWMAN} \U0001f600 \U0010fffd\u2028", 'a"b\\c\n\t'])
+def test_texts_are_written_as_toml_reads_them(text):
+    assert toml_module().loads(f"name = {quoted(text)}") == {"name": text}
+
+
+def test_a_name_of_other_bytes_is_no_text_of_a_case():
+    with pytest.raises(ValueError, match="surrogates"):
+        quoted("Pati\udce9nt")
+
+
+def test_links_into_a_store_are_read_and_broken_ones_reported(head):
+    """As DataLad leaves a data set, with some of its files not fetched."""
+    (head / "store").mkdir()
+    folder = head / "patient"
+    folder.mkdir()
+    for name in ("skin.ply", "cranium.ply", "mandible.ply"):
+        (head / name).rename(head / "store" / name)
+        (folder / name).symlink_to(f"../store/{name}")
+    (head / "store" / "mandible.ply").unlink()
+    draft = init_case(folder)
+    case = cmfsim.Case.load(folder)
+    assert case.surfaces.skin == folder / "skin.ply"
+    assert set(case.surfaces.bones) == {"cranium"}
+    (why,) = [entry.why for entry in draft.taken if entry.label == "mandible.ply"]
+    assert "datalad get" in why
+
+
+def test_links_to_folders_are_followed_once_and_never_upwards(head):
+    """To the folder of surfaces, to itself, and to the folder of all patients."""
+    folder = head / "patient"
+    (head / "store").mkdir()
+    folder.mkdir()
+    for name in ("skin.ply", "cranium.ply", "mandible.ply"):
+        (head / name).rename(head / "store" / name)
+    (folder / "a").symlink_to("../store")
+    (folder / "b").symlink_to("../store")
+    (folder / "up").symlink_to("..")
+    (folder / "round").symlink_to("round")
+    draft = init_case(folder)
+    assert cmfsim.Case.load(folder).surfaces.skin == folder / "a" / "skin.ply"
+    whys = {entry.label: entry.why for entry in draft.taken}
+    assert "that holds this one" in whys["up"]
+    assert "was read already" in whys["b"]
+    assert "datalad" in whys["round"]
+
+
+def series_of_a_head(folder, uid="1.2.3", study="1.2", places=(".",)):
+    """A small CT of which each part of the slices lies in a folder of its own."""
+    values = np.full((24, 24, 12), -1000, dtype=np.int16)
+    values[4:20, 4:20] = 40
+    slices = axial(cmfsim.ImageData(values, (8.0, 8.0, 12.0)))
+    size = -(-len(slices) // len(places))
+    for k, place in enumerate(places):
+        part = slices[k * size : (k + 1) * size]
+        names = [f"{uid}_{k}_{n}" for n in range(len(part))]
+        write_series(folder / place, part, uid=uid, study=study, names=names)
+
+
+@pytest.mark.parametrize("places", [(".", "MORE"), ("a", "b/c")])
+def test_parts_of_one_series_are_one_ct_and_no_question(tmp_path, places):
+    """`init` asked which of the two parts is before the operation."""
+    series_of_a_head(tmp_path, places=places)
+    draft = init_case(tmp_path)
+    assert not draft.questions
+    case = cmfsim.Case.load(tmp_path)
+    assert case.image.file.resolve() == tmp_path.resolve()
+    assert cmfsim.read_image(case.image.file).values.shape[2] == 12
+
+
+def test_a_series_in_parts_beside_another_is_named_by_its_uid(tmp_path):
+    series_of_a_head(tmp_path, places=("a", "b"))
+    series_of_a_head(tmp_path / "after_surgery", uid="1.2.4", study="1.5")
+    draft = init_case(tmp_path)
+    assert not draft.questions
+    case = cmfsim.Case.load(tmp_path)
+    assert case.image.series == "1.2.3"
+    read = cmfsim.read_image(case.image.file, series=case.image.series)
+    assert read.values.shape[2] == 12
+    assert case.postoperative.image == tmp_path / "after_surgery"
+
+
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [
+        ("Maxilla & Upper Skull", "cranium"),
+        ("LeFort1_segment", "maxilla"),
+        ("BSSO distal", "mandible_body"),
+        ("proximal segment left", "ramus_left"),
+        ("RamusR", "ramus_right"),
+        ("Genioplasty", "chin"),
+        ("lowerJaw", "mandible"),
+        ("Lower teeth", "lower teeth"),
+        ("softTissue", "skin"),
+        ("Segment_7", ""),
+        ("ramus", ""),
+    ],
+)
+def test_names_say_parts(name, part):
+    assert name_role(name).part == part
+
+
+def test_a_name_says_what_is_after_the_operation():
+    assert name_role("Mandible_postOp").is_after
+    assert not name_role("posterior_mandible").is_after
