@@ -15,12 +15,12 @@ use crate::contact::{ContactStart, ContactState, Sliding, SlidingNode};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
 use crate::mesh::TetMesh;
-use crate::statics::effort::Solve;
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::system::{Solved, System};
 use crate::statics::options::StaticOptions;
+use crate::statics::plans::settling::{Begin, Linked, Settle, Settled};
 use crate::statics::reduction::Reduction;
-use crate::statics::settling::{Begin, Linked, Settle, Settled};
 use crate::statics::solution::{Clock, TouchResult};
-use crate::statics::system::{Solved, System};
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
 /// Motion of the bones in one step, over the mean edge of the tissue that may be touched.

@@ -5,12 +5,12 @@ use std::borrow::Cow;
 use crate::algebra::constraints::Constraint;
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Exact};
-use crate::statics::effort::Solve;
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::newton::descent::Steps;
 use crate::statics::newton::step::{Moves, Step, by_tangent};
 use crate::statics::newton::{Equilibrium, Pose, Target, along_slope, moved_by};
 use crate::statics::options::Interrupt;
-use crate::statics::row_conditions::RowConditions;
 use crate::vector::{add, dot, scaled, sub};
 
 /// Steps under the conditions of `target`.

@@ -4,13 +4,13 @@ use std::borrow::Cow;
 
 use crate::error::{MtmError, Result};
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
-use crate::statics::effort::Solve;
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::newton::step::{Step, by_tangent};
 use crate::statics::newton::{
     Equilibrium, MAX_STEPS, Pose, STIFF_PARTS, TangentSolver, Target, along_slope, lost, moved_by,
     reach,
 };
-use crate::statics::row_conditions::RowConditions;
 use crate::vector::{add, dot};
 
 /// Share of the slope by which a step must decrease the energy (Armijo 1966).

@@ -13,9 +13,9 @@ use crate::contact::Spring;
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::mechanics::strain_energy::{EnergyState, Part};
+use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::newton::{Equilibrium, Pose, Target, reach};
 use crate::statics::reduction::NO_ROW;
-use crate::statics::row_conditions::RowConditions;
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Largest number of nodes that move, and the same relative to all: more are no small part of the body. Neighbours

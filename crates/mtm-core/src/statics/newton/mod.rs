@@ -22,14 +22,14 @@ use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::mechanics::strain_energy::{LAG, PointTangents, StrainEnergy};
 use crate::mechanics::tensors::MassTensors;
-use crate::statics::effort::Solve;
-use crate::statics::iterative::Extremes;
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::iterative::Extremes;
+use crate::statics::linear::row_conditions::RowConditions;
+use crate::statics::linear::system::Solved;
 use crate::statics::newton::hierarchy::SharedHierarchy;
 use crate::statics::options::{Method, StaticOptions};
 use crate::statics::reduction::{ReducedPattern, Reduction};
-use crate::statics::row_conditions::RowConditions;
 use crate::statics::solution::Clock;
-use crate::statics::system::Solved;
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
 pub(crate) use sliding::Slide;

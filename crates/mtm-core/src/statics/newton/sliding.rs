@@ -8,7 +8,9 @@ use crate::boundary::Motion;
 use crate::contact::{ContactState, Sliding};
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
-use crate::statics::effort::Solve;
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::row_conditions::RowConditions;
+use crate::statics::linear::system::{BodyRows, System};
 use crate::statics::newton::descent::Steps;
 use crate::statics::newton::hierarchy::Found;
 use crate::statics::newton::step::{Step, by_tangent};
@@ -17,11 +19,9 @@ use crate::statics::newton::{
     reach,
 };
 use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::plans::settling::{Begin, Linked, Settle, Settled};
 use crate::statics::restraint::Held;
-use crate::statics::row_conditions::RowConditions;
-use crate::statics::settling::{Begin, Linked, Settle, Settled};
 use crate::statics::solution::Clock;
-use crate::statics::system::{BodyRows, System};
 use crate::vector::{add, sub};
 
 /// Sliding nodes of a body, with the input of their solver.

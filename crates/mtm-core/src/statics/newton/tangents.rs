@@ -7,7 +7,7 @@ use crate::algebra::constraints::{Constraint, add_offsets, projected, projected_
 use crate::algebra::multigrid::Multigrid;
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite};
-use crate::statics::iterative::{Iterative, hierarchy};
+use crate::statics::linear::iterative::{Iterative, hierarchy};
 use crate::statics::newton::hierarchy::Found;
 use crate::statics::newton::step::Moves;
 use crate::statics::newton::{Equilibrium, Pose, STEP_TOLERANCE, TangentSolver, Target};

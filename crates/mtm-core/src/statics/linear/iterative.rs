@@ -15,12 +15,12 @@ use crate::algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
 use crate::contact::links::Link;
 use crate::error::{MtmError, Result, Shortfall};
-use crate::statics::confirmed::{Confirmed, is_doubtful};
-use crate::statics::effort::Solve;
+use crate::statics::linear::confirmed::{Confirmed, is_doubtful};
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::projected_product::ProjectedProduct;
+use crate::statics::linear::row_conditions::RowConditions;
+use crate::statics::linear::unstable::{at_fault, carry_on};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
-use crate::statics::projected_product::ProjectedProduct;
-use crate::statics::row_conditions::RowConditions;
-use crate::statics::unstable::{at_fault, carry_on};
 use crate::vector::{add, dot, norm, scaled, sub};
 
 /// Over-relaxation of the node-wise iteration.

@@ -13,16 +13,16 @@ use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
 use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
 use crate::error::{MtmError, Result};
-use crate::statics::effort::Solve;
-use crate::statics::frozen::FrozenContact;
-use crate::statics::iterative::{Extremes, Iterative, Leave, Trail, hierarchy};
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::iterative::{Extremes, Iterative, Leave, Trail, hierarchy};
+use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::options::{Interrupt, Method, StaticOptions};
-use crate::statics::reaction::ContactFactor;
-use crate::statics::restraint::Held;
-use crate::statics::row_conditions::RowConditions;
-use crate::statics::settling::{
+use crate::statics::plans::frozen::FrozenContact;
+use crate::statics::plans::reaction::ContactFactor;
+use crate::statics::plans::settling::{
     Linked, Settle, Settled, Unfactored, direct_error, settled_by_flexibility, touching_needs_pcg,
 };
+use crate::statics::restraint::Held;
 use crate::statics::solution::Clock;
 use crate::vector::{add, sub};
 

@@ -79,7 +79,7 @@ fn way_along(slope: f64, curvature: f64, most: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::statics::projected_product::ProjectedProduct;
+    use crate::statics::linear::projected_product::ProjectedProduct;
 
     fn spring(row: usize, stiffness: f64) -> (usize, Spring) {
         (row, Spring { node: row, axis: [1.0, 0.0, 0.0], stiffness, goal: 0.0 })

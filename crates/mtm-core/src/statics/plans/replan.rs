@@ -9,11 +9,11 @@ use rayon::prelude::*;
 use crate::boundary::{Motion, NodeKind, Plan, Segment, matched};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
-use crate::statics::about::{About, Rate};
+use crate::statics::linear::system::Frozen;
 use crate::statics::options::Interrupt;
+use crate::statics::plans::about::{About, Rate};
 use crate::statics::reduction::NO_ROW;
 use crate::statics::solver::StaticSolver;
-use crate::statics::system::Frozen;
 
 /// Unit fields per segment.
 pub const COLUMNS: usize = 12;

@@ -14,11 +14,11 @@ use crate::contact::links::Link;
 use crate::contact::{Body, Constraints, ContactStart, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mechanics::kinematics::Kinematics;
-use crate::statics::effort::Solve;
-use crate::statics::iterative::{Advance, Iterative, Leave, Trail};
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::iterative::{Advance, Iterative, Leave, Trail};
+use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::options::{Method, StaticOptions};
-use crate::statics::reaction::{Answer, Answers, ContactFactor};
-use crate::statics::row_conditions::RowConditions;
+use crate::statics::plans::reaction::{Answer, Answers, ContactFactor};
 use crate::statics::solution::Clock;
 use crate::vector::{between, dot, norm, sub};
 

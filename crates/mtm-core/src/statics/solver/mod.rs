@@ -1,6 +1,9 @@
 //! `StaticSolver`: eliminates prescribed nodes, keeps everything that does not depend on the plan, and
 //! assembles the solution of each plan.
 
+pub(crate) mod outcome;
+pub(crate) mod refusals;
+
 use std::sync::Arc;
 
 use crate::algebra::blocks::{Block, BlockMatrix};
@@ -10,16 +13,16 @@ use crate::contact::{ContactState, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, check_forces};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::tensors::MassTensors;
-use crate::statics::confirmed::is_doubtful;
-use crate::statics::effort::Solve;
-use crate::statics::iterative::Extremes;
+use crate::statics::linear::confirmed::is_doubtful;
+use crate::statics::linear::effort::Solve;
+use crate::statics::linear::iterative::Extremes;
+use crate::statics::linear::system::{BodyRows, Frozen, Solved, System};
 use crate::statics::newton::{Equilibrium, Slide};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::plans::settling::{Begin, Linked, Settle, method_for_touching};
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Held};
-use crate::statics::settling::{Begin, Linked, Settle, method_for_touching};
 use crate::statics::solution::{Clock, Solution, Timings};
-use crate::statics::system::{BodyRows, Frozen, Solved, System};
 use crate::statics::touching::{Path, Prescribes, Touch};
 use crate::vector::{add, norm, scaled};
 

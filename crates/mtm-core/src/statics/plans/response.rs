@@ -8,11 +8,11 @@
 use crate::boundary::{Motion, Plan, matched};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
-use crate::statics::about::{About, Rate, Slope};
+use crate::statics::linear::system::Frozen;
 use crate::statics::options::Interrupt;
+use crate::statics::plans::about::{About, Rate, Slope};
 use crate::statics::solution::Solution;
 use crate::statics::solver::StaticSolver;
-use crate::statics::system::Frozen;
 use crate::vector::add;
 
 /// A change of what drives a body, per unit of a parameter.

@@ -2,7 +2,7 @@
 
 use crate::algebra::cholesky::{Rough, TailFlexibility};
 use crate::contact::Spring;
-use crate::statics::reaction::rows::Rows;
+use crate::statics::plans::reaction::rows::Rows;
 
 /// The flexibility Bᵀ F B of the directions B of rows, and of unstable springs after them, in single precision.
 ///

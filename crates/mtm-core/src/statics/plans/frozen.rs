@@ -11,7 +11,7 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use crate::algebra::cholesky::{DenseFactor, DenseSymmetric, TailFlexibility};
 use crate::contact::{Constraints, ContactRow, Spring};
 use crate::error::Result;
-use crate::statics::reaction::{Rows, singular, unheld};
+use crate::statics::plans::reaction::{Rows, singular, unheld};
 use crate::vector::{add, dot, scaled};
 
 /// The factors for conditions that stay the same.
