@@ -25,7 +25,7 @@ CORE: Mapping[str, frozenset[str]] = {
         "meshing": "error geometry mesh vector",
         "muscles": "error geometry mechanics mesh vector",
         "registration": "error geometry vector",
-        "contact": "boundary error geometry mesh vector",
+        "contact": "algebra boundary error geometry mesh vector",
         "statics": "algebra boundary contact error geometry mechanics mesh vector",
     }.items()
 }
@@ -82,6 +82,7 @@ CRATE_PATH = re.compile(r"\b(crate|super)((?:::\w+)+)")
 # A folder's mod.rs lists its files and passes their names on: neither is an import.
 PASSED_ON = re.compile(r"^\s*pub(?:\([^)]*\))?\s+use\s+(?!crate|super)[^;]*;", re.MULTILINE)
 CHILD = re.compile(r"^\s*(?:pub(?:\([^)]*\))?\s+)?mod\s+(\w+);", re.MULTILINE)
+TYPE_NAME = re.compile(r"^(?:pub(?:\([^)]*\))? )?(?:struct|enum|trait|type) (\w+)", re.MULTILINE)
 CRATE_GROUP = re.compile(r"\b(?:crate|super)::\{")
 
 
@@ -106,6 +107,7 @@ def check_rust(root: Path) -> Iterator[str]:
             for match in re.finditer(rf"\b{crate}\s*::|\buse\s+{crate}\b", text):
                 yield f"{_at(path, root, text, match.start())}: {crate} belongs in crates/{home}"
     yield from _check_core(root)
+    yield from _doubled_types(root)
 
 
 def _check_core(root: Path) -> Iterator[str]:
@@ -134,6 +136,18 @@ def _check_core(root: Path) -> Iterator[str]:
         yield f"crates/mtm-core/src: {len(entries)} entries, at most {MOST_CORE_ENTRIES}"
     for circle in _circles(graph):
         yield f"crates/mtm-core/src: a circle of imports: {' → '.join(circle)}"
+
+
+def _doubled_types(root: Path) -> Iterator[str]:
+    """The types that share a name with another one: a reader would have to guess which is meant."""
+    homes: dict[str, str] = {}
+    for path in sorted((root / "crates").rglob("*.rs")):
+        text = COMMENT.sub(_blank, path.read_text(encoding="utf-8"))
+        for match in TYPE_NAME.finditer(text):
+            home = _at(path, root, text, match.start(1))
+            if match[1] in homes:
+                yield f"{home}: {match[1]} is defined in {homes[match[1]]} as well"
+            homes[match[1]] = home
 
 
 def _core_complaint(entry: str, other: str) -> str | None:

@@ -280,7 +280,7 @@ impl PyRigidFit {
 }
 
 /// What moving points are aligned with.
-enum Goal {
+enum AlignmentTarget {
     Surface(Arc<Surface>),
     Points(PointTree),
 }
@@ -314,10 +314,10 @@ pub fn icp(
         None => None,
     };
     let goal = match fixed.cast::<PySurface>() {
-        Ok(surface) => Goal::Surface(surface.get().core.clone()),
+        Ok(surface) => AlignmentTarget::Surface(surface.get().core.clone()),
         Err(_) => {
             let points = arrays::points(fixed, Named("fixed", REGISTRATION))?;
-            Goal::Points(attempted(py, || PointTree::new(&points))?)
+            AlignmentTarget::Points(attempted(py, || PointTree::new(&points))?)
         }
     };
     let defaults = IcpOptions::default();
@@ -340,8 +340,8 @@ pub fn icp(
     };
     let core = interruptible(py, move |stop| {
         let fixed = match &goal {
-            Goal::Surface(surface) => Fixed::Surface(surface),
-            Goal::Points(tree) => Fixed::Points(tree),
+            AlignmentTarget::Surface(surface) => Fixed::Surface(surface),
+            AlignmentTarget::Points(tree) => Fixed::Points(tree),
         };
         core_icp(&moving, normals.as_deref(), fixed, &options, stop)
     })?;

@@ -31,6 +31,11 @@ def test_the_project_keeps_its_import_rules(capsys: pytest.CaptureFixture[str]) 
         ("crates/mtm-core/src/mesh.rs", "use crate::{error, blocks};", "one `use crate::"),
         ("crates/mtm-core/src/algebra/krylov.rs", "use super::{blocks};", "one `use super::"),
         ("crates/mtm-core/src/new.rs", "", "add new to CORE"),
+        (
+            "crates/mtm-core/src/mesh.rs",
+            "struct Row;\npub(crate) enum Row {}",
+            "mesh.rs:2: Row is defined in crates/mtm-core/src/mesh.rs:1",
+        ),
         ("crates/mtm-core/src/new/deep.rs", "", "deep.rs: add new to CORE"),
         ("crates/mtm-core/src/utils.rs", "", "name the file after its subject"),
         ("python/cmfsim/errors.py", "from cmfsim import values", "errors may not import values"),

@@ -5,6 +5,7 @@ pub mod cholesky;
 pub mod constraints;
 pub(crate) mod error_bound;
 pub mod krylov;
+pub(crate) mod line_search;
 pub mod memory;
 pub mod multigrid;
 pub mod ordering;

@@ -28,11 +28,11 @@ const CURVING: f64 = 0.5;
 const SAMPLES_PER_TASK: usize = 64;
 
 /// A lattice point, or the lowest corner of a cell.
-type Place = [i32; 3];
+type LatticePoint = [i32; 3];
 /// Spline coefficients around a cell, four along each axis, those of x first.
 type Cell = [f64; 64];
-type PlaceMap<T> = HashMap<Place, T, BuildHasherDefault<KeyHasher>>;
-type PlaceSet = HashSet<Place, BuildHasherDefault<KeyHasher>>;
+type PlaceMap<T> = HashMap<LatticePoint, T, BuildHasherDefault<KeyHasher>>;
+type PlaceSet = HashSet<LatticePoint, BuildHasherDefault<KeyHasher>>;
 
 /// The field at a point.
 #[derive(Debug, Clone, Copy)]
@@ -53,12 +53,12 @@ pub(crate) struct Field {
     origin: [f64; 3],
     /// Lattice spacing, mm.
     spacing: f64,
-    lattice: RwLock<Lattice>,
+    lattice: RwLock<Samples>,
 }
 
 /// The samples and coefficients computed so far.
 #[derive(Debug, Default)]
-struct Lattice {
+struct Samples {
     samples: PlaceMap<f64>,
     cells: PlaceMap<Box<Cell>>,
 }
@@ -66,13 +66,13 @@ struct Lattice {
 /// The field, evaluated around the points it was requested for.
 pub(crate) struct ReadyField<'a> {
     field: &'a Field,
-    lattice: RwLockReadGuard<'a, Lattice>,
+    lattice: RwLockReadGuard<'a, Samples>,
 }
 
 impl Field {
     /// The field of `surface` on the lattice through `origin` with the given spacing, mm.
     pub fn new(surface: Arc<Surface>, origin: [f64; 3], spacing: f64) -> Self {
-        Self { surface, origin, spacing, lattice: RwLock::new(Lattice::default()) }
+        Self { surface, origin, spacing, lattice: RwLock::new(Samples::default()) }
     }
 
     /// The field of another surface, on the same lattice.
@@ -92,7 +92,7 @@ impl Field {
 
     /// The field prepared at `points`, mm; parallel, bitwise identical for any number of threads.
     pub fn at(&self, points: &[[f64; 3]]) -> ReadyField<'_> {
-        let mut missing: Vec<Place> = {
+        let mut missing: Vec<LatticePoint> = {
             let lattice = self.read();
             let asked: PlaceSet = points.iter().map(|&p| self.cell_of(p).0).collect();
             asked.into_iter().filter(|cell| !lattice.cells.contains_key(cell)).collect()
@@ -105,7 +105,7 @@ impl Field {
     }
 
     /// Samples and coefficients of `cells`.
-    fn fill(&self, cells: &[Place]) {
+    fn fill(&self, cells: &[LatticePoint]) {
         let mut wanted = PlaceSet::default();
         {
             let lattice = self.read();
@@ -119,13 +119,13 @@ impl Field {
                 }
             }
         }
-        let mut wanted: Vec<Place> = wanted.into_iter().collect();
+        let mut wanted: Vec<LatticePoint> = wanted.into_iter().collect();
         wanted.sort_unstable();
         let found: Vec<f64> =
             wanted.par_iter().with_min_len(SAMPLES_PER_TASK).map(|&at| self.sample(at)).collect();
         let mut lattice = self.lattice.write().unwrap_or_else(std::sync::PoisonError::into_inner);
         lattice.samples.extend(wanted.into_iter().zip(found));
-        let made: Vec<(Place, Box<Cell>)> = cells
+        let made: Vec<(LatticePoint, Box<Cell>)> = cells
             .par_iter()
             .with_min_len(SAMPLES_PER_TASK)
             .map(|&cell| (cell, coefficients(&lattice.samples, cell)))
@@ -134,7 +134,7 @@ impl Field {
     }
 
     /// Signed distance of a lattice point from the surface with curved facets.
-    fn sample(&self, at: Place) -> f64 {
+    fn sample(&self, at: LatticePoint) -> f64 {
         let point = [0, 1, 2].map(|i| self.origin[i] + self.spacing * f64::from(at[i]));
         let found = self.surface.closest_one(point);
         let t = found.triangle as usize;
@@ -157,14 +157,14 @@ impl Field {
         distance - dot(rise, outward)
     }
 
-    fn cell_of(&self, point: [f64; 3]) -> (Place, [f64; 3]) {
+    fn cell_of(&self, point: [f64; 3]) -> (LatticePoint, [f64; 3]) {
         let at = [0, 1, 2].map(|i| (point[i] - self.origin[i]) / self.spacing);
         let cell = at.map(f64::floor);
         // Coordinates are limited far below what i32 holds at any sensible spacing; the cast saturates.
         (cell.map(|v| v as i32), [0, 1, 2].map(|i| at[i] - cell[i]))
     }
 
-    fn read(&self) -> RwLockReadGuard<'_, Lattice> {
+    fn read(&self) -> RwLockReadGuard<'_, Samples> {
         self.lattice.read().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 }
@@ -239,19 +239,19 @@ fn weights(t: f64) -> [[f64; 4]; 3] {
 }
 
 /// The knots whose splines are nonzero in a cell, in the order of [`Cell`].
-fn knots(cell: Place) -> impl Iterator<Item = Place> {
+fn knots(cell: LatticePoint) -> impl Iterator<Item = LatticePoint> {
     (0..64).map(move |k: i32| [cell[0] - 1 + k / 16, cell[1] - 1 + k / 4 % 4, cell[2] - 1 + k % 4])
 }
 
 /// A lattice point and its six neighbours.
-fn star(at: Place) -> [Place; 7] {
+fn star(at: LatticePoint) -> [LatticePoint; 7] {
     let [x, y, z] = at;
     [at, [x - 1, y, z], [x + 1, y, z], [x, y - 1, z], [x, y + 1, z], [x, y, z - 1], [x, y, z + 1]]
 }
 
 /// Coefficients of the splines around a cell: the samples minus a sixth of their second differences, which
 /// reproduces cubic fields exactly (de Boor & Fix 1973).
-fn coefficients(samples: &PlaceMap<f64>, cell: Place) -> Box<Cell> {
+fn coefficients(samples: &PlaceMap<f64>, cell: LatticePoint) -> Box<Cell> {
     let mut out = Box::new([0.0; 64]);
     for (value, knot) in out.iter_mut().zip(knots(cell)) {
         let [own, around @ ..] = star(knot).map(|at| samples.get(&at).copied().unwrap_or(f64::NAN));

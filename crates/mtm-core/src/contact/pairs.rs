@@ -20,7 +20,7 @@ use crate::boundary::{Against, Boundary, Motion};
 use crate::contact::links::Link;
 use crate::contact::overlap::Overlap;
 use crate::contact::planes::{Meeting, Plane, Planes};
-use crate::contact::walls::{Moved, Outside, Wall};
+use crate::contact::walls::{MovedWall, Outside, Wall};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::Closest;
@@ -232,18 +232,20 @@ impl Pairs {
         for wall in &self.walls {
             moved.push(match wall {
                 Wall::Tissue { surface, nodes } => {
-                    Moved::Deformed(surface.moved(nodes.iter().map(|&j| there(j)).collect())?)
+                    MovedWall::Deformed(surface.moved(nodes.iter().map(|&j| there(j)).collect())?)
                 }
                 Wall::Bone { surface, segment } => match segment.map(|s| motions[s]) {
-                    None => Moved::Rigid(surface, RigidMotion::identity()),
-                    Some(Motion::Rigid(rigid)) => Moved::Rigid(surface, *rigid),
+                    None => MovedWall::Rigid(surface, RigidMotion::identity()),
+                    Some(Motion::Rigid(rigid)) => MovedWall::Rigid(surface, *rigid),
                     Some(Motion::Surface(motion)) => {
                         let way = motion.displacement(surface.vertices());
                         let vertices = surface.vertices().iter().zip(way);
-                        Moved::Deformed(surface.moved(vertices.map(|(x, w)| add(*x, w)).collect())?)
+                        MovedWall::Deformed(
+                            surface.moved(vertices.map(|(x, w)| add(*x, w)).collect())?,
+                        )
                     }
                     // `Boundary::motions` rejects this for segments that nodes may touch.
-                    Some(Motion::Nodes(_)) => Moved::Rigid(surface, RigidMotion::identity()),
+                    Some(Motion::Nodes(_)) => MovedWall::Rigid(surface, RigidMotion::identity()),
                 },
             });
         }
@@ -282,15 +284,17 @@ impl Pairs {
 
     /// The position of candidate `c` at `place` relative to its surface; nothing beyond the border of the
     /// surface.
-    fn meet(&self, c: &Candidate, wall: &Moved<'_>, place: [f64; 3]) -> Option<Meeting> {
+    fn meet(&self, c: &Candidate, wall: &MovedWall<'_>, place: [f64; 3]) -> Option<Meeting> {
         let (closest, mean_edge) = match wall {
-            Moved::Rigid(surface, rigid) => {
+            MovedWall::Rigid(surface, rigid) => {
                 let mut found = surface.closest_one(rigid.apply_inverse(place));
                 found.point = rigid.apply(found.point);
                 found.normal = rigid.rotate(found.normal);
                 (found, surface.mean_edge_length())
             }
-            Moved::Deformed(surface) => (surface.closest_one(place), surface.mean_edge_length()),
+            MovedWall::Deformed(surface) => {
+                (surface.closest_one(place), surface.mean_edge_length())
+            }
         };
         let way = sub(place, closest.point);
         let distance = over(&closest, way, mean_edge)?;

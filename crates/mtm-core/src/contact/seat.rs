@@ -30,7 +30,7 @@ pub(super) struct Seat {
 
 /// The local shape of a surface at a node.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Touch {
+pub(super) struct LocalShape {
     /// Distance of the node from its surface, negative behind it, mm, to first order.
     pub gap: f64,
     /// Unit normal, out of the bone.
@@ -41,7 +41,7 @@ pub(super) struct Touch {
     pub hessian: [[f64; 3]; 3],
 }
 
-impl Touch {
+impl LocalShape {
     /// Distance in terms of the field, mm: smooth, whereas `gap` is divided by the slope.
     pub fn level(&self) -> f64 {
         self.gap * self.slope
@@ -61,14 +61,14 @@ impl Touch {
 /// Contact surfaces under a plan, and the position of each node on them.
 pub(super) struct Seats<'a> {
     sliding: &'a Sliding,
-    surfaces: Vec<Moved<'a>>,
+    surfaces: Vec<MovedSurface<'a>>,
     seats: Vec<Seat>,
     /// Positions of the nodes if they were attached to their segment, mm.
     pub clinging: Vec<[f64; 3]>,
 }
 
 /// A contact surface under a plan.
-enum Moved<'a> {
+enum MovedSurface<'a> {
     /// Points are moved back to the field at rest, whose samples can be used for every plan.
     Rigid(&'a Field, RigidMotion),
     /// A surface with new vertices.
@@ -90,14 +90,14 @@ impl<'a> Seats<'a> {
             .zip(motions)
             .map(|(field, motion)| {
                 Ok(match (field, motion) {
-                    (None, _) | (_, Motion::Nodes(_)) => Moved::Unused,
-                    (Some(field), Motion::Rigid(rigid)) => Moved::Rigid(field, *rigid),
+                    (None, _) | (_, Motion::Nodes(_)) => MovedSurface::Unused,
+                    (Some(field), Motion::Rigid(rigid)) => MovedSurface::Rigid(field, *rigid),
                     (Some(field), Motion::Surface(surface)) => {
                         let rest = field.surface();
                         let u = surface.displacement(rest.vertices());
                         let vertices = rest.vertices().iter().zip(u);
                         let moved = vertices.map(|(&x, u)| add(x, u)).collect();
-                        Moved::Deformed(field.of(rest.moved(moved)?))
+                        MovedSurface::Deformed(field.of(rest.moved(moved)?))
                     }
                 })
             })
@@ -131,14 +131,16 @@ impl<'a> Seats<'a> {
     fn foot(&self, i: usize) -> [f64; 3] {
         let rest = &self.sliding.rest[i];
         match &self.surfaces[self.sliding.nodes[i].segment] {
-            Moved::Rigid(_, rigid) => rigid.apply(rest.point),
-            Moved::Deformed(field) => field.surface().point_at(rest.triangle, rest.barycentric),
-            Moved::Unused => rest.point,
+            MovedSurface::Rigid(_, rigid) => rigid.apply(rest.point),
+            MovedSurface::Deformed(field) => {
+                field.surface().point_at(rest.triangle, rest.barycentric)
+            }
+            MovedSurface::Unused => rest.point,
         }
     }
 
     /// The local surface of each node at its position in `at`, mm.
-    pub fn touches(&self, at: &[[f64; 3]]) -> Vec<Touch> {
+    pub fn touches(&self, at: &[[f64; 3]]) -> Vec<LocalShape> {
         let mut out = Vec::with_capacity(at.len());
         // Nodes are ordered by segment.
         for chunk in self.sliding.nodes.chunk_by(|a, b| a.segment == b.segment) {
@@ -150,7 +152,7 @@ impl<'a> Seats<'a> {
                 .map(|(&x, seat)| sub(x, seat.offset))
                 .collect();
             match &self.surfaces[chunk[0].segment] {
-                Moved::Rigid(field, rigid) => {
+                MovedSurface::Rigid(field, rigid) => {
                     let back: Vec<[f64; 3]> = own.iter().map(|&x| rigid.apply_inverse(x)).collect();
                     let turn = |value: FieldValue| FieldValue {
                         distance: value.distance,
@@ -159,8 +161,8 @@ impl<'a> Seats<'a> {
                     };
                     felt(field, &back, seats, turn, &mut out);
                 }
-                Moved::Deformed(field) => felt(field, &own, seats, |value| value, &mut out),
-                Moved::Unused => out.extend(own.iter().map(|_| Touch {
+                MovedSurface::Deformed(field) => felt(field, &own, seats, |value| value, &mut out),
+                MovedSurface::Unused => out.extend(own.iter().map(|_| LocalShape {
                     gap: 0.0,
                     normal: [0.0, 0.0, 1.0],
                     slope: 1.0,
@@ -176,7 +178,7 @@ impl<'a> Seats<'a> {
     pub fn closest(&self, i: usize, at: [f64; 3]) -> (Closest, Option<f64>) {
         let own = sub(at, self.seats[i].offset);
         let found = match &self.surfaces[self.sliding.nodes[i].segment] {
-            Moved::Rigid(field, rigid) => {
+            MovedSurface::Rigid(field, rigid) => {
                 let found = field.surface().closest_one(rigid.apply_inverse(own));
                 Closest {
                     point: rigid.apply(found.point),
@@ -184,8 +186,10 @@ impl<'a> Seats<'a> {
                     ..found
                 }
             }
-            Moved::Deformed(field) => field.surface().closest_one(own),
-            Moved::Unused => Closest { point: own, on_border: false, ..self.sliding.rest[i] },
+            MovedSurface::Deformed(field) => field.surface().closest_one(own),
+            MovedSurface::Unused => {
+                Closest { point: own, on_border: false, ..self.sliding.rest[i] }
+            }
         };
         let away = sub(own, found.point);
         let past = norm(sub(away, scaled(found.normal, dot(found.normal, away))));
@@ -202,18 +206,18 @@ impl<'a> Seats<'a> {
     /// Lattice spacing of the field of segment `s`, mm.
     fn spacing(&self, s: usize) -> f64 {
         match &self.surfaces[s] {
-            Moved::Rigid(field, _) => field.spacing(),
-            Moved::Deformed(field) => field.spacing(),
-            Moved::Unused => f64::INFINITY,
+            MovedSurface::Rigid(field, _) => field.spacing(),
+            MovedSurface::Deformed(field) => field.spacing(),
+            MovedSurface::Unused => f64::INFINITY,
         }
     }
 
     /// Mean edge of the surface of segment `s`, mm.
     pub fn mean_edge(&self, s: usize) -> f64 {
         match &self.surfaces[s] {
-            Moved::Rigid(field, _) => field.surface().mean_edge_length(),
-            Moved::Deformed(field) => field.surface().mean_edge_length(),
-            Moved::Unused => 0.0,
+            MovedSurface::Rigid(field, _) => field.surface().mean_edge_length(),
+            MovedSurface::Deformed(field) => field.surface().mean_edge_length(),
+            MovedSurface::Unused => 0.0,
         }
     }
 }
@@ -225,14 +229,14 @@ fn felt(
     points: &[[f64; 3]],
     seats: &[Seat],
     turn: impl Fn(FieldValue) -> FieldValue + Sync,
-    out: &mut Vec<Touch>,
+    out: &mut Vec<LocalShape>,
 ) {
     let ready = field.at(points);
     out.par_extend(points.par_iter().zip(seats).with_min_len(64).map(|(&point, seat)| {
         let value = turn(ready.value(point));
         let length = norm(value.gradient);
         let slope = length.max(LEAST_SLOPE);
-        Touch {
+        LocalShape {
             gap: (value.distance - seat.level) / slope,
             normal: scaled(value.gradient, 1.0 / length.max(f64::MIN_POSITIVE)),
             slope,

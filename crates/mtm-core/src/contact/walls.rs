@@ -38,7 +38,7 @@ impl Wall {
 }
 
 /// A surface under a plan.
-pub(super) enum Moved<'a> {
+pub(super) enum MovedWall<'a> {
     /// Points are moved back to the surface at rest.
     Rigid(&'a Surface, RigidMotion),
     Deformed(Surface),

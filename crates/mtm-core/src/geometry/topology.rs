@@ -42,7 +42,7 @@ pub(crate) struct Topology {
 
 /// One side of a triangle, filed under its undirected edge.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct Side {
+struct TriangleSide {
     edge: [u32; 2],
     triangle: u32,
     k: u8,
@@ -61,13 +61,13 @@ impl Topology {
         normals: &[Vec3],
         crease_angle: f64,
     ) -> Self {
-        let mut sides: Vec<Side> = Vec::with_capacity(3 * triangles.len());
+        let mut sides: Vec<TriangleSide> = Vec::with_capacity(3 * triangles.len());
         for (t, triangle) in triangles.iter().enumerate() {
             for k in 0..3 {
                 let (from, to) = (triangle[k], triangle[(k + 1) % 3]);
                 let (edge, ascending) =
                     if from < to { ([from, to], true) } else { ([to, from], false) };
-                sides.push(Side { edge, triangle: t as u32, k: k as u8, ascending });
+                sides.push(TriangleSide { edge, triangle: t as u32, k: k as u8, ascending });
             }
         }
         sides.par_sort_unstable();
@@ -126,7 +126,7 @@ impl Topology {
     }
 }
 
-impl Side {
+impl TriangleSide {
     /// Corner number `3 * triangle + k` at the start (0) or end (1) of the side.
     fn corner(&self, end: u32) -> u32 {
         3 * self.triangle + (u32::from(self.k) + end) % 3

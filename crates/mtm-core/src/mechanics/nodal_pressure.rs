@@ -20,7 +20,7 @@ use crate::vector::add;
 
 /// κ of a material, MPa, and the remaining stiffness.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Split {
+pub(crate) struct StiffnessSplit {
     /// Stiffness against averaged volumetric strain.
     pub bulk: f64,
     /// C − κ I⊗I, positive definite.
@@ -52,11 +52,14 @@ impl Rest {
 ///
 /// K_R is the largest κ for which C − κ I⊗I has no negative eigenvalue. The direction that then has a zero
 /// eigenvalue, C⁻¹ I, is not a shear: reducing κ by e/3 makes it positive. e ≤ 3 K_R, so κ ≥ 0.
-pub(crate) fn split(material: &TetMaterial<'_>) -> Split {
+pub(crate) fn split(material: &TetMaterial<'_>) -> StiffnessSplit {
     match material {
         TetMaterial::Isotropic(l) => {
             let bulk = l.lambda_.max(0.0);
-            Split { bulk, rest: Rest::Isotropic(Lame { lambda_: l.lambda_ - bulk, mu: l.mu }) }
+            StiffnessSplit {
+                bulk,
+                rest: Rest::Isotropic(Lame { lambda_: l.lambda_ - bulk, mu: l.mu }),
+            }
         }
         TetMaterial::Spencer(c, a) => {
             // In the fibre frame pressure only involves C11, C12 and C22 + C23.
@@ -66,7 +69,7 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> Split {
             let pressed = (c11 * pair - 2.0 * c12 * c12) / (pair - 4.0 * c12 + 2.0 * c11);
             let bulk = (pressed - c.eigenvalue_range().0 / 3.0).max(0.0);
             let rest = Spencer { lambda_: c.lambda_ - bulk, ..*c };
-            Split { bulk, rest: Rest::Spencer(rest, *a) }
+            StiffnessSplit { bulk, rest: Rest::Spencer(rest, *a) }
         }
         TetMaterial::General(c) => {
             let pressure = Vector6::new(1.0, 1.0, 1.0, 0.0, 0.0, 0.0);
@@ -80,7 +83,7 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> Split {
                     *value -= bulk;
                 }
             }
-            Split { bulk, rest: Rest::General(rest) }
+            StiffnessSplit { bulk, rest: Rest::General(rest) }
         }
     }
 }
@@ -90,7 +93,7 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> Split {
 /// compensate for volume changes of the stiff one.
 type Octaves = [i32; 2];
 
-fn octaves(split: &Split) -> Octaves {
+fn octaves(split: &StiffnessSplit) -> Octaves {
     let shear = match split.rest {
         Rest::Isotropic(l) => l.mu,
         Rest::Spencer(c, _) => c.mu_across,

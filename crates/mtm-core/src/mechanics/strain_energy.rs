@@ -44,14 +44,14 @@ pub struct StrainEnergy {
     /// Energy density of each tet, or of all of them.
     densities: Vec<Density>,
     /// Memory of the last state and matrix: clearing new pages takes longer than computing forces.
-    scratch: Mutex<Scratch>,
+    scratch: Mutex<TetValues>,
     /// Memory of the tangents of an earlier series.
     freed: Mutex<PointTangents>,
 }
 
 /// Values of every tet, kept for their memory only.
 #[derive(Debug, Default)]
-struct Scratch {
+struct TetValues {
     /// Internal force on each node of each tet, N.
     forces: Vec<[f64; 3]>,
     /// Tangent stiffness, N/mm.
@@ -136,12 +136,12 @@ impl StrainEnergy {
     }
 
     /// Takes the memory of the last state and tangent; another thread's call meanwhile starts with none.
-    fn take_scratch(&self) -> Scratch {
+    fn take_scratch(&self) -> TetValues {
         std::mem::take(&mut *self.scratch.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// Keeps `scratch` for the next state and tangent.
-    fn keep_scratch(&self, scratch: Scratch) {
+    fn keep_scratch(&self, scratch: TetValues) {
         *self.scratch.lock().unwrap_or_else(PoisonError::into_inner) = scratch;
     }
 

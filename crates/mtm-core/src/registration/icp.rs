@@ -139,7 +139,7 @@ struct Match {
 }
 
 /// The pairs at one pose.
-struct Pairs {
+struct ClosestPairs {
     matches: Vec<Match>,
     kept: usize,
     mean_square: f64,
@@ -170,7 +170,7 @@ pub fn icp(
     let mut pose = initial_pose(moving, &initial);
     let reach = |x: &[f64; 3]| (Vec3::from(*x) - pose.centre).norm();
     let radius = moving.iter().map(reach).fold(0.0, f64::max);
-    let find = |pose: &Pose| Pairs::find(moving, normals, fixed, options, pose);
+    let find = |pose: &Pose| ClosestPairs::find(moving, normals, fixed, options, pose);
 
     let mut pairs = find(&pose)?;
     let mut history = vec![pairs.mean_square.sqrt()];
@@ -212,7 +212,7 @@ pub fn icp(
     })
 }
 
-impl Pairs {
+impl ClosestPairs {
     fn find(
         moving: &[[f64; 3]],
         normals: Option<&[[f64; 3]]>,
@@ -280,7 +280,7 @@ fn counting(matches: &[Match]) -> impl Iterator<Item = &Match> {
 }
 
 /// The pose that brings the pairs closest to one another.
-fn point_step(moving: &[[f64; 3]], pairs: &Pairs) -> Result<Pose> {
+fn point_step(moving: &[[f64; 3]], pairs: &ClosestPairs) -> Result<Pose> {
     let weights: Vec<f64> =
         pairs.matches.iter().map(|pair| if pair.counts { 1.0 } else { 0.0 }).collect();
     let partners: Vec<[f64; 3]> = pairs.matches.iter().map(|pair| pair.closest.into()).collect();
@@ -294,7 +294,7 @@ fn point_step(moving: &[[f64; 3]], pairs: &Pairs) -> Result<Pose> {
 ///
 /// Rotating by ω about the centre m and translating by τ changes n·(x − c) by n·(ω × (x − m) + τ) = ω·((x − m)
 /// × n) + τ·n. With n the direction from c to x this is the change of their distance.
-fn plane_step(pose: &Pose, pairs: &Pairs, radius: f64) -> Result<Pose> {
+fn plane_step(pose: &Pose, pairs: &ClosestPairs, radius: f64) -> Result<Pose> {
     let (mut a, mut b) = (Matrix6::<f64>::zeros(), Vector6::<f64>::zeros());
     let rounding = TOUCHING * (pose.image.amax() + radius);
     for pair in counting(&pairs.matches) {

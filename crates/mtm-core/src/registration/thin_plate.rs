@@ -99,7 +99,7 @@ impl ThinPlateSpline {
 
         let scaled: Vec<Vec3> = about.iter().map(|s| s / radius).collect();
         let right = DMatrix::from_fn(n, 3, |i, axis| target[i][axis] - middle[axis]);
-        let system = System::new(&scaled, smoothing / radius)
+        let system = PlateSystem::new(&scaled, smoothing / radius)
             .ok_or_else(|| closest_pair(&about).into_error())?;
         let (a, c) = system.solve(&right);
 
@@ -292,7 +292,7 @@ impl Folds {
 ///
 /// On the null space of Pᵀ, spanned by the last n − 4 columns of the Q of P = Q R, the system is
 /// positive definite (Wahba 1990, section 2.4).
-struct System {
+struct PlateSystem {
     /// K + λ I.
     kernel: DMatrix<f64>,
     smoothing: f64,
@@ -302,7 +302,7 @@ struct System {
     factor: Cholesky<f64, Dyn>,
 }
 
-impl System {
+impl PlateSystem {
     /// None if rounding makes the factorisation of the system fail.
     fn new(points: &[Vec3], smoothing: f64) -> Option<Self> {
         let n = points.len();

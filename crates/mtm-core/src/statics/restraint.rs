@@ -16,7 +16,7 @@ const MAX_JOINT_PARTS: usize = 150;
 
 /// How the body is constrained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Held {
+pub enum Support {
     /// Fixed and joined nodes suffice: sliding nodes may even be released.
     ByPrescribed,
     /// Sliding nodes are needed: without their normal constraint a part could drift.
@@ -24,7 +24,7 @@ pub enum Held {
 }
 
 /// One rigid part: tets joined over whole faces.
-struct Part {
+struct RigidPart {
     nodes: Vec<u32>,
     centre: [f64; 3],
     radius: f64,
@@ -38,19 +38,19 @@ pub fn check(
     mesh: &TetMesh,
     prescribed: impl Fn(usize) -> bool,
     sliding: &[(u32, [f64; 3])],
-) -> Result<Held> {
+) -> Result<Support> {
     let n = mesh.n_nodes();
     let mut grounded: Vec<bool> = (0..n).map(prescribed).collect();
     grow(mesh, &mut grounded);
     if grounded.iter().all(|&g| g) {
-        return Ok(Held::ByPrescribed);
+        return Ok(Support::ByPrescribed);
     }
     let parts = parts(mesh, &grounded);
     if free_parts(mesh, &parts, grounded.clone(), &[]).is_ok() {
-        return Ok(Held::ByPrescribed);
+        return Ok(Support::ByPrescribed);
     }
     free_parts(mesh, &parts, grounded, sliding)?;
-    Ok(Held::WithSliding)
+    Ok(Support::WithSliding)
 }
 
 /// Grounds every node of a tet that has three grounded ones: three nodes of a tet are never collinear.
@@ -74,7 +74,7 @@ fn grow(mesh: &TetMesh, grounded: &mut [bool]) {
 }
 
 /// Face-connected groups of the tets that still have a node not grounded.
-fn parts(mesh: &TetMesh, grounded: &[bool]) -> Vec<Part> {
+fn parts(mesh: &TetMesh, grounded: &[bool]) -> Vec<RigidPart> {
     let open = |t: usize| mesh.tets()[t].iter().any(|&v| !grounded[v as usize]);
     let mut seen = vec![false; mesh.n_tets()];
     let mut parts = Vec::new();
@@ -105,7 +105,7 @@ fn parts(mesh: &TetMesh, grounded: &[bool]) -> Vec<Part> {
         }
         let radius =
             nodes.iter().map(|&j| norm(sub(mesh.nodes()[j as usize], centre))).fold(0.0, f64::max);
-        parts.push(Part { nodes, centre, radius });
+        parts.push(RigidPart { nodes, centre, radius });
     }
     parts
 }
@@ -113,7 +113,7 @@ fn parts(mesh: &TetMesh, grounded: &[bool]) -> Vec<Part> {
 /// Checks that all parts are constrained: each is tested alone, then those that share nodes jointly.
 fn free_parts(
     mesh: &TetMesh,
-    parts: &[Part],
+    parts: &[RigidPart],
     mut grounded: Vec<bool>,
     sliding: &[(u32, [f64; 3])],
 ) -> Result<()> {
@@ -166,7 +166,7 @@ fn free_parts(
 }
 
 /// Rigid modes of a part at `x`: three translations, three rotations over the radius.
-fn modes_at(part: &Part, x: [f64; 3]) -> SMatrix<f64, 3, 6> {
+fn modes_at(part: &RigidPart, x: [f64; 3]) -> SMatrix<f64, 3, 6> {
     let r = scaled(sub(x, part.centre), 1.0 / part.radius);
     SMatrix::<f64, 3, 6>::from_row_slice(&[
         1.0, 0.0, 0.0, 0.0, r[2], -r[1], //
@@ -178,7 +178,7 @@ fn modes_at(part: &Part, x: [f64; 3]) -> SMatrix<f64, 3, 6> {
 /// Σ (constraint rows)ᵀ (constraint rows) on the six rigid modes of a part.
 fn restraint(
     mesh: &TetMesh,
-    part: &Part,
+    part: &RigidPart,
     grounded: &[bool],
     normal: &[Option<[f64; 3]>],
 ) -> Matrix6<f64> {
@@ -206,7 +206,12 @@ fn free_modes(gram: &Matrix6<f64>) -> Vec<Vector6<f64>> {
 }
 
 /// The free parts in chains that share nodes; the chains, and the parts in each, in ascending order.
-fn touching(mesh: &TetMesh, parts: &[Part], open: &[usize], grounded: &[bool]) -> Vec<Vec<usize>> {
+fn touching(
+    mesh: &TetMesh,
+    parts: &[RigidPart],
+    open: &[usize],
+    grounded: &[bool],
+) -> Vec<Vec<usize>> {
     let mut chain_of: Vec<usize> = (0..open.len()).collect();
     let mut owner: Vec<Option<usize>> = vec![None; mesh.n_nodes()];
     for (at, &p) in open.iter().enumerate() {
@@ -240,7 +245,7 @@ fn root(chain_of: &mut [usize], mut i: usize) -> usize {
 /// Whether parts that share nodes constrain each other: six unknowns per part, equal motion at shared nodes.
 fn held_jointly(
     mesh: &TetMesh,
-    parts: &[Part],
+    parts: &[RigidPart],
     open: &[usize],
     grounded: &[bool],
     normal: &[Option<[f64; 3]>],
@@ -276,7 +281,7 @@ fn held_jointly(
 }
 
 /// The free modes in words: translations first, then rotations with their axis.
-fn describe(modes: &[Vector6<f64>], part: &Part) -> String {
+fn describe(modes: &[Vector6<f64>], part: &RigidPart) -> String {
     if modes.len() == 6 {
         return "all six rigid modes are free: no node of it is fixed, joined or sliding".into();
     }

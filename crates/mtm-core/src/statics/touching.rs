@@ -8,6 +8,7 @@
 
 use std::sync::Arc;
 
+use crate::algebra::line_search::{Descent, first_of_halves};
 use crate::boundary::Motion;
 use crate::contact::pairs::{Left, Pairs, Round, Touching};
 use crate::contact::planes::Planes;
@@ -15,10 +16,10 @@ use crate::contact::{ContactStart, ContactState, Sliding, SlidingNode};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
 use crate::mesh::TetMesh;
-use crate::statics::linear::effort::Solve;
-use crate::statics::linear::system::{Solved, System};
+use crate::statics::linear::effort::PlanSolve;
+use crate::statics::linear::system::{SolvedRows, System};
 use crate::statics::options::StaticOptions;
-use crate::statics::plans::settling::{Begin, Linked, Settle, Settled};
+use crate::statics::plans::settling::{ContactSolve, RowLinks, Settled, WarmStart};
 use crate::statics::reduction::Reduction;
 use crate::statics::solution::{Clock, TouchResult};
 use crate::vector::{add, between, dot, norm, scaled, sub};
@@ -50,9 +51,8 @@ const LAST_ROUNDS: usize = 5;
 const STILL: f64 = 4.0;
 /// Rounds of a step that use the normals as they are found; after that, oscillating normals are damped.
 const SHARP_ROUNDS: usize = 6;
-/// Share of its slope by which the energy has to decrease, and smallest share of a round.
-const DESCENT: f64 = 1e-4;
-const SHORTEST_SHARE: f64 = 1.0 / 32.0;
+/// Smallest share of a round that is tried before one half of it is taken, whatever its energy.
+const SHORTEST_SHARE: f64 = 1.0 / 16.0;
 /// Rounds of a step with the planes at its start, and the depth behind them, over the mean edge, at which they
 /// end.
 const MOST_ROUNDS_AHEAD: usize = 8;
@@ -64,7 +64,7 @@ const NAMED_NODES: usize = 10;
 
 /// The body and its contact after some share of the plan.
 #[derive(Clone)]
-struct Pose {
+struct PartialState {
     /// Displacement of every node, mm.
     u: Vec<[f64; 3]>,
     /// Displacements of the unknown rows.
@@ -75,14 +75,14 @@ struct Pose {
 
 /// What touches.
 #[derive(Default)]
-pub(super) struct Touch {
+pub(super) struct TouchingParts {
     pub result: TouchResult,
     /// Contact force on each row, N; empty if nothing may touch.
     pub forces: Vec<[f64; 3]>,
 }
 
 /// How the nodes of a body follow from the motions of its segments.
-pub(super) trait Prescribes {
+pub(super) trait BoundaryRule {
     /// Displacements of all nodes with the prescribed ones filled in, mm.
     ///
     /// # Errors
@@ -94,8 +94,8 @@ pub(super) trait Prescribes {
 }
 
 /// A plan on a body whose parts may touch.
-pub(super) struct Path<'a> {
-    pub body: &'a dyn Prescribes,
+pub(super) struct TouchingPlan<'a> {
+    pub body: &'a dyn BoundaryRule,
     pub mesh: &'a TetMesh,
     pub reduction: &'a Reduction,
     pub sliding: Option<&'a Sliding>,
@@ -109,7 +109,7 @@ pub(super) struct Path<'a> {
 }
 
 /// The target of a step of the plan.
-struct Goal<'a> {
+struct StepTarget<'a> {
     motions: &'a [&'a Motion],
     /// Displacements of all nodes with the prescribed ones filled in, mm.
     prescribed: &'a [[f64; 3]],
@@ -128,13 +128,13 @@ struct Done {
     converged: bool,
 }
 
-impl Path<'_> {
+impl TouchingPlan<'_> {
     /// The body at the end of the plan.
     ///
     /// # Errors
     /// `ContactNotConverged` if the rounds run out with a gap or penetration that would be visible on a face,
     /// or if a step penetrates however short it is; those of the solves.
-    pub fn solve(&self, solve: &mut Solve<'_>) -> Result<(Solved, Touch)> {
+    pub fn solve(&self, solve: &mut PlanSolve<'_>) -> Result<(SolvedRows, TouchingParts)> {
         let clock = Clock::new();
         let sliding = self.sliding;
         let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(solve.scale);
@@ -165,8 +165,8 @@ impl Path<'_> {
         }
     }
 
-    fn rest(&self) -> Pose {
-        Pose {
+    fn rest(&self) -> PartialState {
+        PartialState {
             u: vec![[0.0; 3]; self.reduction.row_of.len()],
             rows: vec![[0.0; 3]; self.reduction.unknowns.len()],
             contact: None,
@@ -183,16 +183,16 @@ impl Path<'_> {
     /// large for closest points.
     fn advance(
         &self,
-        pose: &Pose,
+        pose: &PartialState,
         (from, to): (f64, f64),
-        solve: &mut Solve<'_>,
-    ) -> Result<Option<(Pose, Done)>> {
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<Option<(PartialState, Done)>> {
         let (before, after) = (self.partial(from)?, self.partial(to)?);
         let before: Vec<&Motion> = before.iter().collect();
         let motions: Vec<&Motion> = after.iter().collect();
         let prescribed = self.body.prescribed(&motions)?;
         let b = self.forces(&prescribed, to);
-        let goal = Goal { motions: &motions, prescribed: &prescribed, b: &b };
+        let goal = StepTarget { motions: &motions, prescribed: &prescribed, b: &b };
         let ahead =
             self.pairs.planes_ahead(self.mesh, &pose.u, (&before, &motions), &pose.touching)?;
         let contact = self.carried(pose, &before, &motions);
@@ -208,15 +208,15 @@ impl Path<'_> {
     /// of their motion, and the number of rounds. Planes are infinite, so nodes cannot pass around them.
     fn go_ahead(
         &self,
-        pose: &Pose,
+        pose: &PartialState,
         ahead: &Planes,
         mut contact: Option<ContactStart>,
-        goal: &Goal<'_>,
-        solve: &mut Solve<'_>,
-    ) -> Result<(Pose, usize)> {
+        goal: &StepTarget<'_>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<(PartialState, usize)> {
         // The targets of prescribed nodes are known before anything is solved.
         let u = self.reduction.filled(goal.prescribed, &pose.rows);
-        let mut pose = Pose { u, ..pose.clone() };
+        let mut pose = PartialState { u, ..pose.clone() };
         let deep = AHEAD_EDGES * self.pairs.mean_edge();
         let close = LOOSE * self.close();
         for round in 1..=MOST_ROUNDS_AHEAD {
@@ -244,12 +244,12 @@ impl Path<'_> {
     /// that oscillate are therefore allowed to turn less and less.
     fn rounds(
         &self,
-        mut pose: Pose,
+        mut pose: PartialState,
         mut planes: Planes,
-        goal: &Goal<'_>,
+        goal: &StepTarget<'_>,
         (before, is_last): (usize, bool),
-        solve: &mut Solve<'_>,
-    ) -> Result<(Pose, Done)> {
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<(PartialState, Done)> {
         let most = if is_last { MOST_ROUNDS } else { MOST_ROUNDS_ON_THE_WAY };
         let close = if is_last { self.close() } else { LOOSE * self.close() };
         let (mut rough, mut count) = (true, 0);
@@ -288,32 +288,32 @@ impl Path<'_> {
     }
 
     /// The residuals of `round` in `pose`, with respect to the planes.
-    fn left(&self, planes: &Planes, round: &Round, pose: &Pose) -> Left {
+    fn left(&self, planes: &Planes, round: &Round, pose: &PartialState) -> Left {
         self.pairs.left(planes, round, &pose.rows, |plane| plane.at(&pose.u))
     }
 
     /// `pose` moved by `share` of the way to `rows`.
     fn moved(
         &self,
-        pose: &Pose,
+        pose: &PartialState,
         rows: &[[f64; 3]],
         contact: Option<ContactState>,
         share: f64,
-        goal: &Goal<'_>,
-    ) -> Pose {
+        goal: &StepTarget<'_>,
+    ) -> PartialState {
         let rows = if share == 1.0 { rows.to_vec() } else { between(&pose.rows, rows, share) };
         let u = self.reduction.filled(goal.prescribed, &rows);
-        Pose { u, rows, contact, touching: pose.touching.clone() }
+        PartialState { u, rows, contact, touching: pose.touching.clone() }
     }
 
     /// How far to go from `pose` towards the solution `rows` of a round: the step is halved until the sum of
     /// elastic energy and contact energy against the planes decreases (Armijo 1966).
     fn share(
         &self,
-        pose: &Pose,
+        pose: &PartialState,
         (planes, round): (&Planes, &Round),
         rows: &[[f64; 3]],
-        goal: &Goal<'_>,
+        goal: &StepTarget<'_>,
     ) -> f64 {
         let (Some(first), Some(last)) = (
             self.system.out_of_balance(&pose.rows, goal.b),
@@ -333,20 +333,17 @@ impl Path<'_> {
         let slope = from - pressing;
         let pressed = |u: &[[f64; 3]]| self.pairs.energy(planes, u, &pose.touching);
         let start = pressed(&pose.u);
-        let mut share = 1.0;
-        while share > SHORTEST_SHARE {
+        let descent = Descent { slope, slack: 0.0 };
+        let found = first_of_halves(SHORTEST_SHARE, |share| {
             let u = self.reduction.filled(goal.prescribed, &between(&pose.rows, rows, share));
             let elastic = share * (from + 0.5 * share * (to - from));
-            if elastic + pressed(&u) - start <= DESCENT * share * slope {
-                break;
-            }
-            share *= 0.5;
-        }
-        share
+            descent.accepts(share, start, elastic + pressed(&u)).then_some(())
+        });
+        found.map_or(0.5 * SHORTEST_SHARE, |((), share)| share)
     }
 
     /// Positions of the sliding nodes in `pose`.
-    fn begun(&self, pose: &Pose) -> Option<ContactStart> {
+    fn begun(&self, pose: &PartialState) -> Option<ContactStart> {
         let (sliding, state) = (self.sliding?, pose.contact.as_ref()?);
         let at = |node: &SlidingNode, place: &[f64; 3]| add(*place, pose.rows[node.row as usize]);
         let places = sliding.nodes().iter().zip(&sliding.positions).map(|(n, x)| at(n, x));
@@ -360,21 +357,21 @@ impl Path<'_> {
     fn linked(
         &self,
         round: &Round,
-        (pose, contact): (&Pose, Option<ContactStart>),
-        goal: &Goal<'_>,
+        (pose, contact): (&PartialState, Option<ContactStart>),
+        goal: &StepTarget<'_>,
         rough: Option<f64>,
-        solve: &mut Solve<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>)> {
         let rows = &pose.rows[..];
-        let linked = Linked { links: &round.links, share: rough.map(|_| ROUGH_SHARE) };
+        let linked = RowLinks { links: &round.links, share: rough.map(|_| ROUGH_SHARE) };
         let Some(sliding) = self.sliding else {
             return Ok((self.system.solve_linked(goal.b, linked, rows, solve)?, None));
         };
         let mut options = *self.options;
         options.contact.allowed = options.contact.allowed.max(rough.unwrap_or(0.0));
-        let begin = contact.map(|contact| Begin { rows, contact });
+        let begin = contact.map(|contact| WarmStart { rows, contact });
         let motions = goal.motions;
-        let settle = Settle { sliding, motions, begin, options: &options, linked };
+        let settle = ContactSolve { sliding, motions, begin, options: &options, linked };
         let Settled { rows, contact, .. } =
             self.system.solve_with_contact(goal.b, &settle, solve)?;
         Ok((rows, Some(contact)))
@@ -415,7 +412,12 @@ impl Path<'_> {
     }
 
     /// Sliding nodes moved with their segments from their positions in `pose`.
-    fn carried(&self, pose: &Pose, from: &[&Motion], to: &[&Motion]) -> Option<ContactStart> {
+    fn carried(
+        &self,
+        pose: &PartialState,
+        from: &[&Motion],
+        to: &[&Motion],
+    ) -> Option<ContactStart> {
         let sliding = self.sliding?;
         let rest = sliding.carried_back(from, pose.contact.as_ref()?)?;
         sliding.carried(to, &rest)
@@ -424,11 +426,11 @@ impl Path<'_> {
     /// The answer, or an error if what is left open would be visible on a face.
     fn end(
         &self,
-        pose: Pose,
+        pose: PartialState,
         done: &Done,
         rounds: usize,
-        solve: &mut Solve<'_>,
-    ) -> Result<(Solved, Touch)> {
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<(SolvedRows, TouchingParts)> {
         let inside = self.pairs.overlap.inside(self.mesh, &pose.u);
         let overlap = inside.iter().fold(0.0, |m: f64, (_, depth)| m.max(*depth));
         let open = done.left.beside_tissue().max(overlap);
@@ -457,12 +459,12 @@ impl Path<'_> {
             rounds,
             converged,
         };
-        let Pose { rows, contact, .. } = pose;
-        Ok((Solved { rows, contact, contact_seconds: 0.0 }, Touch { result, forces }))
+        let PartialState { rows, contact, .. } = pose;
+        Ok((SolvedRows { rows, contact, contact_seconds: 0.0 }, TouchingParts { result, forces }))
     }
 
     /// The error for touching parts without equilibrium, with the nodes that carry the largest forces.
-    fn lost(&self, pose: &Pose, rounds: usize, gap: f64) -> MtmError {
+    fn lost(&self, pose: &PartialState, rounds: usize, gap: f64) -> MtmError {
         let nodes = self.pairs.pressed(&pose.touching, NAMED_NODES);
         let unbalanced = pose.contact.as_ref().map_or(0.0, |contact| contact.unbalanced);
         MtmError::ContactNotConverged { iterations: rounds, nodes, gap, unbalanced }

@@ -13,8 +13,8 @@ use crate::statics::timings;
 pub struct PySolution {
     core: Solution,
     n_nodes: usize,
-    displacements: Field,
-    forces: Field,
+    displacements: NodalField,
+    forces: NodalField,
 }
 
 #[pymethods]
@@ -193,8 +193,8 @@ impl PySolution {
 
 impl PySolution {
     pub(super) fn wrap(py: Python<'_>, mut core: Solution, n_nodes: usize) -> PyResult<Self> {
-        let displacements = Field::new(py, std::mem::take(&mut core.displacements), n_nodes)?;
-        let forces = Field::new(py, std::mem::take(&mut core.forces), n_nodes)?;
+        let displacements = NodalField::new(py, std::mem::take(&mut core.displacements), n_nodes)?;
+        let forces = NodalField::new(py, std::mem::take(&mut core.forces), n_nodes)?;
         Ok(Self { core, n_nodes, displacements, forces })
     }
 
@@ -207,12 +207,12 @@ impl PySolution {
 }
 
 /// A field on all nodes and on those of the mesh; one array if these are the same.
-struct Field {
+struct NodalField {
     all: Py<PyArray2<f64>>,
     corners: Py<PyArray2<f64>>,
 }
 
-impl Field {
+impl NodalField {
     /// Read-only arrays of `rows` and of the first `n` of them.
     fn new(py: Python<'_>, rows: Vec<[f64; 3]>, n: usize) -> PyResult<Self> {
         let first = (rows.len() > n).then(|| rows[..n].to_vec());

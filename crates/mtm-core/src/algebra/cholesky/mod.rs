@@ -19,8 +19,8 @@ use faer::{Conj, MatMut};
 
 pub use dense::TailFlexibility;
 pub use normal::{
-    Found, NormalFactor, Precision, Preconditioner, Progress, ROUGH, RowKey, conjugate_gradients,
-    hopeless,
+    FactorPreconditioner, NormalFactor, ProductAccuracy, Progress, ROUGH, RowForces, RowKey,
+    conjugate_gradients, hopeless,
 };
 use structure::{minimum_degree, supernodal_structure};
 use sweep::Sweep;

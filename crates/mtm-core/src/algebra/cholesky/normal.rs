@@ -19,12 +19,12 @@ pub type RowKey = (usize, usize);
 
 /// A solver for the normal flexibility of some constraint rows, and a preconditioner for similar ones.
 pub struct NormalFactor {
-    answer: Answer,
+    answer: SolvedBy,
     keys: Vec<RowKey>,
 }
 
 /// How a right-hand side is solved for.
-enum Answer {
+enum SolvedBy {
     /// By the factor: cheap to compute.
     Factor(DenseFactor),
     /// By the inverse, in single precision: cheap to apply.
@@ -35,15 +35,15 @@ impl NormalFactor {
     /// The factorisation of `flexibility`, whose rows are `keys`; on failure, the first row without a positive
     /// pivot.
     pub fn new(flexibility: DenseSymmetric, keys: Vec<RowKey>) -> Result<Self, usize> {
-        Ok(Self { answer: Answer::Factor(flexibility.factor()?), keys })
+        Ok(Self { answer: SolvedBy::Factor(flexibility.factor()?), keys })
     }
 
     /// The same by its inverse, for many right-hand sides: in single precision, which is enough for a
-    /// [`Preconditioner`].
+    /// [`FactorPreconditioner`].
     pub fn inverse(self) -> Self {
         let answer = match self.answer {
-            Answer::Factor(factor) => Answer::Inverse(Rough::of(&factor.inverse())),
-            inverse @ Answer::Inverse(_) => inverse,
+            SolvedBy::Factor(factor) => SolvedBy::Inverse(Rough::of(&factor.inverse())),
+            inverse @ SolvedBy::Inverse(_) => inverse,
         };
         Self { answer, ..self }
     }
@@ -51,26 +51,26 @@ impl NormalFactor {
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         match &self.answer {
-            Answer::Factor(factor) => factor.bytes(),
-            Answer::Inverse(inverse) => inverse.bytes(),
+            SolvedBy::Factor(factor) => factor.bytes(),
+            SolvedBy::Inverse(inverse) => inverse.bytes(),
         }
     }
 
     /// A⁻¹ b of the matrix that was factorised.
     pub fn solve(&self, mut b: Vec<f64>) -> Vec<f64> {
         match &self.answer {
-            Answer::Factor(factor) => {
+            SolvedBy::Factor(factor) => {
                 factor.solve(&mut b);
                 b
             }
-            Answer::Inverse(inverse) => inverse.multiply(&b),
+            SolvedBy::Inverse(inverse) => inverse.multiply(&b),
         }
     }
 }
 
 /// Accuracy of a product.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Precision {
+pub enum ProductAccuracy {
     /// To six digits.
     Rough,
     /// To rounding.
@@ -78,7 +78,7 @@ pub enum Precision {
 }
 
 /// Forces along rows, found by conjugate gradients.
-pub struct Found {
+pub struct RowForces {
     /// Force of each row.
     pub forces: Vec<f64>,
     /// Their whole product: displacement along each row, and along whatever else the product gives.
@@ -104,7 +104,7 @@ pub fn hopeless(progress: &Progress, most: usize) -> bool {
 }
 
 /// x with A x = `goals` by conjugate gradients, until what is missing measures `enough` or less, see
-/// [`Preconditioner::measure`].
+/// [`FactorPreconditioner::measure`].
 ///
 /// `product`: displacement along each row under forces along them, and along anything else of interest.
 ///
@@ -113,11 +113,11 @@ pub fn hopeless(progress: &Progress, most: usize) -> bool {
 /// positive definite matrix.
 pub fn conjugate_gradients(
     mut product: impl FnMut(&[f64]) -> Vec<f64>,
-    preconditioner: &Preconditioner,
+    preconditioner: &FactorPreconditioner,
     goals: &[f64],
     enough: f64,
     give_up: impl Fn(&Progress) -> bool,
-) -> Result<Found, f64> {
+) -> Result<RowForces, f64> {
     let (mut x, mut along, mut r) = (vec![0.0; goals.len()], Vec::new(), goals.to_vec());
     let mut z = preconditioner.apply(&r);
     let mut p = z.clone();
@@ -129,7 +129,7 @@ pub fn conjugate_gradients(
             if along.is_empty() {
                 along = product(&x);
             }
-            return Ok(Found { forces: x, along, left: r });
+            return Ok(RowForces { forces: x, along, left: r });
         }
         let fallen = (rz / first).sqrt();
         if give_up(&Progress { step, fallen, goal: enough / first.sqrt() }) {
@@ -162,14 +162,14 @@ pub fn conjugate_gradients(
 }
 
 /// The kept factorisation on the rows it contains, the diagonal on the others: positive definite for any rows.
-pub struct Preconditioner {
+pub struct FactorPreconditioner {
     kept: Arc<NormalFactor>,
     /// Row of the factorisation that corresponds to each row of the matrix.
     row: Vec<u32>,
     diagonal: Vec<f64>,
 }
 
-impl Preconditioner {
+impl FactorPreconditioner {
     /// `kept` on those of `keys` that it contains, `diagonal` (above 0) on the others.
     pub fn new(diagonal: Vec<f64>, keys: &[RowKey], kept: Arc<NormalFactor>) -> Self {
         let mut places: Vec<(RowKey, u32)> =
@@ -240,7 +240,7 @@ mod tests {
         goals: &[f64],
         kept: &Arc<NormalFactor>,
         share: f64,
-    ) -> Result<Found, f64> {
+    ) -> Result<RowForces, f64> {
         let matrix = lower(now);
         let diagonal = (0..now.nrows()).map(|i| now[(i, i)]).collect();
         let product = |x: &[f64]| {
@@ -248,7 +248,7 @@ mod tests {
             let twice: Vec<f64> = along.iter().map(|v| 2.0 * v).collect();
             [along, twice].concat()
         };
-        let preconditioner = Preconditioner::new(diagonal, keys, kept.clone());
+        let preconditioner = FactorPreconditioner::new(diagonal, keys, kept.clone());
         let enough = share * preconditioner.measure(goals);
         let give_up = |progress: &Progress| hopeless(progress, MOST);
         conjugate_gradients(product, &preconditioner, goals, enough, give_up)
@@ -292,7 +292,7 @@ mod tests {
         let n = 60;
         let (now, b) = (turned(n, 0.5), DVector::from_fn(n, |i, _| (i as f64 * 0.7).cos()));
         let kept = Arc::new(NormalFactor::new(lower(&turned(n, 0.0)), keys(n)).unwrap());
-        let preconditioner = Preconditioner::new(vec![1.0; n], &keys(n), kept.clone());
+        let preconditioner = FactorPreconditioner::new(vec![1.0; n], &keys(n), kept.clone());
         let first = preconditioner.measure(b.as_slice());
         let found = found(&now, &keys(n), b.as_slice(), &kept, 1e-3).unwrap();
         let left = &b - &now * DVector::from_vec(found.forces);

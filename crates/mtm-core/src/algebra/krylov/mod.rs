@@ -62,7 +62,7 @@ pub(crate) struct Problem<'a> {
 
 /// Accuracy required of a solution that is only an intermediate step.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Enough {
+pub(crate) enum StepAccuracy {
     /// Estimated error, mm, as a share of the error at the start.
     Error(f64),
     /// Error in the energy norm as a share of the decrease due to the iteration: with springs much stiffer than
@@ -132,7 +132,7 @@ pub(crate) fn pcg_near(
     problem: &Problem<'_>,
     x0: &[[f64; 3]],
     options: &PcgOptions,
-    enough: Option<Enough>,
+    enough: Option<StepAccuracy>,
     seen: &mut Spectrum,
 ) -> Result<Reached> {
     let &Problem { a, b, preconditioner, interrupted } = problem;
@@ -166,7 +166,7 @@ pub(crate) fn pcg_near(
     in_pool(|| state.replace_residual());
     state.restart();
     let goal = match enough {
-        Some(Enough::Error(share)) => share * state.error_mm(),
+        Some(StepAccuracy::Error(share)) => share * state.error_mm(),
         _ => 0.0,
     };
     let mut decrease = Decrease::default();
@@ -197,8 +197,8 @@ pub(crate) fn pcg_near(
         }
 
         let is_enough = match enough {
-            Some(Enough::Error(_)) => goal > options.tolerance && state.error_mm() <= goal,
-            Some(Enough::Energy(share)) => decrease.is_within(share),
+            Some(StepAccuracy::Error(_)) => goal > options.tolerance && state.error_mm() <= goal,
+            Some(StepAccuracy::Energy(share)) => decrease.is_within(share),
             None => false,
         };
         if is_enough {

@@ -21,14 +21,14 @@ const ROWS_PER_TASK: usize = 16;
 pub(super) struct CoarseMatrix {
     pub(super) row_start: Vec<usize>,
     pub(super) columns: Vec<u32>,
-    places: Vec<Place>,
+    places: Vec<BlockPlace>,
     upper: Vec<UpperRows>,
     diagonal: Vec<usize>,
 }
 
 /// Where a block stands in the upper triangle.
 #[derive(Debug, Clone, Copy)]
-struct Place {
+struct BlockPlace {
     task: u32,
     offset: u32,
     /// Whether the block is below the diagonal, and the transpose of the stored one.
@@ -51,7 +51,7 @@ impl SystemRows<MODES> for CoarseMatrix {
     }
     #[inline(always)]
     fn block(&self, position: usize) -> ModeBlock {
-        let Place { task, offset, is_below } = self.places[position];
+        let BlockPlace { task, offset, is_below } = self.places[position];
         let block = &self.upper[task as usize].blocks[offset as usize];
         if is_below { transposed_block(block) } else { *block }
     }
@@ -208,13 +208,14 @@ fn in_order(n: usize, upper: Vec<UpperRows>) -> CoarseMatrix {
         }
     });
     let row_start = running_sum(&sizes);
-    let mut entries = vec![(0_u32, Place { task: 0, offset: 0, is_below: false }); row_start[n]];
+    let mut entries =
+        vec![(0_u32, BlockPlace { task: 0, offset: 0, is_below: false }); row_start[n]];
     let mut next = row_start.clone();
     for_each_block(&upper, |i, j, place| {
         entries[next[i]] = (row_index(j), place);
         next[i] += 1;
         if j != i {
-            entries[next[j]] = (row_index(i), Place { is_below: true, ..place });
+            entries[next[j]] = (row_index(i), BlockPlace { is_below: true, ..place });
             next[j] += 1;
         }
     });
@@ -225,7 +226,7 @@ fn in_order(n: usize, upper: Vec<UpperRows>) -> CoarseMatrix {
                 .sort_unstable_by_key(|entry| entry.0);
         }
     });
-    let (columns, places): (Vec<u32>, Vec<Place>) = entries.into_iter().unzip();
+    let (columns, places): (Vec<u32>, Vec<BlockPlace>) = entries.into_iter().unzip();
     let diagonal = (0..n)
         .map(|i| {
             let row = &columns[row_start[i]..row_start[i + 1]];
@@ -236,14 +237,17 @@ fn in_order(n: usize, upper: Vec<UpperRows>) -> CoarseMatrix {
 }
 
 /// Calls `visit` with row, column and place of every block of the upper triangle.
-fn for_each_block(upper: &[UpperRows], mut visit: impl FnMut(usize, usize, Place)) {
+fn for_each_block(upper: &[UpperRows], mut visit: impl FnMut(usize, usize, BlockPlace)) {
     let mut row = 0;
     for (task, rows) in upper.iter().enumerate() {
         let mut offset = 0;
         for &length in &rows.lengths {
             for &column in &rows.columns[offset..offset + length] {
-                let place =
-                    Place { task: row_index(task), offset: row_index(offset), is_below: false };
+                let place = BlockPlace {
+                    task: row_index(task),
+                    offset: row_index(offset),
+                    is_below: false,
+                };
                 visit(row, column as usize, place);
                 offset += 1;
             }

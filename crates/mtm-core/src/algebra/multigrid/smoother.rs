@@ -142,7 +142,7 @@ impl SmootherStep {
             .enumerate()
             .for_each(|(chunk, ((x, r), d_next))| {
                 let first = chunk * rows;
-                widest(Sweep { step: *self, a, first, correction, d, r, d_next, x });
+                widest(SweepRows { step: *self, a, first, correction, d, r, d_next, x });
             });
     }
 }
@@ -169,7 +169,7 @@ impl<const N: usize, T: Stored, F: Real> Kernel for Residual<'_, N, T, F> {
 }
 
 /// A range of rows of [`SmootherStep::sweep`]; `d` is whole, the other vectors are restricted to those rows.
-struct Sweep<'a, const N: usize, T, F> {
+struct SweepRows<'a, const N: usize, T, F> {
     step: SmootherStep,
     a: &'a ScaledMatrix<N, T>,
     first: usize,
@@ -180,7 +180,7 @@ struct Sweep<'a, const N: usize, T, F> {
     x: &'a mut [[F; N]],
 }
 
-impl<const N: usize, T: Stored, F: Real> Kernel for Sweep<'_, N, T, F> {
+impl<const N: usize, T: Stored, F: Real> Kernel for SweepRows<'_, N, T, F> {
     type Output = ();
     #[inline(always)]
     fn run(self) {

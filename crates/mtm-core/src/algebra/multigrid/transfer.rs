@@ -40,7 +40,7 @@ impl<const N: usize, P: Precision> Transfer<N, P> {
         let parts = split_rows(&mut p.blocks, &p.row_start, rows_per_task);
         parts.into_par_iter().for_each(|part| {
             let (row_start, columns) = (&p.row_start, &p.columns);
-            widest(ScaledRows { row_start, columns, fine, coarse, part });
+            widest(ScaledProlongatorRows { row_start, columns, fine, coarse, part });
         });
         let largest = if P::Stored::IS_BOUNDED {
             largest_of_columns(&p.blocks, &transposed)
@@ -159,7 +159,7 @@ fn multiply<F: Real>(x: &mut [[F; MODES]], factors: &[[F; MODES]]) {
 }
 
 /// A range of rows of P', which become those between scaled unknowns.
-struct ScaledRows<'a, const N: usize> {
+struct ScaledProlongatorRows<'a, const N: usize> {
     row_start: &'a [usize],
     columns: &'a [u32],
     fine: &'a Scaling<N>,
@@ -167,7 +167,7 @@ struct ScaledRows<'a, const N: usize> {
     part: RowsPart<'a, [[f64; MODES]; N]>,
 }
 
-impl<const N: usize> Kernel for ScaledRows<'_, N> {
+impl<const N: usize> Kernel for ScaledProlongatorRows<'_, N> {
     type Output = ();
     #[inline(always)]
     fn run(self) {

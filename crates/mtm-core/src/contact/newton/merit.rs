@@ -1,9 +1,12 @@
 //! The merit of a state, and steps shortened until they decrease it: the augmented Lagrangian
 //! E − Σ λ φ + ½ Σ ρ φ² (Rockafellar 1973); for inequalities the terms of nodes in the air are −λ²/2ρ.
 
+use crate::algebra::line_search::{Descent, first_of_halves};
 use crate::contact::Response;
-use crate::contact::newton::problem::{BALANCE_SHARE, Problem, State, along, farthest};
-use crate::contact::seat::Touch;
+use crate::contact::newton::problem::{
+    BALANCE_SHARE, ContactIterate, ContactProblem, along, farthest,
+};
+use crate::contact::seat::LocalShape;
 use crate::vector::{between, norm, sub};
 
 /// Initial penalty of the merit function over the own stiffness of each node.
@@ -12,8 +15,6 @@ pub(super) const FIRST_PENALTY: f64 = 10.0;
 const MOST_PENALTY: f64 = 1e4;
 /// How much all other terms may increase the merit, as a share of the decrease due to closing gaps.
 const CLOSING_SHARE: f64 = 0.5;
-/// Share of its slope by which the merit must decrease (Armijo 1966).
-const DESCENT: f64 = 1e-4;
 /// Share of its largest gap that a step may leave if the gap exceeds the reach of the surfaces.
 const STEADY_GAP: f64 = 0.6;
 /// Shortest step over the full one.
@@ -23,7 +24,7 @@ const MERIT_ROUNDING: f64 = 1e-9;
 
 /// A step of the nodes with its contact forces, before the line search.
 struct Way<'a> {
-    state: &'a State,
+    state: &'a ContactIterate,
     /// Which nodes are held during the step.
     active: &'a [bool],
     /// Force on each node at its end, N.
@@ -32,17 +33,17 @@ struct Way<'a> {
     ways: Vec<[f64; 3]>,
 }
 
-impl Problem<'_> {
+impl ContactProblem<'_> {
     /// The state at the end of the step to `response`, shortened until the merit decreases, and the accepted
     /// share; none if the merit decreases for no length.
     pub(super) fn search(
         &self,
-        state: &State,
+        state: &ContactIterate,
         active: &[bool],
         response: &Response,
         near: bool,
         penalty: &mut f64,
-    ) -> Option<(State, f64)> {
+    ) -> Option<(ContactIterate, f64)> {
         let target = along(&response.reactions, &state.touches);
         let ends = response.displacements.iter().zip(&state.displacements);
         let way = Way {
@@ -62,25 +63,23 @@ impl Problem<'_> {
         let work = state.reactions.iter().zip(&response.reactions).zip(&way.ways);
         let work: f64 = work.map(|((a, b), way)| (norm(*a) + norm(*b)) * norm(*way)).sum();
         let rounding = MERIT_ROUNDING * work;
-        let mut share = 1.0;
-        while share >= SHORTEST {
+        let descent = Descent { slope, slack: rounding };
+        let found = first_of_halves(SHORTEST, |share| {
             let displacements = between(&state.displacements, &response.displacements, share);
             let touches = self.seats.touches(&self.places(&displacements));
             let within = farthest(&touches, active) <= reach;
             let falls = || match response.slopes {
                 Some(slopes) if !is_tiny => {
                     let rise = self.rise(&way, &touches, slopes, share, *penalty);
-                    rise <= DESCENT * share * slope + rounding
+                    descent.accepts(share, 0.0, rise)
                 }
                 _ => true,
             };
-            if within && falls() {
-                let reactions = between(&state.reactions, &response.reactions, share);
-                return Some((self.reached(displacements, touches, reactions, active), share));
-            }
-            share *= 0.5;
-        }
-        None
+            (within && falls()).then_some((displacements, touches))
+        });
+        let ((displacements, touches), share) = found?;
+        let reactions = between(&state.reactions, &response.reactions, share);
+        Some((self.reached(displacements, touches, reactions, active), share))
     }
 
     /// Slope of the merit at the start of a step, made negative by increasing the penalty; none if no penalty
@@ -127,7 +126,7 @@ impl Problem<'_> {
     fn rise(
         &self,
         way: &Way<'_>,
-        touches: &[Touch],
+        touches: &[LocalShape],
         (first, last): (f64, f64),
         share: f64,
         penalty: f64,

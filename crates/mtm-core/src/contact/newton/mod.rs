@@ -18,7 +18,7 @@ mod merit;
 mod problem;
 
 use crate::boundary::Motion;
-use crate::contact::newton::problem::{Problem, farthest};
+use crate::contact::newton::problem::{ContactProblem, farthest};
 use crate::contact::seat::Seats;
 use crate::contact::{Body, ContactOptions, ContactStart, ContactState, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
@@ -67,7 +67,7 @@ impl Sliding {
             });
         }
         let seats = Seats::new(self, motions)?;
-        let problem = Problem { sliding: self, seats: &seats, options };
+        let problem = ContactProblem { sliding: self, seats: &seats, options };
         let mut state = problem.start(begin);
         let mut active = problem.held(&state, None);
         let mut penalty = merit::FIRST_PENALTY;

@@ -1,6 +1,6 @@
 //! One contact problem: its conditions about a state, its steps, and what a state leaves open.
 
-use crate::contact::seat::{Seats, Touch};
+use crate::contact::seat::{LocalShape, Seats};
 use crate::contact::{
     Body, Constraints, ContactMode, ContactOptions, ContactRow, ContactStart, ContactState,
     Response, Sliding, Spring,
@@ -35,9 +35,9 @@ const UNSEEN: f64 = 0.02;
 const UNSEEN_SHARE: f64 = 1e-4;
 
 /// A state of the sliding nodes.
-pub(super) struct State {
+pub(super) struct ContactIterate {
     pub displacements: Vec<[f64; 3]>,
-    pub touches: Vec<Touch>,
+    pub touches: Vec<LocalShape>,
     /// Forces of the bone; none before the first response of the body.
     pub reactions: Vec<[f64; 3]>,
     /// Contact forces along the normals, 0 for nodes in the air.
@@ -45,13 +45,13 @@ pub(super) struct State {
 }
 
 /// One contact problem.
-pub(super) struct Problem<'a> {
+pub(super) struct ContactProblem<'a> {
     pub sliding: &'a Sliding,
     pub seats: &'a Seats<'a>,
     pub options: &'a ContactOptions,
 }
 
-impl Problem<'_> {
+impl ContactProblem<'_> {
     pub fn count(&self) -> usize {
         self.sliding.nodes.len()
     }
@@ -74,7 +74,7 @@ impl Problem<'_> {
         self.sliding.positions.iter().zip(displacements).map(|(x, u)| add(*x, *u)).collect()
     }
 
-    pub fn start(&self, begin: Option<&ContactStart>) -> State {
+    pub fn start(&self, begin: Option<&ContactStart>) -> ContactIterate {
         let (places, reactions) = match begin {
             Some(begin) => (&begin.places, begin.reactions.clone()),
             None => (&self.seats.clinging, vec![[0.0; 3]; self.count()]),
@@ -83,11 +83,11 @@ impl Problem<'_> {
             places.iter().zip(&self.sliding.positions).map(|(p, x)| sub(*p, *x)).collect();
         let touches = self.seats.touches(&self.places(&displacements));
         let forces = along(&reactions, &touches);
-        State { displacements, touches, reactions, forces }
+        ContactIterate { displacements, touches, reactions, forces }
     }
 
     /// Which nodes are held: all of them, or those whose pressure outweighs their gap.
-    pub fn held(&self, state: &State, before: Option<&[bool]>) -> Vec<bool> {
+    pub fn held(&self, state: &ContactIterate, before: Option<&[bool]>) -> Vec<bool> {
         if !self.is_unilateral() {
             return vec![true; self.count()];
         }
@@ -108,7 +108,7 @@ impl Problem<'_> {
     /// The response of the body to the conditions linearised about `state`.
     pub fn step(
         &self,
-        state: &State,
+        state: &ContactIterate,
         active: &[bool],
         reach: f64,
         (share, spring_share): (f64, f64),
@@ -165,7 +165,7 @@ impl Problem<'_> {
 
     /// The state with nodes that have left their surfaces moved back onto them; none if they are near enough,
     /// or too far away.
-    pub fn put_back(&self, response: &Response, active: &[bool]) -> Option<State> {
+    pub fn put_back(&self, response: &Response, active: &[bool]) -> Option<ContactIterate> {
         let reach = self.seats.reach();
         let mut displacements = response.displacements.clone();
         let mut touches = self.seats.touches(&self.places(&displacements));
@@ -184,7 +184,7 @@ impl Problem<'_> {
             .then(|| self.reached(displacements, touches, response.reactions.clone(), active))
     }
 
-    fn rows(&self, state: &State, active: &[bool]) -> Vec<ContactRow> {
+    fn rows(&self, state: &ContactIterate, active: &[bool]) -> Vec<ContactRow> {
         (0..self.count())
             .filter(|&i| active[i])
             .map(|i| {
@@ -199,7 +199,7 @@ impl Problem<'_> {
     /// How the contact forces change direction as held nodes slide: −f H across the normals.
     ///
     /// `least`: share of a node's own stiffness below which the springs are omitted.
-    fn springs(&self, state: &State, active: &[bool], least: f64) -> Vec<Spring> {
+    fn springs(&self, state: &ContactIterate, active: &[bool], least: f64) -> Vec<Spring> {
         let mut out = Vec::new();
         for i in (0..self.count()).filter(|&i| active[i] && state.forces[i] != 0.0) {
             let touch = &state.touches[i];
@@ -218,21 +218,21 @@ impl Problem<'_> {
     pub fn reached(
         &self,
         displacements: Vec<[f64; 3]>,
-        touches: Vec<Touch>,
+        touches: Vec<LocalShape>,
         reactions: Vec<[f64; 3]>,
         active: &[bool],
-    ) -> State {
+    ) -> ContactIterate {
         let mut forces = along(&reactions, &touches);
         for (force, held) in forces.iter_mut().zip(active) {
             if !held {
                 *force = 0.0;
             }
         }
-        State { displacements, touches, reactions, forces }
+        ContactIterate { displacements, touches, reactions, forces }
     }
 
     /// Largest gap of a held node, and largest distance, mm, by which the tangential force would move a node.
-    pub fn left(&self, state: &State, active: &[bool]) -> (f64, f64) {
+    pub fn left(&self, state: &ContactIterate, active: &[bool]) -> (f64, f64) {
         let (mut gap, mut unbalanced) = (0.0_f64, 0.0_f64);
         for (i, &held) in active.iter().enumerate() {
             let (own_gap, own_way) = self.left_of(state, i, held);
@@ -243,7 +243,7 @@ impl Problem<'_> {
     }
 
     /// The same for node `i`: a node in the air may be above its surface, and must be free of any force.
-    fn left_of(&self, state: &State, i: usize, held: bool) -> (f64, f64) {
+    fn left_of(&self, state: &ContactIterate, i: usize, held: bool) -> (f64, f64) {
         let (touch, reaction) = (&state.touches[i], state.reactions[i]);
         let (gap, left) = if held {
             let across = sub(reaction, scaled(touch.normal, dot(reaction, touch.normal)));
@@ -256,7 +256,7 @@ impl Problem<'_> {
 
     pub fn end(
         &self,
-        state: State,
+        state: ContactIterate,
         active: &[bool],
         unbalanced: f64,
         converged: bool,
@@ -303,7 +303,7 @@ impl Problem<'_> {
     /// `left`: the largest gap, and by how much the tangential force would move a node, mm.
     pub fn far(
         &self,
-        state: &State,
+        state: &ContactIterate,
         active: &[bool],
         iterations: usize,
         (gap, unbalanced): (f64, f64),
@@ -321,18 +321,18 @@ impl Problem<'_> {
 }
 
 /// Largest gap of a held node, mm.
-pub(super) fn farthest(touches: &[Touch], active: &[bool]) -> f64 {
+pub(super) fn farthest(touches: &[LocalShape], active: &[bool]) -> f64 {
     let held = touches.iter().zip(active).filter(|(_, held)| **held);
     held.fold(0.0, |m, (touch, _)| m.max(touch.gap.abs()))
 }
 
 /// Component of each reaction along the normal of its node.
-pub(super) fn along(reactions: &[[f64; 3]], touches: &[Touch]) -> Vec<f64> {
+pub(super) fn along(reactions: &[[f64; 3]], touches: &[LocalShape]) -> Vec<f64> {
     reactions.iter().zip(touches).map(|(r, t)| dot(*r, t.normal)).collect()
 }
 
 /// Principal curvatures of the level through a node, 1/mm, with their unit directions across the normal.
-fn curvatures(touch: &Touch) -> [(f64, [f64; 3]); 2] {
+fn curvatures(touch: &LocalShape) -> [(f64, [f64; 3]); 2] {
     let [x, y] = across(&Vec3::from(touch.normal));
     let times = |a: &Vec3, b: &Vec3| -> f64 {
         (0..3).map(|i| a[i] * (0..3).map(|j| touch.hessian[i][j] * b[j]).sum::<f64>()).sum()

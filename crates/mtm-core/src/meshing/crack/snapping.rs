@@ -28,7 +28,7 @@ pub fn snap(mesh: &TetMesh, surface: &Surface, nodes: &mut [[f64; 3]]) -> Vec<Op
     let boundary = BoundaryEdges::new(mesh);
     for (near, least) in PASSES {
         for node in 0..nodes.len() {
-            let crossings = Crossings::at(mesh, node, (nodes, &heights), &boundary);
+            let crossings = NodeCrossings::at(mesh, node, (nodes, &heights), &boundary);
             if crossings.nearest.is_none_or(|(share, _)| share >= near) {
                 continue;
             }
@@ -53,13 +53,13 @@ pub fn snap(mesh: &TetMesh, surface: &Surface, nodes: &mut [[f64; 3]]) -> Vec<Op
 }
 
 /// Where edges at a node cross the surface, each as a share of its length and a point.
-struct Crossings {
+struct NodeCrossings {
     nearest: Option<(f64, [f64; 3])>,
     /// The nearest on an edge of the boundary.
     on_boundary: Option<(f64, [f64; 3])>,
 }
 
-impl Crossings {
+impl NodeCrossings {
     fn at(
         mesh: &TetMesh,
         node: usize,

@@ -142,7 +142,7 @@ pub(super) struct Sampler<'a> {
 }
 
 /// Buffers that a thread refills for each tet.
-struct Scratch {
+struct TetBuffers {
     packet: Packet,
     /// Whether each sample lies inside each muscle of the tet, muscle by muscle.
     inside: Vec<bool>,
@@ -156,7 +156,7 @@ impl Sampler<'_> {
     /// Result of each touched tet, ascending; incomplete once `stop` returns true.
     pub fn shares(&self, touched: &TetTouches) -> Vec<TetMuscle> {
         let n = self.sequence.len();
-        let scratch = || Scratch {
+        let scratch = || TetBuffers {
             packet: Packet::new(n),
             inside: Vec::new(),
             depth: vec![0; n],
@@ -203,8 +203,8 @@ impl Sampler<'_> {
     }
 
     /// A tet that at least one surface may cross.
-    fn sampled(&self, muscles: &[(u32, Touch)], scratch: &mut Scratch) -> TetMuscle {
-        let Scratch { packet, inside, depth, near } = scratch;
+    fn sampled(&self, muscles: &[(u32, Touch)], scratch: &mut TetBuffers) -> TetMuscle {
+        let TetBuffers { packet, inside, depth, near } = scratch;
         let (tet, n) = (muscles[0].1.tet, self.sequence.len());
         packet.fill(&self.sequence, self.seed, tet, self.corners(tet));
         inside.clear();

@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::region::{Moments, Region};
+use super::region::{AreaMoments, Region};
 use crate::vector::Vec3;
 
 /// Slices of equal area whose centroids the line is fitted to.
@@ -43,12 +43,12 @@ impl CentreLine {
     ///
     /// The longer the region is relative to its width in a direction, the more the line may bend in that
     /// direction.
-    pub fn new(region: &Region, moments: &Moments) -> Self {
+    pub fn new(region: &Region, moments: &AreaMoments) -> Self {
         let axes = moments.axes();
         let mut line = Self::straight(axes[0]);
         for _ in 0..ROUNDS {
             let slices = line.cut(region, SLICES);
-            let found: Vec<(Vec3, Moments)> = slices
+            let found: Vec<(Vec3, AreaMoments)> = slices
                 .iter()
                 .enumerate()
                 .filter_map(|(i, slice)| {
@@ -71,7 +71,7 @@ impl CentreLine {
     }
 
     /// The least-squares line through the centroids of slices with their normals.
-    fn fitted(slices: &[(Vec3, Moments)], axes: [Vec3; 3]) -> Option<Self> {
+    fn fitted(slices: &[(Vec3, AreaMoments)], axes: [Vec3; 3]) -> Option<Self> {
         if slices.len() < SLICES {
             return None;
         }
@@ -162,7 +162,7 @@ impl CentreLine {
 }
 
 /// Extent of a slice along `axis` as seen in the plane across `normal`, mm.
-fn width_across(axis: &Vec3, normal: &Vec3, moments: &Moments) -> f64 {
+fn width_across(axis: &Vec3, normal: &Vec3, moments: &AreaMoments) -> f64 {
     let flat = axis - normal * normal.dot(axis);
     EXTENT_PER_DEVIATION * flat.dot(&(moments.covariance * flat)).max(0.0).sqrt()
 }

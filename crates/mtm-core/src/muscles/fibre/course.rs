@@ -23,14 +23,14 @@ pub(super) struct Courses {
 /// Segments of fibre lines, line after line.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Segments {
-    list: Vec<Segment>,
+    list: Vec<LinePiece>,
     /// Where each line ends in the list; every line has at least one segment.
     ends: Vec<usize>,
 }
 
 /// A piece of a fibre line between two of its points.
 #[derive(Debug, Clone, Copy)]
-struct Segment {
+struct LinePiece {
     start: Vec3,
     step: Vec3,
     /// Squared length, mm².
@@ -50,7 +50,7 @@ impl Courses {
             all.list.extend(line.windows(2).zip(tangents.windows(2)).map(|(ends, tangents)| {
                 let step = ends[1] - ends[0];
                 let tangents = [tangents[0], tangents[1]];
-                Segment { start: ends[0], step, square: step.norm_squared(), tangents }
+                LinePiece { start: ends[0], step, square: step.norm_squared(), tangents }
             }));
             all.ends.push(all.list.len());
         }
@@ -72,7 +72,7 @@ impl Courses {
             let least =
                 line.iter().map(|s| s.squared_distance(centre)).fold(f64::INFINITY, f64::min);
             let reach = (least.sqrt() + 2.0 * radius) * (1.0 + NEAR_MARGIN);
-            let may_be = |s: &&Segment| s.squared_distance(centre) <= reach * reach;
+            let may_be = |s: &&LinePiece| s.squared_distance(centre) <= reach * reach;
             near.list.extend(line.iter().filter(may_be));
             near.ends.push(near.list.len());
         }
@@ -93,13 +93,13 @@ impl Courses {
 }
 
 impl Segments {
-    fn lines(&self) -> impl Iterator<Item = &[Segment]> {
+    fn lines(&self) -> impl Iterator<Item = &[LinePiece]> {
         let starts = std::iter::once(0).chain(self.ends.iter().copied());
         starts.zip(&self.ends).map(|(start, &end)| &self.list[start..end])
     }
 }
 
-impl Segment {
+impl LinePiece {
     /// Position along the segment, as a share, at which it is nearest to a point.
     fn part(&self, from: &Vec3) -> f64 {
         (from.dot(&self.step) / self.square).clamp(0.0, 1.0)
@@ -145,7 +145,7 @@ fn tangents(line: &[Vec3], length: f64) -> Vec<Vec3> {
 }
 
 /// Squared distance to the nearest of a line's segments and the unit tangent there.
-fn nearest(line: &[Segment], x: &Vec3) -> (f64, Vec3) {
+fn nearest(line: &[LinePiece], x: &Vec3) -> (f64, Vec3) {
     let (mut best, mut at, mut part) = (f64::INFINITY, 0, 0.0);
     for (i, segment) in line.iter().enumerate() {
         let from = x - segment.start;

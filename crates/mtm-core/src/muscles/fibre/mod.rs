@@ -18,7 +18,7 @@ use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::geometry::surface::Surface;
 use crate::vector::Vec3;
 use course::{Courses, Segments};
-use parts::Part;
+use parts::FibrePart;
 use region::Region;
 
 /// Ratio of the second extent to the first above which the longest axis of a muscle does not determine the
@@ -339,7 +339,7 @@ impl Reach {
 }
 
 /// The box of a part: along its direction, then along the principal axes across it.
-fn oriented_box(part: &Part) -> OrientedBox {
+fn oriented_box(part: &FibrePart) -> OrientedBox {
     let axes = part.moments.axes_about(part.direction);
     let ranges = axes.map(|axis| part.region.range(&axis));
     let centre =

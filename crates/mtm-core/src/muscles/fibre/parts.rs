@@ -3,7 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use super::centre_line::{CentreLine, EXTENT_PER_DEVIATION};
-use super::region::{Moments, Region};
+use super::region::{AreaMoments, Region};
 use crate::vector::Vec3;
 
 /// Rotation of the centre line per box, rad (8°): at the ends of a box the direction is off by half of that.
@@ -40,16 +40,16 @@ const APEX_MARGIN: f64 = 0.02;
 
 /// A piece of a muscle's surface with one direction of its fibres.
 #[derive(Debug, Clone)]
-pub(super) struct Part {
+pub(super) struct FibrePart {
     /// Its triangles.
     pub region: Region,
     /// Its centroid and covariance.
-    pub moments: Moments,
+    pub moments: AreaMoments,
     /// Unit direction of the fibres.
     pub direction: Vec3,
 }
 
-impl Part {
+impl FibrePart {
     fn new(region: Region, direction: Vec3) -> Option<Self> {
         region.moments().map(|moments| Self { region, moments, direction })
     }
@@ -59,24 +59,24 @@ impl Part {
 ///
 /// A single requested part has its principal axis (Kim et al. 2010); otherwise the directions are the tangents
 /// of the line.
-pub(super) fn in_series(region: &Region, count: Option<usize>) -> Vec<Part> {
+pub(super) fn in_series(region: &Region, count: Option<usize>) -> Vec<FibrePart> {
     let Some(moments) = region.moments() else { return Vec::new() };
     if count == Some(1) {
-        return Part::new(region.clone(), moments.axes()[0]).into_iter().collect();
+        return FibrePart::new(region.clone(), moments.axes()[0]).into_iter().collect();
     }
     let line = CentreLine::new(region, &moments);
     let needed = || ((line.turning() / TURN_PER_BOX).ceil() as usize).clamp(1, MOST_IN_SERIES);
     let count = count.unwrap_or_else(needed);
     let middle = |i: usize| line.tangent((i as f64 + 0.5) / count as f64);
     let slices = line.cut(region, count).into_iter().enumerate();
-    slices.filter_map(|(i, slice)| Part::new(slice, middle(i))).collect()
+    slices.filter_map(|(i, slice)| FibrePart::new(slice, middle(i))).collect()
 }
 
 /// Parts in lanes that converge where the muscle tapers; `lanes` of one part each, or as many as the shape
 /// needs, each in series.
 ///
 /// `towards`: from the wide side to the narrow one.
-pub(super) fn in_lanes(region: &Region, towards: Vec3, lanes: Option<usize>) -> Vec<Part> {
+pub(super) fn in_lanes(region: &Region, towards: Vec3, lanes: Option<usize>) -> Vec<FibrePart> {
     let Some(moments) = region.moments() else { return Vec::new() };
     let pencil = Pencil::new(region, &moments, towards);
     let count = lanes.unwrap_or(pencil.lanes);
@@ -99,11 +99,11 @@ pub(super) fn in_lanes(region: &Region, towards: Vec3, lanes: Option<usize>) -> 
 ///
 /// The opening is a slit along the longer axis, whose length is the difference between length and width of the
 /// ring: rays are perpendicular to it where it is straight, and turn around its ends.
-pub(super) fn in_ring(region: &Region, count: Option<usize>) -> Vec<Part> {
+pub(super) fn in_ring(region: &Region, count: Option<usize>) -> Vec<FibrePart> {
     let Some(moments) = region.moments() else { return Vec::new() };
     let count = count.unwrap_or(BOXES_ROUND);
     let track = Track::new(region, &moments);
-    let sectors: Vec<(Region, Moments)> = (0..count)
+    let sectors: Vec<(Region, AreaMoments)> = (0..count)
         .filter_map(|i| {
             let [from, middle, to] =
                 [0.0, 0.5, 1.0].map(|k| track.ray((i as f64 + k) / count as f64));
@@ -118,7 +118,7 @@ pub(super) fn in_ring(region: &Region, count: Option<usize>) -> Vec<Part> {
     let tangent = |i: usize| (middles[(i + 1) % n] - middles[(i + n - 1) % n]).normalize();
     let directions: Vec<Vec3> = (0..n).map(tangent).collect();
     let parts = sectors.into_iter().zip(directions);
-    parts.map(|((region, moments), direction)| Part { region, moments, direction }).collect()
+    parts.map(|((region, moments), direction)| FibrePart { region, moments, direction }).collect()
 }
 
 /// The path around a slit at half the width of a ring.
@@ -140,7 +140,7 @@ struct Ray {
 }
 
 impl Track {
-    fn new(region: &Region, moments: &Moments) -> Self {
+    fn new(region: &Region, moments: &AreaMoments) -> Self {
         let [u, v, w] = moments.axes();
         let [along, across] = [region.range(&u), region.range(&v)];
         let centre = u * along[0].midpoint(along[1])
@@ -185,7 +185,7 @@ impl Ray {
 }
 
 /// The direction in which a fan tapers: that of the third moment of its area in its own plane.
-pub(super) fn taper_direction(region: &Region, moments: &Moments) -> Vec3 {
+pub(super) fn taper_direction(region: &Region, moments: &AreaMoments) -> Vec3 {
     let [first, second, _] = moments.axes();
     let skew = region.skew(moments.centroid, [first, second]);
     let length = skew.norm();
@@ -204,7 +204,7 @@ struct Pencil {
 }
 
 impl Pencil {
-    fn new(region: &Region, moments: &Moments, towards: Vec3) -> Self {
+    fn new(region: &Region, moments: &AreaMoments, towards: Vec3) -> Self {
         let thin = moments.axes()[2];
         let along = (towards - thin * thin.dot(&towards)).normalize();
         let across = thin.cross(&along);

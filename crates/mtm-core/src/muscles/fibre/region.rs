@@ -19,7 +19,7 @@ pub(super) struct Region {
 
 /// Centroid and covariance of the area of a region.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Moments {
+pub(super) struct AreaMoments {
     /// mm.
     pub centroid: Vec3,
     /// Mean of (x − c)(x − c)ᵀ over the area, mm².
@@ -37,7 +37,7 @@ impl Region {
     ///
     /// Over a triangle of area A with corners v and their sum s: ∫ x = A s/3 and
     /// ∫ x xᵀ = A/12 (Σ v vᵀ + s sᵀ).
-    pub fn moments(&self) -> Option<Moments> {
+    pub fn moments(&self) -> Option<AreaMoments> {
         let origin = self.triangles.first()?[0];
         let (mut area, mut first, mut second) = (0.0, Vec3::zeros(), Matrix3::zeros());
         for triangle in &self.triangles {
@@ -52,7 +52,10 @@ impl Region {
         }
         (area > 0.0).then(|| {
             let mean = first / area;
-            Moments { centroid: origin + mean, covariance: second / area - mean * mean.transpose() }
+            AreaMoments {
+                centroid: origin + mean,
+                covariance: second / area - mean * mean.transpose(),
+            }
         })
     }
 
@@ -133,7 +136,7 @@ impl Region {
     }
 }
 
-impl Moments {
+impl AreaMoments {
     /// Unit principal axes, the longest first, right-handed.
     ///
     /// The largest component of the first two is positive, so that the axes do not depend on the

@@ -3,8 +3,8 @@
 use std::sync::OnceLock;
 
 use crate::algebra::krylov::{
-    Enough, Operator, PcgOptions, Preconditioner, Problem, Reached, Spectrum, Trial, pcg_near,
-    trial,
+    Operator, PcgOptions, Preconditioner, Problem, Reached, Spectrum, StepAccuracy, Trial,
+    pcg_near, trial,
 };
 use crate::error::{MtmError, Result, Shortfall};
 use crate::statics::options::Interrupt;
@@ -63,7 +63,7 @@ impl Confirmed<'_> {
         b: &[[f64; 3]],
         start: &[[f64; 3]],
         options: &PcgOptions,
-        enough: Option<Enough>,
+        enough: Option<StepAccuracy>,
         seen: &mut Spectrum,
     ) -> Result<Reached> {
         let Self { a, preconditioner, interrupted, .. } = *self;

@@ -22,14 +22,14 @@ impl Effort {
 }
 
 /// The solve of one plan.
-pub(crate) struct Solve<'a> {
+pub(crate) struct PlanSolve<'a> {
     /// Reference length of the tolerance: the largest prescribed displacement, mm.
     pub scale: f64,
     pub interrupted: Interrupt<'a>,
     pub effort: Effort,
 }
 
-impl<'a> Solve<'a> {
+impl<'a> PlanSolve<'a> {
     /// The record of a solve that has not started.
     pub fn new(scale: f64, interrupted: Interrupt<'a>) -> Self {
         Self { scale, interrupted, effort: Effort::default() }

@@ -8,15 +8,15 @@ use std::sync::{Arc, OnceLock};
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::krylov::{
-    Enough, Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, Trial,
-    pcg_near,
+    Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, StepAccuracy,
+    Trial, pcg_near,
 };
 use crate::algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
 use crate::contact::links::Link;
 use crate::error::{MtmError, Result, Shortfall};
 use crate::statics::linear::confirmed::{Confirmed, is_doubtful};
-use crate::statics::linear::effort::Solve;
+use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::projected_product::ProjectedProduct;
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::linear::unstable::{at_fault, carry_on};
@@ -38,7 +38,7 @@ const SINGLE_CONTRAST: f64 = 1e4;
 
 /// Results kept between the solves of one plan, whose constraints differ only a little.
 #[derive(Default)]
-pub(crate) struct Trail {
+pub(crate) struct SolveMemory {
     /// Displacements of the rows; none before the first solve, unless an approximation is known.
     pub rows: Vec<[f64; 3]>,
     /// What the solves have revealed of the spectrum.
@@ -49,7 +49,7 @@ pub(crate) struct Trail {
     reach: Option<f64>,
 }
 
-impl Trail {
+impl SolveMemory {
     /// A trail that starts at the given displacements of the rows, or without any.
     pub fn starting(rows: Vec<[f64; 3]>) -> Self {
         Self { rows, ..Self::default() }
@@ -64,11 +64,11 @@ impl Trail {
 
 /// What a solve under contact conditions may leave for the next one.
 #[derive(Clone, Copy)]
-pub(crate) struct Leave<'a> {
+pub(crate) struct KeptForNext<'a> {
     /// How far springs of negative stiffness may carry any node, mm.
     pub reach: f64,
     /// The accuracy that suffices; none for the tolerance itself.
-    pub enough: Option<Enough>,
+    pub enough: Option<StepAccuracy>,
     /// Springs between rows.
     pub links: &'a [Link],
 }
@@ -158,11 +158,11 @@ impl Iterative {
     }
 
     /// A⁻¹ b.
-    pub fn solve(&self, b: &[[f64; 3]], solve: &mut Solve<'_>) -> Result<Vec<[f64; 3]>> {
+    pub fn solve(&self, b: &[[f64; 3]], solve: &mut PlanSolve<'_>) -> Result<Vec<[f64; 3]>> {
         if is_zero(b) {
             return Ok(vec![[0.0; 3]; b.len()]);
         }
-        let begun = Begun::new(&self.multigrid, b);
+        let begun = StartedPreconditioner::new(&self.multigrid, b);
         let tolerance = self.tolerance * begun.reach(solve.scale);
         if self.sweeps {
             let found = self.relax_to_bound(&self.matrix, b, tolerance, solve)?;
@@ -181,7 +181,7 @@ impl Iterative {
     ///
     /// The length of the tolerance is known before the solution: one cycle guesses it, and at contrasts near the
     /// limit of f64 it may guess far more than anything moves.
-    pub fn check_worth(&self, solution: &[[f64; 3]], solve: &Solve<'_>) -> Result<()> {
+    pub fn check_worth(&self, solution: &[[f64; 3]], solve: &PlanSolve<'_>) -> Result<()> {
         let length = solution.iter().fold(solve.scale, |m, v| m.max(norm(*v)));
         let (value, limit) = (solve.effort.error_estimate, WORTH.max(self.tolerance) * length);
         if value <= limit {
@@ -209,7 +209,7 @@ impl Iterative {
         allowed: f64,
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, usize)> {
-        let begun = Begun::new(&self.multigrid, b);
+        let begun = StartedPreconditioner::new(&self.multigrid, b);
         let far = begun.reach(0.0);
         if far == 0.0 {
             return Ok((vec![[0.0; 3]; b.len()], 0));
@@ -255,16 +255,17 @@ impl Iterative {
         &self,
         mut b: Vec<[f64; 3]>,
         conditions: RowConditions,
-        leave: Leave<'_>,
-        trail: &mut Trail,
-        solve: &mut Solve<'_>,
+        leave: KeptForNext<'_>,
+        trail: &mut SolveMemory,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Advance> {
         if is_zero(&b) {
             let rows = vec![[0.0; 3]; b.len()];
             return Ok(Advance { rows, solved: true, is_carried: false });
         }
-        let length =
-            *trail.reach.get_or_insert_with(|| Begun::new(&self.multigrid, &b).reach(solve.scale));
+        let length = *trail.reach.get_or_insert_with(|| {
+            StartedPreconditioner::new(&self.multigrid, &b).reach(solve.scale)
+        });
         let length = conditions.constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
         let tolerance = self.tolerance * length;
         if self.sweeps {
@@ -338,7 +339,7 @@ impl Iterative {
         matrix: &BlockMatrix,
         b: &[[f64; 3]],
         tolerance: f64,
-        solve: &mut Solve<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let most = self.max_iterations.unwrap_or(MAX_SWEEPS);
         let (mut x, mut goal, mut sweeps) = (vec![[0.0; 3]; b.len()], tolerance, 0);
@@ -382,14 +383,14 @@ impl Iterative {
 
 /// The preconditioner of a system whose first cycle has been run: conjugate gradients that start from rest begin
 /// with the same one.
-struct Begun<'a> {
+struct StartedPreconditioner<'a> {
     multigrid: &'a Multigrid,
     b: &'a [[f64; 3]],
     /// The cycle applied to `b`, mm.
     first: Vec<[f64; 3]>,
 }
 
-impl<'a> Begun<'a> {
+impl<'a> StartedPreconditioner<'a> {
     fn new(multigrid: &'a Multigrid, b: &'a [[f64; 3]]) -> Self {
         let mut first = vec![[0.0; 3]; b.len()];
         multigrid.apply(b, &mut first);
@@ -403,7 +404,7 @@ impl<'a> Begun<'a> {
     }
 }
 
-impl Preconditioner for Begun<'_> {
+impl Preconditioner for StartedPreconditioner<'_> {
     fn apply(&self, r: &[[f64; 3]], z: &mut [[f64; 3]]) {
         if r == self.b {
             z.copy_from_slice(&self.first);

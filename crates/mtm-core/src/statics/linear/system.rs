@@ -8,21 +8,22 @@ use rayon::prelude::*;
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, projected};
-use crate::algebra::krylov::Enough;
+use crate::algebra::krylov::StepAccuracy;
 use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
 use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
 use crate::error::{MtmError, Result};
-use crate::statics::linear::effort::Solve;
-use crate::statics::linear::iterative::{Extremes, Iterative, Leave, Trail, hierarchy};
+use crate::statics::linear::effort::PlanSolve;
+use crate::statics::linear::iterative::{Extremes, Iterative, KeptForNext, SolveMemory, hierarchy};
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::plans::frozen::FrozenContact;
 use crate::statics::plans::reaction::ContactFactor;
 use crate::statics::plans::settling::{
-    Linked, Settle, Settled, Unfactored, direct_error, settled_by_flexibility, touching_needs_pcg,
+    ContactSolve, RowLinks, Settled, Unfactored, direct_error, settled_by_flexibility,
+    touching_needs_pcg,
 };
-use crate::statics::restraint::Held;
+use crate::statics::restraint::Support;
 use crate::statics::solution::Clock;
 use crate::vector::{add, sub};
 
@@ -53,7 +54,7 @@ pub(crate) struct BodyRows<'a> {
     /// Coordinates of the rows, mm.
     pub positions: &'a [[f64; 3]],
     pub sliding: Option<&'a Sliding>,
-    pub held: Held,
+    pub held: Support,
     /// Contrast and compressibility of the tissue.
     pub tissue: Extremes,
     /// The hierarchy of a similar matrix under the same conditions, if there is one.
@@ -61,7 +62,7 @@ pub(crate) struct BodyRows<'a> {
 }
 
 /// Displacements of the rows after a solve, with contact if nodes slide.
-pub(crate) struct Solved {
+pub(crate) struct SolvedRows {
     /// mm.
     pub rows: Vec<[f64; 3]>,
     pub contact: Option<ContactState>,
@@ -69,14 +70,14 @@ pub(crate) struct Solved {
     pub contact_seconds: f64,
 }
 
-impl From<Vec<[f64; 3]>> for Solved {
+impl From<Vec<[f64; 3]>> for SolvedRows {
     /// Displacements of a body without sliding nodes.
     fn from(rows: Vec<[f64; 3]>) -> Self {
         Self { rows, contact: None, contact_seconds: 0.0 }
     }
 }
 
-impl From<Settled> for Solved {
+impl From<Settled> for SolvedRows {
     fn from(found: Settled) -> Self {
         let Settled { rows, contact, contact_seconds } = found;
         Self { rows, contact: Some(contact), contact_seconds }
@@ -120,7 +121,7 @@ impl System {
             let slide_rows: Vec<u32> =
                 body.sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
             // If a part is constrained by sliding nodes alone, there is no flexibility without them.
-            let kept = body.held == Held::ByPrescribed && slide_rows.len() <= MAX_KEPT_SLIDING;
+            let kept = body.held == Support::ByPrescribed && slide_rows.len() <= MAX_KEPT_SLIDING;
             let symbolic = Arc::new(Symbolic::new(&matrix, if kept { &slide_rows } else { &[] })?);
             clock.lap("ordering", true);
             if interrupted() {
@@ -178,7 +179,7 @@ impl System {
     }
 
     /// A⁻¹ b without contact.
-    pub fn solve(&self, b: &[[f64; 3]], solve: &mut Solve<'_>) -> Result<Vec<[f64; 3]>> {
+    pub fn solve(&self, b: &[[f64; 3]], solve: &mut PlanSolve<'_>) -> Result<Vec<[f64; 3]>> {
         match &self.kept {
             Kept::Factor { factor, .. } => {
                 let x = in_pool(|| factor.solve(b));
@@ -196,8 +197,8 @@ impl System {
     pub fn solve_with_contact(
         &self,
         b: &[[f64; 3]],
-        settle: &Settle<'_>,
-        solve: &mut Solve<'_>,
+        settle: &ContactSolve<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Settled> {
         match &self.kept {
             Kept::Factor { .. } if !settle.linked.links.is_empty() => {
@@ -224,9 +225,9 @@ impl System {
     pub fn solve_linked(
         &self,
         b: &[[f64; 3]],
-        linked: Linked<'_>,
+        linked: RowLinks<'_>,
         start: &[[f64; 3]],
-        solve: &mut Solve<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Rows> {
         let Kept::Matrix(Unfactored::Iterative(iterative)) = &self.kept else {
             return Err(touching_needs_pcg(Method::Cholesky));
@@ -235,12 +236,12 @@ impl System {
         for link in linked.links {
             link.add_goal(&mut b);
         }
-        let leave = Leave {
+        let leave = KeptForNext {
             reach: f64::INFINITY,
-            enough: linked.share.map(Enough::Energy),
+            enough: linked.share.map(StepAccuracy::Energy),
             links: linked.links,
         };
-        let mut trail = Trail::starting(start.to_vec());
+        let mut trail = SolveMemory::starting(start.to_vec());
         let conditions = RowConditions { constraints: Vec::new(), springs: Vec::new() };
         Ok(iterative.solve_projected(b, conditions, leave, &mut trail, solve)?.rows)
     }
@@ -259,9 +260,9 @@ impl System {
                 factor.solve_many(&mut columns);
                 return Ok(columns);
             }
-            let linked = Linked { share, ..Linked::default() };
+            let linked = RowLinks { share, ..RowLinks::default() };
             let solve = |(b, &scale): (&Rows, &f64)| {
-                let mut solve = Solve::new(scale, interrupted);
+                let mut solve = PlanSolve::new(scale, interrupted);
                 match (&self.kept, share) {
                     (Kept::Matrix(Unfactored::Iterative(_)), Some(_)) => {
                         self.solve_linked(b, linked, &[], &mut solve)
@@ -296,13 +297,13 @@ impl System {
             }
             Kept::Matrix(system) => {
                 // All columns have the same constraints, so one trial serves them.
-                let mut trail = Trail::default();
+                let mut trail = SolveMemory::default();
                 let solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
                     check()?;
-                    let mut solve = Solve::new(scale, interrupted);
+                    let mut solve = PlanSolve::new(scale, interrupted);
                     conditions(k, &mut |c| {
                         trail.begin_again();
-                        let nodes = (sliding, Linked { share, ..Linked::default() });
+                        let nodes = (sliding, RowLinks { share, ..RowLinks::default() });
                         let found = system.solve_projected(b, nodes, c, &mut trail, &mut solve);
                         found.map(|found| found.rows)
                     })

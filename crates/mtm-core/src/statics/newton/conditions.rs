@@ -5,11 +5,11 @@ use std::borrow::Cow;
 use crate::algebra::constraints::Constraint;
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Exact};
-use crate::statics::linear::effort::Solve;
+use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::row_conditions::RowConditions;
-use crate::statics::newton::descent::Steps;
-use crate::statics::newton::step::{Moves, Step, by_tangent};
-use crate::statics::newton::{Equilibrium, Pose, Target, along_slope, moved_by};
+use crate::statics::newton::descent::StepRule;
+use crate::statics::newton::step::{BoundaryMotion, NewtonStep, by_tangent};
+use crate::statics::newton::{Equilibrium, Iterate, Target, along_slope, moved_by};
 use crate::statics::options::Interrupt;
 use crate::vector::{add, dot, scaled, sub};
 
@@ -22,18 +22,18 @@ struct UnderConditions<'a, 'i> {
     interrupted: Interrupt<'i>,
 }
 
-impl Steps for UnderConditions<'_, '_> {
-    fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step> {
-        let moves = Moves { constraints: &self.still.constraints, change: None };
+impl StepRule for UnderConditions<'_, '_> {
+    fn next(&mut self, pose: &Iterate, how: (TangentKind, f64)) -> Result<NewtonStep> {
+        let moves = BoundaryMotion { constraints: &self.still.constraints, change: None };
         let rows = self.equilibrium.step(pose, self.target, &moves, how, self.interrupted)?;
-        Ok(Step { slope: along_slope(&rows, pose), slack: 0.0, rows })
+        Ok(NewtonStep { slope: along_slope(&rows, pose), slack: 0.0, rows })
     }
 
     fn conditions(&self) -> Cow<'_, RowConditions> {
         Cow::Borrowed(&self.still)
     }
 
-    fn resume(&mut self, _pose: &Pose) {}
+    fn resume(&mut self, _pose: &Iterate) {}
 }
 
 impl Equilibrium {
@@ -43,7 +43,7 @@ impl Equilibrium {
         u: &[[f64; 3]],
         target: &Target<'_>,
         part: f64,
-        solve: &mut Solve<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         // The boundary moves; the unknowns follow as predicted by the tangent.
         let mut moved = target.prescribed.to_vec();
@@ -63,7 +63,7 @@ impl Equilibrium {
         let allowed = self.allowed(&start, target, f64::INFINITY);
         let interrupted = solve.interrupted;
         let (rows, _) = by_tangent(Exact, |kind| {
-            let moves = Moves { constraints: &constraints, change: Some(&change) };
+            let moves = BoundaryMotion { constraints: &constraints, change: Some(&change) };
             self.step(&start, target, &moves, (kind, allowed), interrupted)
         })?;
         target.hierarchy.leave_rest(&self.at_rest);

@@ -2,19 +2,18 @@
 
 use std::borrow::Cow;
 
+use crate::algebra::line_search::{Descent, first_of_halves};
 use crate::error::{MtmError, Result};
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
-use crate::statics::linear::effort::Solve;
+use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::row_conditions::RowConditions;
-use crate::statics::newton::step::{Step, by_tangent};
+use crate::statics::newton::step::{NewtonStep, by_tangent};
 use crate::statics::newton::{
-    Equilibrium, MAX_STEPS, Pose, STIFF_PARTS, TangentSolver, Target, along_slope, lost, moved_by,
-    reach,
+    Equilibrium, Iterate, MAX_STEPS, STIFF_PARTS, TangentSolver, Target, along_slope, lost,
+    moved_by, reach,
 };
 use crate::vector::{add, dot};
 
-/// Share of the slope by which a step must decrease the energy (Armijo 1966).
-const DESCENT: f64 = 1e-4;
 /// Shortest step of the line search relative to the full one.
 const SHORTEST: f64 = 1.0 / 1024.0;
 /// Rounding error of the energy relative to its parts: a smaller decrease cannot be detected.
@@ -37,18 +36,18 @@ const WINDOW: usize = 3;
 const QUADRATIC: f64 = 1e-3;
 
 /// Newton's steps under the conditions at the boundary.
-pub(super) trait Steps {
+pub(super) trait StepRule {
     /// The step from `pose` with this tangent, and with this error, mm.
     ///
     /// # Errors
     /// Those of the solver and of contact.
-    fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step>;
+    fn next(&mut self, pose: &Iterate, how: (TangentKind, f64)) -> Result<NewtonStep>;
 
     /// The conditions of the last step on its rows, whose constraints move no further.
     fn conditions(&self) -> Cow<'_, RowConditions>;
 
     /// Nodes have moved to `pose` since the last step.
-    fn resume(&mut self, pose: &Pose);
+    fn resume(&mut self, pose: &Iterate);
 }
 
 impl Equilibrium {
@@ -58,11 +57,11 @@ impl Equilibrium {
     /// computed.
     pub(super) fn descend(
         &self,
-        mut pose: Pose,
+        mut pose: Iterate,
         target: &Target<'_>,
         (finest, on_walls): (f64, &[u32]),
-        steps: &mut impl Steps,
-        solve: &mut Solve<'_>,
+        steps: &mut impl StepRule,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
         // Step length below which the exact tangent is worth trying.
@@ -133,7 +132,7 @@ impl Equilibrium {
     /// on its own. Where tets are squeezed flat, a short step may be followed by a longer one.
     fn rate(
         &self,
-        pose: &Pose,
+        pose: &Iterate,
         end: &[[f64; 3]],
         target: &Target<'_>,
         conditions: &RowConditions,
@@ -146,7 +145,7 @@ impl Equilibrium {
     }
 
     /// Whether the whole `step` goes downhill.
-    fn descends_fully(&self, pose: &Pose, target: &Target<'_>, step: &Step) -> bool {
+    fn descends_fully(&self, pose: &Iterate, target: &Target<'_>, step: &NewtonStep) -> bool {
         let end = moved_by(&self.reduction, &pose.u, &step.rows, 1.0);
         // Without an energy at its end it does not.
         self.pose(end, target).is_ok_and(|end| step.descends(pose, &end, 1.0))
@@ -159,12 +158,12 @@ impl Equilibrium {
     /// the minimum. Rows `on_walls` stay at the end of the step.
     fn search(
         &self,
-        pose: Pose,
+        pose: Iterate,
         target: &Target<'_>,
-        step: &Step,
+        step: &NewtonStep,
         kind: TangentKind,
         on_walls: &[u32],
-    ) -> Result<Pose> {
+    ) -> Result<Iterate> {
         let at = |share: f64| {
             let mut u = moved_by(&self.reduction, &pose.u, &step.rows, share);
             if share > 1.0 {
@@ -175,34 +174,35 @@ impl Equilibrium {
             }
             self.pose(u, target)
         };
-        let mut share = 1.0;
-        while share >= SHORTEST {
-            let mut next = at(share)?;
-            if step.descends(&pose, &next, share) {
-                while kind == Definite
-                    && (1.0..LONGEST).contains(&share)
-                    && still_falls(&step.rows, &next, on_walls)
-                {
-                    share *= 2.0;
-                    let further = at(share)?;
-                    if further.merit >= next.merit - rounding(&pose, &next) {
-                        break;
-                    }
-                    next = further;
-                }
-                return Ok(next);
+        let found = first_of_halves(SHORTEST, |share| match at(share) {
+            Ok(next) => step.descends(&pose, &next, share).then_some(Ok(next)),
+            Err(error) => Some(Err(error)),
+        });
+        let Some((next, mut share)) = found else {
+            let quantity = "the share of the last step that lowers the energy";
+            return Err(lost(quantity, 0.5 * SHORTEST, SHORTEST, ""));
+        };
+        let mut next = next?;
+        while kind == Definite
+            && (1.0..LONGEST).contains(&share)
+            && still_falls(&step.rows, &next, on_walls)
+        {
+            share *= 2.0;
+            let further = at(share)?;
+            if further.merit >= next.merit - rounding(&pose, &next) {
+                break;
             }
-            share *= 0.5;
+            next = further;
         }
-        Err(lost("the share of the last step that lowers the energy", share, SHORTEST, ""))
+        Ok(next)
     }
 }
 
-impl Step {
+impl NewtonStep {
     /// Whether `end`, at `share` of the step from `pose`, lies downhill, up to the slack of the step.
-    fn descends(&self, pose: &Pose, end: &Pose, share: f64) -> bool {
-        let limit = pose.merit + DESCENT * share * self.slope + self.slack;
-        end.merit <= limit + rounding(pose, end)
+    fn descends(&self, pose: &Iterate, end: &Iterate, share: f64) -> bool {
+        let descent = Descent { slope: self.slope, slack: self.slack + rounding(pose, end) };
+        descent.accepts(share, pose.merit, end.merit)
     }
 }
 
@@ -223,13 +223,13 @@ fn left_after(lengths: &[f64], goal: f64) -> f64 {
 }
 
 /// Whether the merit of `pose` still falls along `rows`, without those `on_walls`, which go no further.
-fn still_falls(rows: &[[f64; 3]], pose: &Pose, on_walls: &[u32]) -> bool {
+fn still_falls(rows: &[[f64; 3]], pose: &Iterate, on_walls: &[u32]) -> bool {
     let held: f64 =
         on_walls.iter().map(|&row| dot(rows[row as usize], pose.slope[row as usize])).sum();
     along_slope(rows, pose) < held
 }
 
 /// Rounding error of the difference in energy of two states, N mm.
-fn rounding(one: &Pose, other: &Pose) -> f64 {
+fn rounding(one: &Iterate, other: &Iterate) -> f64 {
     ENERGY_ROUNDING * one.size.max(other.size)
 }

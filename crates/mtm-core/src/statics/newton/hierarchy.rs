@@ -26,7 +26,7 @@ struct Used {
 }
 
 /// What a solve with a hierarchy found.
-pub(super) struct Found<T> {
+pub(super) struct HierarchyResult<T> {
     pub value: T,
     /// The hierarchy; none if the system was factorised.
     pub multigrid: Option<Arc<Multigrid>>,
@@ -49,7 +49,7 @@ impl SharedHierarchy {
     pub fn serve<T>(
         &self,
         again: bool,
-        solve: impl Fn(Option<Arc<Multigrid>>) -> Result<Found<T>>,
+        solve: impl Fn(Option<Arc<Multigrid>>) -> Result<HierarchyResult<T>>,
     ) -> Result<T> {
         let kept = self.used.borrow().as_ref().map(|used| used.multigrid.clone());
         let is_old = kept.is_some();
@@ -57,7 +57,7 @@ impl SharedHierarchy {
             Err(MtmError::NotConverged { .. }) if is_old && again => solve(None)?,
             other => other?,
         };
-        let Found { value, multigrid, iterations } = found;
+        let HierarchyResult { value, multigrid, iterations } = found;
         let mut shared = self.used.borrow_mut();
         let before = shared.take();
         *shared = multigrid.and_then(|multigrid| {

@@ -9,12 +9,13 @@ use std::sync::Arc;
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, add_offsets, projected};
+use crate::algebra::line_search::{Descent, first_of_halves};
 use crate::contact::Spring;
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::mechanics::strain_energy::{EnergyState, Part};
 use crate::statics::linear::row_conditions::RowConditions;
-use crate::statics::newton::{Equilibrium, Pose, Target, reach};
+use crate::statics::newton::{Equilibrium, Iterate, Target, reach};
 use crate::statics::reduction::NO_ROW;
 use crate::vector::{add, dot, norm, scaled, sub};
 
@@ -34,8 +35,6 @@ const FEW: f64 = 0.05;
 const SHORT: f64 = 1e-3;
 /// Largest number of steps.
 const STEPS: usize = 30;
-/// Share of the slope by which a step must decrease the energy (Armijo 1966).
-const DESCENT: f64 = 1e-4;
 /// Shortest step of the line search relative to the full one.
 const SHORTEST: f64 = 1.0 / 256.0;
 
@@ -53,10 +52,10 @@ impl Equilibrium {
     /// They keep `conditions`.
     pub(super) fn eased(
         &self,
-        pose: Pose,
+        pose: Iterate,
         target: &Target<'_>,
         conditions: &RowConditions,
-    ) -> Result<(Pose, bool)> {
+    ) -> Result<(Iterate, bool)> {
         let goal = self.options.tolerance * reach(&pose, target);
         let rows = self.far_rows(&pose, FAR * goal, conditions);
         if rows.is_empty() {
@@ -77,12 +76,12 @@ impl Equilibrium {
     }
 
     /// Distance of the furthest row from equilibrium on its own, mm.
-    pub(super) fn furthest(&self, pose: &Pose, conditions: &RowConditions) -> f64 {
+    pub(super) fn furthest(&self, pose: &Iterate, conditions: &RowConditions) -> f64 {
         self.distances(pose, conditions).into_iter().fold(0.0, f64::max)
     }
 
     /// Distance of each row from equilibrium on its own, mm, estimated by its stiffness at rest.
-    fn distances(&self, pose: &Pose, conditions: &RowConditions) -> Vec<f64> {
+    fn distances(&self, pose: &Iterate, conditions: &RowConditions) -> Vec<f64> {
         let stiffness = self.tensors.matrix();
         let mut forces = pose.slope.clone();
         add_offsets(&mut forces, &conditions.constraints);
@@ -98,7 +97,7 @@ impl Equilibrium {
 
     /// Rows further than `limit`, mm, from equilibrium on their own, and those around them, ascending: the
     /// furthest ones, if they are many.
-    fn far_rows(&self, pose: &Pose, limit: f64, conditions: &RowConditions) -> Vec<u32> {
+    fn far_rows(&self, pose: &Iterate, limit: f64, conditions: &RowConditions) -> Vec<u32> {
         let distances = self.distances(pose, conditions);
         let furthest = distances.iter().fold(0.0_f64, |m, d| m.max(*d));
         let mut far: Vec<(f64, u32)> = distances
@@ -173,18 +172,15 @@ impl Local<'_> {
             let length = step.iter().fold(0.0_f64, |m, d| m.max(norm(*d)));
             let slope: f64 = step.iter().zip(&here.forces).map(|(d, f)| dot(*d, *f)).sum();
             let start: Vec<[f64; 3]> = self.part.nodes().iter().map(|&j| u[j as usize]).collect();
-            let mut share = 1.0;
-            let next = loop {
+            let descent = Descent { slope, slack: 0.0 };
+            let found = first_of_halves(SHORTEST, |share| {
                 self.place(u, &start, &step, share);
                 let next = self.state(u);
-                if next.energy <= here.energy + DESCENT * share * slope {
-                    break next;
-                }
-                share *= 0.5;
-                if share < SHORTEST {
-                    self.place(u, &start, &step, 0.0);
-                    return;
-                }
+                descent.accepts(share, here.energy, next.energy).then_some(next)
+            });
+            let Some((next, share)) = found else {
+                self.place(u, &start, &step, 0.0);
+                return;
             };
             here = next;
             if share * length < short {

@@ -22,17 +22,17 @@ use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::mechanics::strain_energy::{LAG, PointTangents, StrainEnergy};
 use crate::mechanics::tensors::MassTensors;
-use crate::statics::linear::effort::Solve;
+use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::Extremes;
 use crate::statics::linear::row_conditions::RowConditions;
-use crate::statics::linear::system::Solved;
+use crate::statics::linear::system::SolvedRows;
 use crate::statics::newton::hierarchy::SharedHierarchy;
 use crate::statics::options::{Method, StaticOptions};
 use crate::statics::reduction::{ReducedPattern, Reduction};
 use crate::statics::solution::Clock;
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
-pub(crate) use sliding::Slide;
+pub(crate) use sliding::SlidingBody;
 
 /// Newton steps after which a share of the plan counts as too large.
 const MAX_STEPS: usize = 40;
@@ -76,7 +76,7 @@ struct Followed<'a, 'i> {
     u: Vec<[f64; 3]>,
     /// Displacements before the last step.
     before: Vec<[f64; 3]>,
-    solve: &'a mut Solve<'i>,
+    solve: &'a mut PlanSolve<'i>,
 }
 
 impl Body for Followed<'_, '_> {
@@ -119,7 +119,7 @@ struct Target<'a> {
 }
 
 /// A state, with the data from which the next step starts.
-struct Pose {
+struct Iterate {
     u: Vec<[f64; 3]>,
     /// Energy minus the work of loads, with springs, N mm.
     merit: f64,
@@ -207,9 +207,9 @@ impl Equilibrium {
         &self,
         prescribed: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
-        slide: Option<&Slide<'_>>,
-        solve: &mut Solve<'_>,
-    ) -> Result<Solved> {
+        slide: Option<&SlidingBody<'_>>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<SolvedRows> {
         // Stiff parts that turn on soft ones move by more than their own change of shape shows.
         let lag = if self.tissue.contrast > STIFF_PARTS { 0.0 } else { LAG };
         let tangents = RefCell::new(self.energy.begin(lag));
@@ -223,9 +223,9 @@ impl Equilibrium {
         &self,
         tangents: &RefCell<PointTangents>,
         (prescribed, loads): (&[[f64; 3]], Option<&[[f64; 3]]>),
-        slide: Option<&Slide<'_>>,
-        solve: &mut Solve<'_>,
-    ) -> Result<Solved> {
+        slide: Option<&SlidingBody<'_>>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<SolvedRows> {
         let clock = Clock::new();
         let scale = solve.scale;
         let shared = SharedHierarchy::starting(&self.at_rest);
@@ -234,7 +234,7 @@ impl Equilibrium {
         let target =
             || Target { prescribed, loads, conditions: conditions(), scale, hierarchy, tangents };
         let mut u = vec![[0.0; 3]; prescribed.len()];
-        let settled = |u: &[[f64; 3]], contact: ContactState| Solved {
+        let settled = |u: &[[f64; 3]], contact: ContactState| SolvedRows {
             rows: self.reduction.rows(u),
             contact: Some(contact),
             contact_seconds: clock.total(),
@@ -253,7 +253,7 @@ impl Equilibrium {
             ) => {}
             Err(error) => return Err(error),
         }
-        let Slide { sliding, motions, .. } = slide;
+        let SlidingBody { sliding, motions, .. } = slide;
         // Other constraints than those at rest.
         let own = SharedHierarchy::default();
         let target = Target { hierarchy: &own, ..target() };
@@ -269,7 +269,7 @@ impl Equilibrium {
         &self,
         u: Vec<[f64; 3]>,
         target: &Target<'_>,
-        solve: &mut Solve<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
         let (mut here, mut done, mut share) = (u, 0.0, 1.0_f64);
         while done < 1.0 {
@@ -292,7 +292,7 @@ impl Equilibrium {
     }
 
     /// Error allowed in the next step from `pose`, mm, after a step of `length`; 0 for a factorisation.
-    fn allowed(&self, pose: &Pose, target: &Target<'_>, length: f64) -> f64 {
+    fn allowed(&self, pose: &Iterate, target: &Target<'_>, length: f64) -> f64 {
         if matches!(self.solver, TangentSolver::Cholesky(_)) {
             return 0.0;
         }
@@ -302,7 +302,7 @@ impl Equilibrium {
     }
 
     /// Merit and slope at displacements `u`.
-    fn pose(&self, u: Vec<[f64; 3]>, target: &Target<'_>) -> Result<Pose> {
+    fn pose(&self, u: Vec<[f64; 3]>, target: &Target<'_>) -> Result<Iterate> {
         let state = self.energy.state(&u)?;
         let mut slope = self.reduction.rows(&state.forces);
         let (mut merit, mut size) = (state.energy, state.energy.abs());
@@ -320,7 +320,7 @@ impl Equilibrium {
             let limit = self.options.tolerance * target.scale;
             return Err(lost("the estimated error of a node", f64::INFINITY, limit, " mm"));
         }
-        Ok(Pose { u, merit, size, slope })
+        Ok(Iterate { u, merit, size, slope })
     }
 }
 
@@ -335,12 +335,12 @@ fn lost(quantity: &'static str, value: f64, limit: f64, unit: &'static str) -> M
 }
 
 /// Slope of the merit along `rows`.
-fn along_slope(rows: &[[f64; 3]], pose: &Pose) -> f64 {
+fn along_slope(rows: &[[f64; 3]], pose: &Iterate) -> f64 {
     rows.iter().zip(&pose.slope).map(|(&d, &s)| dot(d, s)).sum()
 }
 
 /// Reference length of the tolerance, mm.
-fn reach(pose: &Pose, target: &Target<'_>) -> f64 {
+fn reach(pose: &Iterate, target: &Target<'_>) -> f64 {
     pose.u.iter().fold(target.scale, |m, v| m.max(norm(*v)))
 }
 

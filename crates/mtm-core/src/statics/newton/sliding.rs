@@ -8,35 +8,35 @@ use crate::boundary::Motion;
 use crate::contact::{ContactState, Sliding};
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
-use crate::statics::linear::effort::Solve;
+use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::linear::system::{BodyRows, System};
-use crate::statics::newton::descent::Steps;
-use crate::statics::newton::hierarchy::Found;
-use crate::statics::newton::step::{Step, by_tangent};
+use crate::statics::newton::descent::StepRule;
+use crate::statics::newton::hierarchy::HierarchyResult;
+use crate::statics::newton::step::{NewtonStep, by_tangent};
 use crate::statics::newton::{
-    Equilibrium, Pose, STEP_SHARE, STEP_TOLERANCE, TangentSolver, Target, along_slope, moved_by,
+    Equilibrium, Iterate, STEP_SHARE, STEP_TOLERANCE, TangentSolver, Target, along_slope, moved_by,
     reach,
 };
 use crate::statics::options::{Interrupt, Method, StaticOptions};
-use crate::statics::plans::settling::{Begin, Linked, Settle, Settled};
-use crate::statics::restraint::Held;
+use crate::statics::plans::settling::{ContactSolve, RowLinks, Settled, WarmStart};
+use crate::statics::restraint::Support;
 use crate::statics::solution::Clock;
 use crate::vector::{add, sub};
 
 /// Sliding nodes of a body, with the input of their solver.
-pub(crate) struct Slide<'a> {
+pub(crate) struct SlidingBody<'a> {
     pub sliding: &'a Sliding,
     /// One motion per segment.
     pub motions: &'a [&'a Motion],
     /// How the body is held.
-    pub held: Held,
+    pub held: Support,
 }
 
 /// Input of every step of a body in contact.
 struct Wanted<'a> {
     target: &'a Target<'a>,
-    slide: &'a Slide<'a>,
+    slide: &'a SlidingBody<'a>,
 }
 
 /// Starting state of a step.
@@ -60,8 +60,8 @@ struct InContact<'a, 'i> {
     interrupted: Interrupt<'i>,
 }
 
-impl Steps for InContact<'_, '_> {
-    fn next(&mut self, pose: &Pose, how: (TangentKind, f64)) -> Result<Step> {
+impl StepRule for InContact<'_, '_> {
+    fn next(&mut self, pose: &Iterate, how: (TangentKind, f64)) -> Result<NewtonStep> {
         let start = Start { contact: Some(&self.contact), ..Start::default() };
         let (rows, state) =
             self.equilibrium.settled(pose, self.wanted, &start, how, self.interrupted)?;
@@ -71,14 +71,14 @@ impl Steps for InContact<'_, '_> {
         let gaps = 2.0 * how.1.max(self.before).max(self.fine);
         self.before = how.1;
         let slack = self.contact.forces.iter().map(|f| f.abs() * gaps).sum();
-        Ok(Step { slope: along_slope(&rows, pose).min(0.0), slack, rows })
+        Ok(NewtonStep { slope: along_slope(&rows, pose).min(0.0), slack, rows })
     }
 
     fn conditions(&self) -> Cow<'_, RowConditions> {
         Cow::Owned(RowConditions::of_state(self.wanted.slide.sliding, &self.contact))
     }
 
-    fn resume(&mut self, pose: &Pose) {
+    fn resume(&mut self, pose: &Iterate) {
         let ContactState { displacements, reactions, .. } = &mut self.contact;
         let nodes = self.wanted.slide.sliding.nodes();
         for ((node, u), force) in nodes.iter().zip(displacements).zip(reactions) {
@@ -95,8 +95,8 @@ impl Equilibrium {
     pub(super) fn slide(
         &self,
         target: &Target<'_>,
-        slide: &Slide<'_>,
-        solve: &mut Solve<'_>,
+        slide: &SlidingBody<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState)> {
         let interrupted = solve.interrupted;
         let wanted = Wanted { target, slide };
@@ -131,7 +131,7 @@ impl Equilibrium {
     /// `how`: the tangent, and the error allowed in the step, mm.
     fn settled(
         &self,
-        pose: &Pose,
+        pose: &Iterate,
         wanted: &Wanted<'_>,
         start: &Start<'_>,
         (kind, allowed): (TangentKind, f64),
@@ -160,14 +160,14 @@ impl Equilibrium {
             };
             let (system, _) = System::new(matrix, &body, &options, &mut Clock::new(), interrupted)?;
             let contact = start.contact.map(|state| slide.sliding.start_of(state));
-            let settle = Settle {
+            let settle = ContactSolve {
                 sliding: slide.sliding,
                 motions: slide.motions,
-                begin: contact.map(|contact| Begin { rows: &here, contact }),
+                begin: contact.map(|contact| WarmStart { rows: &here, contact }),
                 options: &options,
-                linked: Linked::default(),
+                linked: RowLinks::default(),
             };
-            let mut solve = Solve::new(target.scale, interrupted);
+            let mut solve = PlanSolve::new(target.scale, interrupted);
             let Settled { rows, contact, .. } =
                 system.solve_with_contact(&b, &settle, &mut solve)?;
             let step = rows.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
@@ -175,7 +175,7 @@ impl Equilibrium {
             // tangent cost more than a new one.
             let multigrid = start.change.and_then(|_| system.multigrid().cloned());
             let iterations = solve.effort.iterations;
-            Ok(Found { value: (step, contact), multigrid, iterations })
+            Ok(HierarchyResult { value: (step, contact), multigrid, iterations })
         })
     }
 

@@ -6,7 +6,7 @@ use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::vector::norm;
 
 /// A step of Newton's method.
-pub(super) struct Step {
+pub(super) struct NewtonStep {
     pub rows: Vec<[f64; 3]>,
     /// Slope of the merit along it.
     pub slope: f64,
@@ -14,7 +14,7 @@ pub(super) struct Step {
     pub slack: f64,
 }
 
-impl Step {
+impl NewtonStep {
     /// Largest displacement, mm.
     pub(super) fn length(&self) -> f64 {
         self.rows.iter().fold(0.0, |m, v| m.max(norm(*v)))
@@ -22,7 +22,7 @@ impl Step {
 }
 
 /// How the boundary moves in a step.
-pub(super) struct Moves<'a> {
+pub(super) struct BoundaryMotion<'a> {
     /// Displacement of each constrained row along its normal.
     pub constraints: &'a [Constraint],
     /// Displacements of the nodes that are not unknowns; none if they do not move.

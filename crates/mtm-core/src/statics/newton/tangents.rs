@@ -8,9 +8,9 @@ use crate::algebra::multigrid::Multigrid;
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite};
 use crate::statics::linear::iterative::{Iterative, hierarchy};
-use crate::statics::newton::hierarchy::Found;
-use crate::statics::newton::step::Moves;
-use crate::statics::newton::{Equilibrium, Pose, STEP_TOLERANCE, TangentSolver, Target};
+use crate::statics::newton::hierarchy::HierarchyResult;
+use crate::statics::newton::step::BoundaryMotion;
+use crate::statics::newton::{Equilibrium, Iterate, STEP_TOLERANCE, TangentSolver, Target};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::vector::{scaled, sub};
 
@@ -19,7 +19,7 @@ impl Equilibrium {
     /// side if the other nodes move by `change`.
     pub(super) fn tangent(
         &self,
-        (pose, target): (&Pose, &Target<'_>),
+        (pose, target): (&Iterate, &Target<'_>),
         kind: TangentKind,
         change: Option<&[[f64; 3]]>,
     ) -> Result<(BlockMatrix, Vec<[f64; 3]>)> {
@@ -41,13 +41,13 @@ impl Equilibrium {
     /// `how`: the tangent, and the error allowed in the step, mm.
     pub(super) fn step(
         &self,
-        pose: &Pose,
+        pose: &Iterate,
         target: &Target<'_>,
-        moves: &Moves<'_>,
+        moves: &BoundaryMotion<'_>,
         (kind, allowed): (TangentKind, f64),
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
-        let &Moves { constraints, change } = moves;
+        let &BoundaryMotion { constraints, change } = moves;
         target.hierarchy.serve(kind == Definite, |kept| {
             let (mut matrix, b) = self.tangent((pose, target), kind, change)?;
             for (row, spring) in &target.conditions.springs {
@@ -68,7 +68,7 @@ impl Equilibrium {
                 }
             };
             add_offsets(&mut value, constraints);
-            Ok(Found { value, multigrid, iterations })
+            Ok(HierarchyResult { value, multigrid, iterations })
         })
     }
 

@@ -41,7 +41,7 @@ impl Rate {
 }
 
 /// Contact at equilibrium.
-pub(crate) struct About<'a> {
+pub(crate) struct ContactEquilibrium<'a> {
     pub rows: &'a [ContactRow],
     pub springs: &'a [Spring],
     /// Unit normal, contact force (N) and state of every sliding node.
@@ -62,7 +62,7 @@ pub(crate) struct Slope {
     pub goals: Vec<f64>,
 }
 
-impl About<'_> {
+impl ContactEquilibrium<'_> {
     /// No change.
     pub fn still(&self) -> Slope {
         Slope { offsets: vec![0.0; self.rows.len()], goals: vec![0.0; self.springs.len()] }

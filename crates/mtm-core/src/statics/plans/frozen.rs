@@ -11,12 +11,12 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 use crate::algebra::cholesky::{DenseFactor, DenseSymmetric, TailFlexibility};
 use crate::contact::{Constraints, ContactRow, Spring};
 use crate::error::Result;
-use crate::statics::plans::reaction::{Rows, singular, unheld};
+use crate::statics::plans::reaction::{ConditionRows, singular, unheld};
 use crate::vector::{add, dot, scaled};
 
 /// The factors for conditions that stay the same.
 pub(crate) struct FrozenContact {
-    rows: Rows,
+    rows: ConditionRows,
     /// Nᵀ F N.
     normal: DenseFactor,
     unstable: Vec<Spring>,
@@ -34,7 +34,7 @@ impl FrozenContact {
     /// resist.
     pub fn new(tail: &TailFlexibility, rows: &[ContactRow], springs: &[Spring]) -> Result<Self> {
         let offsets = vec![0.0; rows.len()];
-        let rows = Rows::new(&Constraints {
+        let rows = ConditionRows::new(&Constraints {
             rows,
             offsets: &offsets,
             springs,
@@ -74,7 +74,7 @@ impl FrozenContact {
     /// Force on each sliding node, N: `free` are the displacements without contact, `offsets` and `goals` the
     /// values prescribed for rows and springs, mm.
     pub fn forces(&self, free: &[[f64; 3]], c: &Constraints<'_>) -> Vec<[f64; 3]> {
-        let mut along = Rows::new(c).missing(free);
+        let mut along = ConditionRows::new(c).missing(free);
         self.normal.solve(&mut along);
         let mut out = vec![[0.0; 3]; free.len()];
         if let Some(held) = &self.held {

@@ -11,7 +11,7 @@ use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::statics::linear::system::Frozen;
 use crate::statics::options::Interrupt;
-use crate::statics::plans::about::{About, Rate};
+use crate::statics::plans::about::{ContactEquilibrium, Rate};
 use crate::statics::reduction::NO_ROW;
 use crate::statics::solver::StaticSolver;
 
@@ -104,7 +104,7 @@ impl StaticSolver {
                 let identity = RigidMotion::identity();
                 let motion = |s: &Segment| *find(reference, &s.name).unwrap_or(&identity);
                 let motions: Vec<RigidMotion> = segments.iter().map(motion).collect();
-                let about = About {
+                let about = ContactEquilibrium {
                     rows: &state.rows,
                     springs: &state.springs,
                     normals: &state.normals,

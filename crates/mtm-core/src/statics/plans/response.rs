@@ -10,7 +10,7 @@ use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::statics::linear::system::Frozen;
 use crate::statics::options::Interrupt;
-use crate::statics::plans::about::{About, Rate, Slope};
+use crate::statics::plans::about::{ContactEquilibrium, Rate, Slope};
 use crate::statics::solution::Solution;
 use crate::statics::solver::StaticSolver;
 use crate::vector::add;
@@ -25,7 +25,7 @@ pub enum Change {
 }
 
 /// A change in terms of the system.
-struct Posed {
+struct PosedChange {
     /// Displacement of every prescribed node, mm.
     prescribed: Vec<[f64; 3]>,
     /// Forces on the unknown rows, N.
@@ -63,7 +63,7 @@ impl StaticSolver {
         let motions: Vec<RigidMotion> =
             known.iter().map(|m| m.unwrap_or_else(RigidMotion::identity)).collect();
         let contact = &solution.contact;
-        let about = About {
+        let about = ContactEquilibrium {
             rows: &contact.rows,
             springs: &contact.springs,
             normals: &contact.normals,
@@ -93,9 +93,9 @@ impl StaticSolver {
     fn posed(
         &self,
         change: &Change,
-        about: &About<'_>,
+        about: &ContactEquilibrium<'_>,
         known: &[Option<RigidMotion>],
-    ) -> Result<Posed> {
+    ) -> Result<PosedChange> {
         let places = self.tensors.element_nodes().positions();
         let segments = self.node_kinds.segments();
         let (mut u, mut slope) = (vec![[0.0; 3]; places.len()], about.still());
@@ -105,7 +105,7 @@ impl StaticSolver {
             Change::Loads(loads) => {
                 let loads = self.checked_loads(loads)?;
                 let rows = self.reduction.rows(&loads);
-                return Ok(Posed { prescribed: u, rows, slope });
+                return Ok(PosedChange { prescribed: u, rows, slope });
             }
         };
         for (name, rows) in rates {
@@ -127,7 +127,7 @@ impl StaticSolver {
         for (row, b) in field.iter_mut().zip(self.coupled(&u)) {
             *row = add(*row, b);
         }
-        Ok(Posed { prescribed: u, rows: field, slope })
+        Ok(PosedChange { prescribed: u, rows: field, slope })
     }
 
     fn check_accuracy(&self, accuracy: f64) -> Result<()> {

@@ -7,15 +7,15 @@ use std::sync::Arc;
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, add_offsets, projected_rhs};
-use crate::algebra::krylov::Enough;
+use crate::algebra::krylov::StepAccuracy;
 use crate::algebra::row_sums::in_pool;
 use crate::boundary::Motion;
 use crate::contact::links::Link;
 use crate::contact::{Body, Constraints, ContactStart, ContactState, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mechanics::kinematics::Kinematics;
-use crate::statics::linear::effort::Solve;
-use crate::statics::linear::iterative::{Advance, Iterative, Leave, Trail};
+use crate::statics::linear::effort::PlanSolve;
+use crate::statics::linear::iterative::{Advance, Iterative, KeptForNext, SolveMemory};
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::options::{Method, StaticOptions};
 use crate::statics::plans::reaction::{Answer, Answers, ContactFactor};
@@ -54,11 +54,11 @@ impl Unfactored {
     pub fn settled(
         &self,
         b: &[[f64; 3]],
-        settle: &Settle<'_>,
-        solve: &mut Solve<'_>,
+        settle: &ContactSolve<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Settled> {
         let clock = Clock::new();
-        let Settle { sliding, motions, begin, options, linked } = settle;
+        let ContactSolve { sliding, motions, begin, options, linked } = settle;
         let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
         let first = begin.as_ref().map(|b| &b.contact);
         let mut contact = options.contact;
@@ -66,7 +66,7 @@ impl Unfactored {
             let far = solve.scale.max(sliding.farthest(motions));
             contact.allowed = contact.allowed.max(CONTACT_SHARE * options.tolerance * far);
         }
-        let trail = Trail::starting(rows.to_vec());
+        let trail = SolveMemory::starting(rows.to_vec());
         let interrupted = solve.interrupted;
         let linked = *linked;
         let mut body = Projected { system: self, b, linked, sliding, trail, solve, last: None };
@@ -89,10 +89,10 @@ impl Unfactored {
     pub fn solve_projected(
         &self,
         b: &[[f64; 3]],
-        (sliding, linked): (&Sliding, Linked<'_>),
+        (sliding, linked): (&Sliding, RowLinks<'_>),
         c: &Constraints<'_>,
-        trail: &mut Trail,
-        solve: &mut Solve<'_>,
+        trail: &mut SolveMemory,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<Advance> {
         let conditions = RowConditions::new(sliding, c);
         let b = linked.pulled(b, &conditions.constraints);
@@ -102,10 +102,10 @@ impl Unfactored {
         let mut found = match self {
             Self::Iterative(iterative) => {
                 let enough = match linked.share {
-                    Some(rough) => Some(Enough::Energy(rough)),
-                    None => (c.share > 0.0).then_some(Enough::Error(c.share)),
+                    Some(rough) => Some(StepAccuracy::Energy(rough)),
+                    None => (c.share > 0.0).then_some(StepAccuracy::Error(c.share)),
                 };
-                let leave = Leave { reach: c.reach, enough, links: linked.links };
+                let leave = KeptForNext { reach: c.reach, enough, links: linked.links };
                 iterative.solve_projected(rhs, conditions, leave, trail, solve)?
             }
             Self::Refactored { .. } if !linked.links.is_empty() => {
@@ -124,25 +124,25 @@ impl Unfactored {
 }
 
 /// Input of a contact solve.
-pub(crate) struct Settle<'a> {
+pub(crate) struct ContactSolve<'a> {
     pub sliding: &'a Sliding,
     /// One motion per segment.
     pub motions: &'a [&'a Motion],
-    pub begin: Option<Begin<'a>>,
+    pub begin: Option<WarmStart<'a>>,
     pub options: &'a StaticOptions,
-    pub linked: Linked<'a>,
+    pub linked: RowLinks<'a>,
 }
 
 /// Links between the rows of touching nodes.
 #[derive(Clone, Copy, Default)]
-pub(crate) struct Linked<'a> {
+pub(crate) struct RowLinks<'a> {
     pub links: &'a [Link],
     /// Error allowed relative to the change that the links cause, in the energy norm; none for an answer within
     /// the tolerance.
     pub share: Option<f64>,
 }
 
-impl Linked<'_> {
+impl RowLinks<'_> {
     /// `b` with the forces of the links, where rows satisfy their constraints.
     fn pulled<'b>(&self, b: &'b [[f64; 3]], constraints: &[Constraint]) -> Cow<'b, [[f64; 3]]> {
         if self.links.is_empty() {
@@ -167,7 +167,7 @@ pub(crate) struct Settled {
 }
 
 /// Starting state of a solve with contact: the end of a solve for a similar plan or body.
-pub(crate) struct Begin<'a> {
+pub(crate) struct WarmStart<'a> {
     /// Displacements of the rows.
     pub rows: &'a [[f64; 3]],
     pub contact: ContactStart,
@@ -178,11 +178,11 @@ pub(crate) fn settled_by_flexibility(
     factor: &Factor,
     contact: &ContactFactor,
     b: &[[f64; 3]],
-    settle: &Settle<'_>,
-    solve: &mut Solve<'_>,
+    settle: &ContactSolve<'_>,
+    solve: &mut PlanSolve<'_>,
 ) -> Result<Settled> {
     let clock = Clock::new();
-    let Settle { sliding, motions, begin, options, .. } = settle;
+    let ContactSolve { sliding, motions, begin, options, .. } = settle;
     let first = begin.as_ref().map(|b| &b.contact);
     // Run on a thread of the pool, so that inner loops start without a hand-over; but one at a time, since
     // interrupts must be checked on the calling thread.
@@ -200,20 +200,20 @@ pub(crate) fn settled_by_flexibility(
 struct Flexible<'a> {
     answers: Answers<'a>,
     tolerance: f64,
-    last: Option<Step>,
+    last: Option<RowStep>,
     /// Whether the forces at the start of the last step are known.
     is_known: bool,
 }
 
 /// A step of some rows with the residual forces at its ends, N.
-pub(crate) struct Step {
+pub(crate) struct RowStep {
     from: Vec<[f64; 3]>,
     pub to: Vec<[f64; 3]>,
     forces_from: Vec<[f64; 3]>,
     forces_to: Vec<[f64; 3]>,
 }
 
-impl Step {
+impl RowStep {
     /// Slopes of the energy along the step, at its start and at its end.
     fn slopes(&self) -> (f64, f64) {
         let (mut first, mut last) = (0.0, 0.0);
@@ -241,7 +241,8 @@ impl Body for Flexible<'_> {
         let before = self.last.take().map(|last| (last.to, last.forces_to));
         self.is_known = before.is_some();
         let (from, forces_from) = before.unwrap_or_else(|| (displacements.clone(), forces.clone()));
-        let step = Step { from, to: displacements.clone(), forces_from, forces_to: forces.clone() };
+        let step =
+            RowStep { from, to: displacements.clone(), forces_from, forces_to: forces.clone() };
         let slopes = self.is_known.then(|| step.slopes());
         self.last = Some(step);
         Ok(Response { displacements, reactions: forces, slopes, solved, is_carried })
@@ -265,11 +266,11 @@ impl Body for Flexible<'_> {
 pub(crate) struct Projected<'a, 'i> {
     pub system: &'a Unfactored,
     pub b: &'a [[f64; 3]],
-    pub linked: Linked<'a>,
+    pub linked: RowLinks<'a>,
     pub sliding: &'a Sliding,
-    pub trail: Trail,
-    pub solve: &'a mut Solve<'i>,
-    pub last: Option<Step>,
+    pub trail: SolveMemory,
+    pub solve: &'a mut PlanSolve<'i>,
+    pub last: Option<RowStep>,
 }
 
 impl Projected<'_, '_> {
@@ -307,7 +308,7 @@ impl Body for Projected<'_, '_> {
             Ok(found) => found,
             Err(error) => {
                 let (to, forces_to) = (from.clone(), forces_from.clone());
-                self.last = Some(Step { from, to, forces_from, forces_to });
+                self.last = Some(RowStep { from, to, forces_from, forces_to });
                 return Err(error);
             }
         };
@@ -316,7 +317,7 @@ impl Body for Projected<'_, '_> {
             self.sliding.nodes().iter().map(|n| rows[n.row as usize]).collect::<Vec<_>>()
         };
         let (displacements, reactions) = (of(&x), of(&forces));
-        let step = Step { from, to: x, forces_from, forces_to: forces };
+        let step = RowStep { from, to: x, forces_from, forces_to: forces };
         let slopes = Some(step.slopes());
         self.last = Some(step);
         // An approximate round is solved once it is as accurate as requested.

@@ -14,16 +14,16 @@ use crate::error::{ErrorKind, MtmError, Result, check_forces};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::tensors::MassTensors;
 use crate::statics::linear::confirmed::is_doubtful;
-use crate::statics::linear::effort::Solve;
+use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::Extremes;
-use crate::statics::linear::system::{BodyRows, Frozen, Solved, System};
-use crate::statics::newton::{Equilibrium, Slide};
+use crate::statics::linear::system::{BodyRows, Frozen, SolvedRows, System};
+use crate::statics::newton::{Equilibrium, SlidingBody};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
-use crate::statics::plans::settling::{Begin, Linked, Settle, method_for_touching};
+use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart, method_for_touching};
 use crate::statics::reduction::{NO_ROW, Reduction};
-use crate::statics::restraint::{self, Held};
+use crate::statics::restraint::{self, Support};
 use crate::statics::solution::{Clock, Solution, Timings};
-use crate::statics::touching::{Path, Prescribes, Touch};
+use crate::statics::touching::{BoundaryRule, TouchingParts, TouchingPlan};
 use crate::vector::{add, norm, scaled};
 
 /// Multiple of the correction of a solution by factorisation that is taken as the error of the corrected one.
@@ -44,7 +44,7 @@ pub struct StaticSolver {
     /// What may touch what.
     pairs: Option<Pairs>,
     mechanics: Mechanics,
-    held: Held,
+    held: Support,
     /// Coupling of unknown rows with joined nodes: (row, node, tensor).
     couplings: Vec<(u32, u32, Block)>,
     timings: Timings,
@@ -59,7 +59,7 @@ enum Mechanics {
 }
 
 /// A plan in terms of the system.
-struct Posed<'a> {
+struct PosedPlan<'a> {
     /// Forces from joined nodes and loads on the rows of the linear system, N.
     b: &'a [[f64; 3]],
     /// Displacements of all nodes, those of joined ones filled in, mm.
@@ -243,9 +243,9 @@ impl StaticSolver {
         }
         clock.lap("plan", true);
 
-        let mut solve = Solve::new(scale, interrupted);
-        let posed = Posed { b: &b, u: &u, loads, motions: &motions, start };
-        let (Solved { rows, contact, contact_seconds }, touch) =
+        let mut solve = PlanSolve::new(scale, interrupted);
+        let posed = PosedPlan { b: &b, u: &u, loads, motions: &motions, start };
+        let (SolvedRows { rows, contact, contact_seconds }, touch) =
             self.solve_rows(&posed, &mut solve)?;
         clock.lap("solve", true);
         u = self.reduction.filled(&u, &rows);
@@ -300,7 +300,7 @@ impl StaticSolver {
         u: &mut [[f64; 3]],
         forces: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
-        solve: &mut Solve<'_>,
+        solve: &mut PlanSolve<'_>,
     ) -> Result<()> {
         let Mechanics::Linear(system) = &self.mechanics else { return Ok(()) };
         let out_of_balance = |&j: &u32| {
@@ -308,7 +308,7 @@ impl StaticSolver {
             loads.map_or(f, |rows| add(rows[j as usize], f))
         };
         let b: Vec<[f64; 3]> = self.reduction.unknowns.iter().map(out_of_balance).collect();
-        let correction = system.solve(&b, &mut Solve::new(0.0, solve.interrupted))?;
+        let correction = system.solve(&b, &mut PlanSolve::new(0.0, solve.interrupted))?;
         let mut largest = 0.0_f64;
         for (&j, d) in self.reduction.unknowns.iter().zip(&correction) {
             u[j as usize] = add(u[j as usize], *d);
@@ -364,10 +364,14 @@ impl StaticSolver {
     }
 
     /// Displacements of the unknown rows at contact equilibrium, and what touches.
-    fn solve_rows(&self, posed: &Posed<'_>, solve: &mut Solve<'_>) -> Result<(Solved, Touch)> {
-        let &Posed { b, u, loads, motions, start } = posed;
+    fn solve_rows(
+        &self,
+        posed: &PosedPlan<'_>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<(SolvedRows, TouchingParts)> {
+        let &PosedPlan { b, u, loads, motions, start } = posed;
         if let (Mechanics::Linear(system), Some(pairs)) = (&self.mechanics, &self.pairs) {
-            let path = Path {
+            let path = TouchingPlan {
                 body: self,
                 mesh: self.tensors.mesh(),
                 reduction: &self.reduction,
@@ -382,24 +386,27 @@ impl StaticSolver {
         }
         let found = match (&self.mechanics, &self.sliding) {
             (Mechanics::LargeRotation(body), sliding) => {
-                let slide =
-                    sliding.as_ref().map(|sliding| Slide { sliding, motions, held: self.held });
+                let slide = sliding.as_ref().map(|sliding| SlidingBody {
+                    sliding,
+                    motions,
+                    held: self.held,
+                });
                 body.solve(u, loads, slide.as_ref(), solve)
             }
-            (Mechanics::Linear(system), None) => system.solve(b, solve).map(Solved::from),
+            (Mechanics::Linear(system), None) => system.solve(b, solve).map(SolvedRows::from),
             (Mechanics::Linear(system), Some(sliding)) => {
                 let rows =
                     start.map_or_else(Vec::new, |start| self.reduction.rows(&start.displacements));
                 let rest = start.and_then(|start| start.contact.at_rest.as_ref());
                 let contact = rest.and_then(|rest| sliding.carried(motions, rest));
-                let begin = contact.map(|contact| Begin { rows: &rows, contact });
-                let (options, linked) = (&self.options, Linked::default());
-                let settle = Settle { sliding, motions, begin, options, linked };
-                system.solve_with_contact(b, &settle, solve).map(Solved::from)
+                let begin = contact.map(|contact| WarmStart { rows: &rows, contact });
+                let (options, linked) = (&self.options, RowLinks::default());
+                let settle = ContactSolve { sliding, motions, begin, options, linked };
+                system.solve_with_contact(b, &settle, solve).map(SolvedRows::from)
             }
         };
         let found = found.map_err(|e| by_node(e, &self.reduction.unknowns))?;
-        Ok((found, Touch::default()))
+        Ok((found, TouchingParts::default()))
     }
 
     /// Contact at equilibrium for `plan`: the state about which the linear operator of re-planning is frozen.
@@ -415,8 +422,8 @@ impl StaticSolver {
         let u = self.prescribed(&motions)?;
         let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
         let b = self.coupled(&u);
-        let posed = Posed { b: &b, u: &u, loads: None, motions: &motions, start: None };
-        Ok(self.solve_rows(&posed, &mut Solve::new(scale, interrupted))?.0.contact)
+        let posed = PosedPlan { b: &b, u: &u, loads: None, motions: &motions, start: None };
+        Ok(self.solve_rows(&posed, &mut PlanSolve::new(scale, interrupted))?.0.contact)
     }
 
     /// Unknown rows for several right-hand sides, with contact frozen if there is any; see
@@ -437,7 +444,7 @@ impl StaticSolver {
     }
 }
 
-impl Prescribes for StaticSolver {
+impl BoundaryRule for StaticSolver {
     fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
         self.prescribed(motions)
     }

@@ -2,7 +2,7 @@
 
 use crate::algebra::cholesky::{Rough, TailFlexibility};
 use crate::contact::Spring;
-use crate::statics::plans::reaction::rows::Rows;
+use crate::statics::plans::reaction::rows::ConditionRows;
 
 /// The flexibility Bᵀ F B of the directions B of rows, and of unstable springs after them, in single precision.
 ///
@@ -17,7 +17,12 @@ pub(super) struct Along {
 
 impl Along {
     /// Assembled from `tail`, in `memory` of an earlier one.
-    pub fn new(tail: &TailFlexibility, rows: &Rows, unstable: &[Spring], memory: Vec<f32>) -> Self {
+    pub fn new(
+        tail: &TailFlexibility,
+        rows: &ConditionRows,
+        unstable: &[Spring],
+        memory: Vec<f32>,
+    ) -> Self {
         let directions = directions(rows, unstable);
         let mut order: Vec<usize> = (0..directions.len()).collect();
         order.sort_by_key(|&i| directions[i].0);
@@ -46,7 +51,7 @@ impl Along {
 }
 
 /// Node of each direction, and the unit vector.
-fn directions(rows: &Rows, unstable: &[Spring]) -> Vec<(usize, [f64; 3])> {
+fn directions(rows: &ConditionRows, unstable: &[Spring]) -> Vec<(usize, [f64; 3])> {
     let rows = rows.rows.iter().map(|r| (r.node, r.normal));
     rows.chain(unstable.iter().map(|s| (s.node, s.axis))).collect()
 }

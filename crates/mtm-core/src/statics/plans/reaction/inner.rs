@@ -3,17 +3,17 @@
 use std::sync::Arc;
 
 use super::along::Along;
-use super::rows::Rows;
+use super::rows::ConditionRows;
 use crate::algebra::cholesky::{
-    NormalFactor, Preconditioner, Progress, TailFlexibility, conjugate_gradients, hopeless,
+    FactorPreconditioner, NormalFactor, Progress, TailFlexibility, conjugate_gradients, hopeless,
 };
 use crate::error::{MtmError, Result, Shortfall};
 
-pub(super) use crate::algebra::cholesky::Found;
+pub(super) use crate::algebra::cholesky::RowForces;
 
 /// Accuracy required of the forces.
 #[derive(Clone, Copy)]
-pub(super) enum Aim {
+pub(super) enum ForceAccuracy {
     /// Relative to what the rows ask for.
     Share(f64),
     /// Absolute, in the norm of the preconditioner.
@@ -23,12 +23,12 @@ pub(super) enum Aim {
 /// The rows of one step with their preconditioner.
 pub(super) struct Inner<'a> {
     along: Along,
-    rows: &'a Rows,
+    rows: &'a ConditionRows,
     diagonal: Vec<f64>,
     /// The factorisation that preconditions, and whether it was made for these rows.
     pub kept: Arc<NormalFactor>,
     pub is_made: bool,
-    preconditioner: Preconditioner,
+    preconditioner: FactorPreconditioner,
     most: usize,
     /// The flexibility for a new factorisation.
     tail: &'a TailFlexibility,
@@ -38,12 +38,12 @@ impl<'a> Inner<'a> {
     /// `most`: number of steps above which a new factorisation takes less time.
     pub fn new(
         along: Along,
-        rows: &'a Rows,
+        rows: &'a ConditionRows,
         (diagonal, kept): (Vec<f64>, Arc<NormalFactor>),
         most: usize,
         tail: &'a TailFlexibility,
     ) -> Self {
-        let preconditioner = Preconditioner::new(diagonal.clone(), &rows.keys, kept.clone());
+        let preconditioner = FactorPreconditioner::new(diagonal.clone(), &rows.keys, kept.clone());
         Self { along, rows, diagonal, kept, is_made: false, preconditioner, most, tail }
     }
 
@@ -62,10 +62,10 @@ impl<'a> Inner<'a> {
     ///
     /// # Errors
     /// `NotPositiveDefinite` if the rows are degenerate, `NotConverged`.
-    pub fn solve(&mut self, goals: &[f64], aim: Aim) -> Result<Found> {
+    pub fn solve(&mut self, goals: &[f64], aim: ForceAccuracy) -> Result<RowForces> {
         let enough = |inner: &Self| match aim {
-            Aim::Share(share) => share * inner.measure(goals),
-            Aim::Measure(enough) => enough,
+            ForceAccuracy::Share(share) => share * inner.measure(goals),
+            ForceAccuracy::Measure(enough) => enough,
         };
         let first = self.iterate(goals, enough(self));
         if first.is_ok() || self.is_made {
@@ -74,11 +74,12 @@ impl<'a> Inner<'a> {
         self.kept = Arc::new(self.rows.factor(self.tail)?);
         self.is_made = true;
         let diagonal = self.diagonal.clone();
-        self.preconditioner = Preconditioner::new(diagonal, &self.rows.keys, self.kept.clone());
+        self.preconditioner =
+            FactorPreconditioner::new(diagonal, &self.rows.keys, self.kept.clone());
         self.iterate(goals, enough(self))
     }
 
-    fn iterate(&mut self, goals: &[f64], enough: f64) -> Result<Found> {
+    fn iterate(&mut self, goals: &[f64], enough: f64) -> Result<RowForces> {
         let Self { along, preconditioner, most, .. } = self;
         let give_up = |progress: &Progress| hopeless(progress, *most);
         let product = |forces: &[f64]| along.multiply(forces);

@@ -15,15 +15,15 @@ mod rows;
 use std::sync::Arc;
 
 use along::Along;
-use inner::{Aim, Found, Inner};
+use inner::{ForceAccuracy, Inner, RowForces};
 
-use crate::algebra::cholesky::{Factor, NormalFactor, Precision, ROUGH, TailFlexibility};
+use crate::algebra::cholesky::{Factor, NormalFactor, ProductAccuracy, ROUGH, TailFlexibility};
 use crate::contact::{Constraints, ContactRow, Spring};
 use crate::error::{MtmError, Result};
 use crate::vector::{add, dot, norm, scaled, sub};
 use krylov::{Krylov, length};
 use rows::pushes;
-pub(crate) use rows::{Rows, singular};
+pub(crate) use rows::{ConditionRows, singular};
 
 /// Maximum number of conjugate gradient steps: a new factorisation takes as long as sixty products of the matrix.
 const MOST_PRODUCTS: usize = 60;
@@ -60,7 +60,7 @@ impl ContactFactor {
         let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
         let rows: Vec<ContactRow> = normals.iter().enumerate().map(row).collect();
         let offsets = vec![0.0; rows.len()];
-        let rows = Rows::new(&Constraints {
+        let rows = ConditionRows::new(&Constraints {
             rows: &rows,
             offsets: &offsets,
             springs: &[],
@@ -97,7 +97,7 @@ impl ContactFactor {
             free,
             pushed,
             moved,
-            precision: Precision::Exact,
+            precision: ProductAccuracy::Exact,
             memory: Vec::new(),
             made: None,
         }
@@ -121,7 +121,7 @@ pub(crate) struct Answers<'a> {
     pushed: Vec<[f64; 3]>,
     /// Their contribution to the displacements, mm, and its accuracy.
     moved: Vec<[f64; 3]>,
-    precision: Precision,
+    precision: ProductAccuracy,
     /// Memory of the last assembled matrix.
     memory: Vec<f32>,
     /// The last factorisation made for this plan, if the one at rest was not good enough.
@@ -154,7 +154,7 @@ impl<'a> Answers<'a> {
     pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Answer> {
         let unstable: Vec<Spring> =
             c.springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
-        let rows = Rows::new(c);
+        let rows = ConditionRows::new(c);
         let mut inner = self.inner(&rows, &unstable);
         let found = self.balanced(c, &rows, &unstable, &mut inner, tolerance);
         if inner.is_made {
@@ -170,27 +170,28 @@ impl<'a> Answers<'a> {
     fn balanced(
         &mut self,
         c: &Constraints<'_>,
-        rows: &Rows,
+        rows: &ConditionRows,
         unstable: &[Spring],
         inner: &mut Inner<'_>,
         tolerance: f64,
     ) -> Result<(bool, bool)> {
         let exact = ROUNDING.max(EXACT_SHARE * tolerance);
-        let precision = if c.share >= ROUGH_STEP { Precision::Rough } else { Precision::Exact };
+        let precision =
+            if c.share >= ROUGH_STEP { ProductAccuracy::Rough } else { ProductAccuracy::Exact };
         let n = self.free.len();
         // The last forces, turned with their normals.
         let mut forces = rows.turned(&self.pushed, c.rows.len());
         self.push(pushes(n, &rows.rows, &forces), precision);
         let mut open = rows.open(&self.displacements(), &forces);
         let mut measure = inner.measure(&open);
-        let aim = if precision == Precision::Rough { c.share * measure } else { 0.0 };
+        let aim = if precision == ProductAccuracy::Rough { c.share * measure } else { 0.0 };
         let (mut loads, mut is_carried) = (vec![0.0; unstable.len()], false);
         for round in 0..MOST_ROUNDS {
             let enough = aim.max(ROUGH * measure).max(exact * self.size());
-            let mut found = inner.solve(&open, Aim::Measure(enough))?;
+            let mut found = inner.solve(&open, ForceAccuracy::Measure(enough))?;
             if round == 0 && !unstable.is_empty() {
                 (loads, is_carried) = self.loads(c, unstable, inner, &mut found)?;
-                let more = inner.solve(&found.left, Aim::Measure(enough))?;
+                let more = inner.solve(&found.left, ForceAccuracy::Measure(enough))?;
                 add_to(&mut found.forces, 1.0, &more.forces);
             }
             add_to(&mut forces, 1.0, &found.forces);
@@ -202,7 +203,7 @@ impl<'a> Answers<'a> {
             open = rows.open(&self.displacements(), &forces);
             let before = std::mem::replace(&mut measure, inner.measure(&open));
             let is_exact = measure <= exact * self.size() || self.is_rounding(&open);
-            if is_exact && self.precision == Precision::Exact {
+            if is_exact && self.precision == ProductAccuracy::Exact {
                 return Ok((true, is_carried));
             }
             if is_exact || measure <= NEARLY * aim || measure > STALLED * before {
@@ -219,7 +220,7 @@ impl<'a> Answers<'a> {
         c: &Constraints<'_>,
         unstable: &[Spring],
         inner: &mut Inner<'_>,
-        found: &mut Found,
+        found: &mut RowForces,
     ) -> Result<(Vec<f64>, bool)> {
         let n = found.forces.len();
         let root: Vec<f64> = unstable.iter().map(|s| (-s.stiffness).sqrt()).collect();
@@ -229,7 +230,7 @@ impl<'a> Answers<'a> {
         let start: Vec<f64> = stretch.zip(&root).map(|(v, r)| v * r).collect();
         let size = length(&start);
         let mut krylov = Krylov::new(size);
-        let mut answered: Vec<Found> = Vec::new();
+        let mut answered: Vec<RowForces> = Vec::new();
         let mut next: Vec<f64> = start.iter().map(|v| v / size).collect();
         while size > 0.0 && krylov.basis.len() < MOST_LOAD_STEPS.min(unstable.len()) {
             let mut push = vec![0.0; n];
@@ -239,7 +240,7 @@ impl<'a> Answers<'a> {
             // Later directions contribute less, so that errors of their responses count less (Simoncini &
             // Szyld 2003).
             let error = (c.spring_share * size / krylov.left).min(MOST_PROBE_ERROR);
-            let answer = inner.solve(&goals, Aim::Share(error))?;
+            let answer = inner.solve(&goals, ForceAccuracy::Share(error))?;
             let moved: Vec<f64> =
                 there[n..].iter().zip(&answer.along[n..]).map(|(a, b)| a + b).collect();
             let product = moved.iter().zip(&root).map(|(v, r)| v * r).collect();
@@ -262,7 +263,7 @@ impl<'a> Answers<'a> {
     }
 
     /// The rows and the axes of `unstable` springs, ready to be solved for.
-    fn inner<'r>(&mut self, rows: &'r Rows, unstable: &[Spring]) -> Inner<'r>
+    fn inner<'r>(&mut self, rows: &'r ConditionRows, unstable: &[Spring]) -> Inner<'r>
     where
         'a: 'r,
     {
@@ -293,7 +294,7 @@ impl<'a> Answers<'a> {
     /// Replaces the forces on the nodes, N.
     ///
     /// Approximate products are of changes, which are smaller; the first exact one after them is of all.
-    fn push(&mut self, forces: Vec<[f64; 3]>, precision: Precision) {
+    fn push(&mut self, forces: Vec<[f64; 3]>, precision: ProductAccuracy) {
         if self.precision < precision {
             self.moved = self.respond_to(&forces, precision);
             self.precision = precision;
@@ -309,15 +310,15 @@ impl<'a> Answers<'a> {
         self.pushed = forces;
     }
 
-    fn respond_to(&self, forces: &[[f64; 3]], precision: Precision) -> Vec<[f64; 3]> {
+    fn respond_to(&self, forces: &[[f64; 3]], precision: ProductAccuracy) -> Vec<[f64; 3]> {
         match precision {
-            Precision::Rough => self.contact.flexibility.respond_roughly(forces),
-            Precision::Exact => self.contact.flexibility.respond(forces),
+            ProductAccuracy::Rough => self.contact.flexibility.respond_roughly(forces),
+            ProductAccuracy::Exact => self.contact.flexibility.respond(forces),
         }
     }
 
     /// Flexibility of each row on its own, mm/N.
-    fn diagonal(&self, rows: &Rows) -> Vec<f64> {
+    fn diagonal(&self, rows: &ConditionRows) -> Vec<f64> {
         let own = |r: &ContactRow| self.contact.flexibility.own(r.node, r.normal);
         rows.rows.iter().zip(&rows.softness).map(|(r, s)| own(r) + s).collect()
     }

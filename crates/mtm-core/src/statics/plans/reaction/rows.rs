@@ -7,7 +7,7 @@ use crate::vector::{add, dot, scaled};
 
 /// Constraint rows, followed by one row for each spring: a spring of stiffness k adds a column along its axis,
 /// with 1/k on the diagonal.
-pub(crate) struct Rows {
+pub(crate) struct ConditionRows {
     pub rows: Vec<ContactRow>,
     /// Prescribed displacement of each row, mm.
     goals: Vec<f64>,
@@ -16,7 +16,7 @@ pub(crate) struct Rows {
     pub keys: Vec<RowKey>,
 }
 
-impl Rows {
+impl ConditionRows {
     pub fn new(c: &Constraints<'_>) -> Self {
         let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
         let mut softness = vec![0.0; rows.len()];
