@@ -694,6 +694,29 @@ fn node_in_a_groove_rests_near_its_bottom() {
     }
 }
 
+/// Bone far thinner than the tissue resolves, here a ball of a tenth of an edge across: the node slides on the plane
+/// through the place where it touches, as far as it is drawn. The field of such bone is a bowl with no direction, and
+/// steps on it used to run out.
+#[test]
+fn node_on_a_speck_of_bone_slides_on_its_tangent_plane() {
+    let (speck, triangles) = meshes::sphere(2, 0.05);
+    let speck: Vec<[f64; 3]> =
+        speck.iter().map(|v| [v[0] + 0.3, v[1] + 0.1, v[2] + 1.45]).collect();
+    let speck = surface((speck, triangles));
+    let touched = Vec3::new(0.3, 0.1, 1.5);
+    for method in METHODS {
+        for goal in [Vec3::new(0.9, -0.3, 0.7), Vec3::new(-0.5, 0.6, 2.1)] {
+            let (end, force, k) = drawn_to(goal, &speck, 0.0, with_method(method));
+            let n = force.normalize();
+            assert!(n.z.abs() >= 0.97, "the normal of the ball's top: {n}");
+            let exact = goal - n * n.dot(&(goal - touched));
+            // The facets lie a little below the ball's top, and the node at its gap of zero on them.
+            assert!((end - exact).norm() <= 0.01, "{method:?}: {end} for {exact}");
+            assert!((force - (end - goal) * k).norm() <= 1e-6 * k, "{method:?}: {force}");
+        }
+    }
+}
+
 /// Three walls that carry a block about, and nothing else: it is not strained, and its residual is rounding
 /// over what the walls' way would cost each node alone, though no force acts in the end.
 #[test]

@@ -10,9 +10,12 @@ use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::Closest;
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// Length of the gradient of the distance below which the surface counts as lost: such nodes lie in the middle
-/// of a sheet far thinner than the mesh of the tissue resolves.
+/// Length of the gradient of the distance by which a gap is divided at least, while a node passes such a place.
 const LEAST_SLOPE: f64 = 0.1;
+/// Length of the gradient at rest below which the field does not resolve the bone at a node: a spike or a sheet
+/// thinner than about 0.4 lattice spacings, around whose middle the field is a bowl. A node cannot follow a level
+/// of that bowl, whose radius is a fraction of a millimetre.
+const RESOLVED_SLOPE: f64 = 0.3;
 
 /// Difference from its gap at rest, over the lattice spacing, up to which a node counts as lying at that gap.
 const AT_REST: f64 = 0.05;
@@ -26,6 +29,9 @@ pub(super) struct Seat {
     pub offset: [f64; 3],
     /// Value of the field on it, mm.
     level: f64,
+    /// Where the field does not resolve the bone: the unit normal of the plane through the node, or at its gap, on
+    /// which it slides instead.
+    plane: Option<[f64; 3]>,
 }
 
 /// The local shape of a surface at a node.
@@ -35,13 +41,20 @@ pub(super) struct LocalShape {
     pub gap: f64,
     /// Unit normal, out of the bone.
     pub normal: [f64; 3],
-    /// Length of the gradient, by which the gap and the Hessian are divided.
+    /// Length of the gradient of the field.
+    length: f64,
+    /// The same, at least [`LEAST_SLOPE`]: the gap and the Hessian are divided by it.
     slope: f64,
     /// Hessian of the distance over the slope, 1/mm.
     pub hessian: [[f64; 3]; 3],
 }
 
 impl LocalShape {
+    /// A plane with the unit `normal`, `gap` mm behind a node.
+    fn plane(gap: f64, normal: [f64; 3]) -> Self {
+        Self { gap, normal, length: 1.0, slope: 1.0, hessian: [[0.0; 3]; 3] }
+    }
+
     /// Distance in terms of the field, mm: smooth, whereas `gap` is divided by the slope.
     pub fn level(&self) -> f64 {
         self.gap * self.slope
@@ -54,7 +67,7 @@ impl LocalShape {
 
     /// Rate of change of the level along `way`.
     pub fn level_rate(&self, way: [f64; 3]) -> f64 {
-        self.slope * dot(self.normal, way)
+        self.length * dot(self.normal, way)
     }
 }
 
@@ -103,19 +116,23 @@ impl<'a> Seats<'a> {
             })
             .collect::<Result<Vec<_>>>()?;
         let clinging = sliding.clinging(motions);
-        let seats = vec![Seat { offset: [0.0; 3], level: 0.0 }; clinging.len()];
+        let seats = vec![Seat { offset: [0.0; 3], level: 0.0, plane: None }; clinging.len()];
         let mut out = Self { sliding, surfaces, seats, clinging };
         let feet: Vec<[f64; 3]> = (0..out.seats.len()).map(|i| out.foot(i)).collect();
         for (i, (gap, &foot)) in sliding.gaps.iter().zip(&feet).enumerate() {
-            out.seats[i] = match gap {
-                Some(_) => Seat { offset: [0.0; 3], level: 0.0 },
-                None => Seat { offset: sub(out.clinging[i], foot), level: 0.0 },
-            };
+            if gap.is_none() {
+                out.seats[i].offset = sub(out.clinging[i], foot);
+            }
         }
         // A node that lies at its gap stays there at rest, whatever error the field makes.
         let levels = out.touches(&out.clinging.clone());
         for (i, (touch, gap)) in levels.iter().zip(&sliding.gaps).enumerate() {
             let near = AT_REST * out.spacing(sliding.nodes[i].segment);
+            if touch.length < RESOLVED_SLOPE {
+                out.seats[i].plane = Some(out.normal_at(i, feet[i]));
+                out.seats[i].level = gap.unwrap_or(0.0);
+                continue;
+            }
             out.seats[i].level = match *gap {
                 None => touch.level(),
                 Some(gap) if (sliding.rest_distance(i) - gap).abs() <= near => {
@@ -136,6 +153,15 @@ impl<'a> Seats<'a> {
                 field.surface().point_at(rest.triangle, rest.barycentric)
             }
             MovedSurface::Unused => rest.point,
+        }
+    }
+
+    /// Current unit normal of the triangles at the `foot` of node `i`.
+    fn normal_at(&self, i: usize, foot: [f64; 3]) -> [f64; 3] {
+        match &self.surfaces[self.sliding.nodes[i].segment] {
+            MovedSurface::Rigid(_, rigid) => rigid.rotate(self.sliding.rest[i].normal),
+            MovedSurface::Deformed(field) => field.surface().closest_one(foot).normal,
+            MovedSurface::Unused => self.sliding.rest[i].normal,
         }
     }
 
@@ -162,12 +188,15 @@ impl<'a> Seats<'a> {
                     felt(field, &back, seats, turn, &mut out);
                 }
                 MovedSurface::Deformed(field) => felt(field, &own, seats, |value| value, &mut out),
-                MovedSurface::Unused => out.extend(own.iter().map(|_| LocalShape {
-                    gap: 0.0,
-                    normal: [0.0, 0.0, 1.0],
-                    slope: 1.0,
-                    hessian: [[0.0; 3]; 3],
-                })),
+                MovedSurface::Unused => {
+                    out.extend(own.iter().map(|_| LocalShape::plane(0.0, [0.0, 0.0, 1.0])));
+                }
+            }
+        }
+        for (i, seat) in self.seats.iter().enumerate() {
+            if let Some(normal) = seat.plane {
+                let away = sub(sub(at[i], seat.offset), self.foot(i));
+                out[i] = LocalShape::plane(dot(normal, away) - seat.level, normal);
             }
         }
         out
@@ -240,6 +269,7 @@ fn felt(
             gap: (value.distance - seat.level) / slope,
             normal: scaled(value.gradient, 1.0 / length.max(f64::MIN_POSITIVE)),
             slope,
+            length,
             hessian: value.hessian.map(|row| scaled(row, 1.0 / slope)),
         }
     }));
