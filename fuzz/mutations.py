@@ -8,8 +8,6 @@ import struct
 import zipfile
 from collections.abc import Callable, Sequence
 
-__all__ = ["mutated", "mutated_inside"]
-
 NUMBER = re.compile(rb"-?\b[0-9]+(?:\.[0-9]*)?(?:[eE][-+]?[0-9]+)?\b")
 WORD = re.compile(rb"[A-Za-z_]{2,24}")
 # Numbers at the ends of what types hold, and what is none.

@@ -13,8 +13,6 @@ import struct
 import xml.etree.ElementTree as ET
 import zlib
 
-__all__ = ["UndecidedError", "fcsv", "markups", "obj", "ply", "stl", "vtk_xml"]
-
 Surface = tuple[list[tuple[float, ...]], list[tuple[int, ...]]]
 PLAIN_REAL = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?", re.ASCII)
 PLAIN_WHOLE = re.compile(r"[-+]?[0-9]+", re.ASCII)

@@ -32,8 +32,6 @@ from cmfsim.io.meshes.vtk.writing import write_tets
 from cmfsim.io.slicer.bundles import unpack_bundle
 from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
 
-__all__ = ["READERS", "Reader", "changed_in_silence", "plain"]
-
 
 @dataclass(frozen=True)
 class Reader:

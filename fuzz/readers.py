@@ -27,8 +27,6 @@ import cmfsim
 from mutations import mutated, mutated_inside
 from reader_table import READERS, Reader, changed_in_silence, plain
 
-__all__ = ["Tally", "markdown", "run"]
-
 # What may come of a mutant: the first three are as it should be.
 SOUND = ("same", "other", "refused")
 FAULTS = ("silent", "traceback", "hang", "crash")

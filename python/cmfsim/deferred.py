@@ -6,8 +6,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-__all__ = ["deferred"]
-
 # A line of a stub that makes a name of another module public.
 PUBLIC = re.compile(r"^from (\S+) import (\w+) as \2$", re.MULTILINE)
 

@@ -5,8 +5,6 @@ from skimage import measure
 
 from real_heads import core_surface
 
-__all__ = ["check_face", "dice", "distances", "face", "parted_as", "reference", "surface_points"]
-
 
 def reference():
     """Skin, bone and mandible, ready to be searched."""

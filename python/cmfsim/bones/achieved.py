@@ -37,14 +37,6 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import RigidMotion, carried, decompose_motion, rigid_matrix
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
-__all__ = [
-    "AchievedMotion",
-    "AchievedPlan",
-    "achieved_plan",
-    "measure_motion",
-    "measure_pair",
-]
-
 _LOG = logging.getLogger(__name__)
 
 # A motion counts as rigid if it reproduces the place of every vertex to this, mm: a tenth of the

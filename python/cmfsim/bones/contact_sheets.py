@@ -19,8 +19,6 @@ from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["ContactSheet", "SheetOptions", "contact_sheet", "sheet_departure"]
-
 Mask = NDArray[np.bool_]
 
 # Grid that the sheet is made on, mm.

@@ -20,15 +20,6 @@ from cmfsim.values.motion import carried
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
-__all__ = [
-    "RemovedBone",
-    "missing_patches",
-    "moves_as_one",
-    "sound_motion",
-    "torn_pieces",
-    "triangle_areas",
-]
-
 # An edge is torn if its ends move apart by more than this, mm, and by more than this share of its
 # length: noise of 0.3 mm per vertex does the first to one edge in 10 000, and a turn of 15° the
 # second to none.

@@ -15,8 +15,6 @@ from cmfsim.surfaces.levels import block_of
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
 
-__all__ = ["check_segments"]
-
 # Smoothing and decimation keep a surface within half a voxel of the zero set of its level, so that
 # the cube of three voxels about a vertex holds voxels on both sides. Share of the vertices of which
 # that must be true: 1.00 on the 18 segments of three real heads after Le Fort I, BSSO and

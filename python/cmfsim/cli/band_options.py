@@ -7,8 +7,6 @@ from cmfsim.io import Case
 from cmfsim.io.results.calibrations import read_calibration
 from cmfsim.values.band_options import BandOptions
 
-__all__ = ["add_band_options", "band_options"]
-
 
 def add_band_options(command: argparse.ArgumentParser) -> None:
     """Adds them to a command."""

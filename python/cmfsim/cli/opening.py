@@ -7,8 +7,6 @@ from pathlib import Path
 
 from cmfsim.pictures import has_screen
 
-__all__ = ["can_open", "open_page"]
-
 
 def can_open() -> bool:
     """Whether a person works at a screen."""

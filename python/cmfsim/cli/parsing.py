@@ -25,8 +25,6 @@ from cmfsim.planning.replanning import CORRECTIONS
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
 
-__all__ = ["make_parser"]
-
 MOST_PORT = 65535
 # How `predict` and `evaluate` take models.
 MODEL_CHOICES: dict[str, Any] = {

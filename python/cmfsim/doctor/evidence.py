@@ -23,8 +23,6 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.moduli import FatModuli, moduli_unusual
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
-__all__ = ["Body", "Evidence", "gather"]
-
 # Points of a surface that distances are measured at; a few thousand describe a skull.
 MAX_SAMPLES = 20_000
 # No head or bone is longer, mm: ten times what the check of sizes lets pass.

@@ -7,8 +7,6 @@ from cmfsim.doctor.evidence import Evidence
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 
-__all__ = ["check_lips"]
-
 CORNERS = ("cheilion_R", "cheilion_L")
 BORDERS = ("labiale_superius", "labiale_inferius")
 # Methods that solve contact of the lips.

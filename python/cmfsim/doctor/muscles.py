@@ -15,8 +15,6 @@ from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding
 from cmfsim.values.moduli import FatModuli
 
-__all__ = ["check_muscles"]
-
 # Where a case states moduli of all muscles.
 MUSCLE_KEYS = ("muscles.young_along", "muscles.young_across", "muscles.poisson")
 

@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterable
 
 from cmfsim.values.finding import SEVERITIES, Finding
 
-__all__ = ["findings_text"]
-
 # ANSI colours of the severities: red, yellow, blue.
 COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}
 # Columns of a terminal, unless it reports its width.

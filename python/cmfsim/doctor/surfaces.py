@@ -9,8 +9,6 @@ from cmfsim.doctor.sites.places import place_text
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["check_image", "check_mesh_size", "check_surfaces"]
-
 # Spacing above which thin structures of a face are lost, mm: half the thickness of lips and lids.
 COARSE_SPACING = 2.5
 # A border longer than this many extents of the skin surrounds the face, not the neck: a cap over it

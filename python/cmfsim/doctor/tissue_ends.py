@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.values.finding import Finding
 
-__all__ = ["check_ends"]
-
 # What moves the chin, and the landmarks at its lower and upper border.
 LOWER_JAW = frozenset({"mandible", "mandible_body", "chin"})
 LOWEST, HIGHEST = "menton", "infradentale"

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-__all__ = ["Taken", "Text", "clean", "legible", "quoted"]
-
 # Characters of a line before its comment goes to lines of its own.
 WIDTH = 100
 

@@ -10,8 +10,6 @@ from cmfsim.drafting.finds import HU_AIR, ImageFind, LandmarkFind
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
-__all__ = ["Images", "Marks", "choose_images", "choose_landmarks"]
-
 # LPS to RAS, and back.
 TURN = np.array([-1.0, -1.0, 1.0])
 # What stored values are when an offset of 1024 was added to HU.

@@ -29,8 +29,6 @@ from cmfsim.drafting.written import (
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats
 
-__all__ = ["CaseDraft", "draft_case"]
-
 # Middles of the skins before and after that are farther apart are those of two scans, mm.
 APART = 20.0
 # Questions about what there is after the operation.

@@ -21,22 +21,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "CASE_FILE",
-    "EXTRACTED",
-    "HU_AIR",
-    "ImageFind",
-    "LandmarkFind",
-    "Listing",
-    "OtherFind",
-    "SurfaceFind",
-    "TransformFind",
-    "image_find",
-    "landmark_find",
-    "listing",
-    "surface_find",
-]
-
 # How far into folders, and how many files: a case has some hundred, DICOM a thousand slices.
 # A CT in HU has air, some -1000 HU.
 HU_AIR = -500.0

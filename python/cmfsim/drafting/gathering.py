@@ -25,8 +25,6 @@ from cmfsim.io.images.segmentations import NAMES_FILE
 from cmfsim.io.slicer.bundles import unpack_bundle
 from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
 
-__all__ = ["Gathered", "gather"]
-
 # Images that are read to see which is the CT.
 MAX_IMAGES = 6
 # Masks that are read by their names.

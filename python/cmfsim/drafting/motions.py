@@ -16,8 +16,6 @@ from cmfsim.io.slicer.transforms import is_itk_file, motion_in_lps, read_transfo
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import clinical_motion
 
-__all__ = ["DraftMotion", "Plan", "file_motions", "scene_motions"]
-
 # A motion below this, mm and as entries of a rotation, is none.
 NOTHING = 1e-9
 

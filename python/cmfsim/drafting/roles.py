@@ -5,8 +5,6 @@ import re
 import unicodedata
 from dataclasses import dataclass
 
-__all__ = ["JAWS_OF_TEETH", "MOVING", "NameRole", "name_role", "safe_key"]
-
 # Words that programs and people use, without accents: English, then German, French, Spanish and
 # Italian. "schaedel" and "schadel" are the two ways to write an umlaut without it.
 # Parts that are no bone of a case.

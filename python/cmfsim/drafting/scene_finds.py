@@ -18,8 +18,6 @@ from cmfsim.errors import CmfsimError
 from cmfsim.io.slicer.slicer_scenes import SceneNode, SlicerScene
 from cmfsim.values.checks import Floats
 
-__all__ = ["LooseMotion", "SceneFinds", "scene_finds"]
-
 # Slicer's own planes in the 3-D view are models, too.
 SLICE_MODELS = "Volume Slice"
 

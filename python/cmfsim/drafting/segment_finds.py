@@ -15,8 +15,6 @@ from cmfsim.surfaces.levels import block_of, surface_of_level
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["SegmentFinds", "segment_finds"]
-
 # Segments without a known name that are asked about, where some have one; the rest are organs.
 MOST_UNNAMED = 6
 # Grids that agree up to this, mm, are one.

@@ -30,8 +30,6 @@ from cmfsim.values.checks import (
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["MATCHINGS", "SkinComparison", "compare_skins"]
-
 MATCHINGS = ("landmarks", "closest")
 # Matches at a border, of the part that was to be evaluated, from which on a finding is made.
 MANY_AT_BORDER = 0.05

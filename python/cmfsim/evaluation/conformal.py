@@ -20,8 +20,6 @@ from cmfsim.errors import CalibrationError
 from cmfsim.values.calibration import BandFactor
 from cmfsim.values.checks import as_floats, as_number
 
-__all__ = ["calibrate", "cases_needed", "covered_interval", "region_scores"]
-
 # (n + 1) c of decimal fractions that is a whole number by this margin is one.
 ROUNDING = 1e-9
 # Share of the distribution of the coverage between the ends of its interval.

@@ -12,8 +12,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Matches", "Skin", "match_skins"]
-
 # A partner lies on the border if its distance from the border's edge, as a share of the height of
 # its triangle, is below this: more than the rounding of a closest point at 1000 mm.
 ON_EDGE = 1e-7

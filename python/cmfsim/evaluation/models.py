@@ -23,8 +23,6 @@ from cmfsim.surfaces.depth import moved_outward
 from cmfsim.values.checks import Floats, as_rows, as_text, check_one_of, frozen
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["NO_CHANGE", "WHOLE", "Improvement", "ModelComparison", "compare_models"]
-
 # The pre-operative skin taken as a prediction: what any model must beat.
 NO_CHANGE = "no change"
 # Name of the whole evaluated part, next to the names of regions.

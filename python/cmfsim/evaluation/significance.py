@@ -10,15 +10,6 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.checks import as_floats, check_one_of
 
-__all__ = [
-    "LEAST_PAIRS",
-    "PAIRED_BY",
-    "PairedChange",
-    "PairedTest",
-    "paired_change",
-    "wilcoxon_test",
-]
-
 PAIRED_BY = ("vertex", "patient")
 CAVEATS = {
     "vertex": (

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, as_floats
 
-__all__ = ["LIMITS", "DistanceStatistics", "distance_statistics"]
-
 # Errors up to which a prediction is usually called strict, good, acceptable and lenient, mm.
 LIMITS = (1.0, 1.5, 2.0, 3.0)
 # A distance is an outlier of a box plot beyond the upper quartile by this many boxes (Tukey 1977).

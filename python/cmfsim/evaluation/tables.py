@@ -15,8 +15,6 @@ from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics
 from cmfsim.values.checks import as_text, check_one_of
 
-__all__ = ["ErrorTable", "error_table"]
-
 # Columns of the CSV file after patient, region and model.
 COLUMNS = (
     "count",

@@ -16,13 +16,6 @@ from cmfsim.evaluation.comparison import SkinComparison, compare_skins
 from cmfsim.values.checks import Floats, as_floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "STILL",
-    "ThicknessChange",
-    "compare_unmoved",
-    "fitted_thickness",
-]
-
 # What every model moves by less than this stays, mm: far below the noise of a scan.
 STILL = 0.1
 # Vertices below which a figure is one of single points.

@@ -8,8 +8,6 @@ from cmfsim.imaging.skins.skin import Skin
 from cmfsim.imaging.working_grid import COARSE, Working
 from cmfsim.values.finding import Finding
 
-__all__ = ["view_findings"]
-
 # Skin or bone that meets a border of the image over less than this is not cut off, mm².
 CUT_SKIN = 150.0
 CUT_BONE = 60.0

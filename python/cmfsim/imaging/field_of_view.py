@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from cmfsim.imaging.morphology import Mask
 
-__all__ = ["RoundField", "round_field"]
-
 # Slices in which the field is looked for.
 SLICES = 5
 # Less of a slice than this is no padding: the corners of a square beside its circle are 0.21 of it.

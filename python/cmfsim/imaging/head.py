@@ -28,8 +28,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.progress import Progress
 
-__all__ = ["segment_head"]
-
 _LOG = logging.getLogger(__name__)
 
 # Number of things found in parallel with others.

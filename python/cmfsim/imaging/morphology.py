@@ -13,34 +13,6 @@ from numpy.typing import NDArray
 from cmfsim import _core
 from cmfsim.errors import ImageError, third_party
 
-__all__ = [
-    "Block",
-    "Mask",
-    "Volume",
-    "as_array",
-    "as_itk",
-    "binned",
-    "box_of",
-    "chosen",
-    "closed",
-    "depth",
-    "distance",
-    "filled",
-    "grown",
-    "label",
-    "largest",
-    "ndimage",
-    "opened",
-    "reached",
-    "resampled_to",
-    "shrunk",
-    "simpleitk",
-    "simplex",
-    "smoothed",
-    "sparse",
-    "watershed",
-]
-
 Mask = NDArray[np.bool_]
 Volume = NDArray[np.float32]
 Block = tuple[slice, ...]

@@ -7,8 +7,6 @@ import numpy as np
 from cmfsim.errors import ImageInputError
 from cmfsim.values.checks import as_number, as_positive
 
-__all__ = ["BONE", "METAL", "SegmentOptions"]
-
 # Bone is denser than this: thin bone that shares its voxels reaches little more, HU.
 BONE = 250.0
 # Enamel reaches 2200 HU; fillings, crowns and plates lie above this.

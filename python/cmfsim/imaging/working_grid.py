@@ -24,8 +24,6 @@ from cmfsim.imaging.options import SegmentOptions
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["COARSE", "Working", "coarse_of", "working_grid"]
-
 # Voxel size at which shapes as large as a couch are told apart, mm.
 COARSE = 2.5
 # A voxel this many times longer than the shortest is divided.

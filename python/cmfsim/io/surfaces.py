@@ -25,18 +25,6 @@ from cmfsim.values.checks import check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
-__all__ = [
-    "SurfaceFile",
-    "read_bone_pair",
-    "read_moved_surface",
-    "read_surface",
-    "read_surface_file",
-    "surface_as_stored",
-    "surface_suffixes",
-    "write_surface",
-]
-
-
 _log = logging.getLogger(__name__)
 
 

@@ -13,8 +13,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["anatomy_from_surfaces", "signed_level"]
-
 # Levels are clipped where they are this many voxels from the surface: two are enough for the
 # trilinear zero set, and fewer distances have to be found.
 BAND_IN_VOXELS = 2.0

@@ -10,8 +10,6 @@ from cmfsim._core import TetMesh
 from cmfsim.values.finding import Finding
 from cmfsim.values.mesh_report import BINS, MeshReport
 
-__all__ = ["LEAST_DIHEDRAL", "mesh_findings", "mesh_report", "report_of_part"]
-
 # Smallest dihedral angle that a tet of a good mesh has, degrees; below, the stiffness matrix loses
 # digits and the deformation of the tet its meaning.
 LEAST_DIHEDRAL = 10.0

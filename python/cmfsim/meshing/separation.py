@@ -7,8 +7,6 @@ from cmfsim._core import Surface, TetMesh
 from cmfsim.values.checks import Indices
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["SeparatedMesh", "part_mesh", "separated_mesh"]
-
 
 @dataclass(frozen=True, eq=False)
 class SeparatedMesh:

@@ -14,8 +14,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.mesh_report import MeshReport
 
-__all__ = ["MeshOptions", "TissueMesh", "mesh_from_labels", "mesh_from_level"]
-
 MAX_REFINEMENTS = 3
 
 

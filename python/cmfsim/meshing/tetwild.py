@@ -14,8 +14,6 @@ from cmfsim.errors import MeshInputError
 from cmfsim.values.checks import as_positive
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["mesh_with_tetwild"]
-
 
 def mesh_with_tetwild(surface: SurfaceData, edge_length: float = 3.0) -> TetMesh:
     """The tets inside a closed surface, by the optional package pytetwild (MPL-2.0).

@@ -13,8 +13,6 @@ from cmfsim.values.checks import Floats, as_number, as_point, as_positive
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["TissueRegion", "near_skin", "tissue_level"]
-
 Levels = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 

@@ -7,8 +7,6 @@ from cmfsim._core import TetMesh
 from cmfsim.values.checks import Floats
 from cmfsim.values.tissue_data import TissueData
 
-__all__ = ["Blur", "blurred"]
-
 # Rounds are not repeated beyond: a blur this wide in edges would be of no muscle that is left.
 MOST_ROUNDS = 64
 

@@ -25,15 +25,6 @@ from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.tissue_data import DEFAULT_PRESET, MIXINGS, TissueData
 
-__all__ = [
-    "INSIDE_TESTS",
-    "Mixture",
-    "MuscleVolume",
-    "PreparedMuscles",
-    "equivalent_material",
-    "prepared_muscles",
-]
-
 INSIDE_TESTS = ("winding", "normal")
 # Fraction of a closed muscle that may be outside the mesh before a finding reports it.
 LOST_PART = 0.02

@@ -11,8 +11,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.moduli import MuscleModuli, TissueModuli, moduli_unusual
 from cmfsim.values.tissue_data import TissueData
 
-__all__ = ["MODULI_CODES", "check_muscle_names", "mixed_tissue", "moduli_findings"]
-
 MODULI_CODES = frozenset({"muscle-moduli", "moduli-unusual"})
 
 

@@ -10,8 +10,6 @@ from cmfsim.phantom.geometry.curves import Level
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Field", "gradient_at", "level_grid", "level_surface", "to_surface"]
-
 Field = Callable[[Level, Level, Level], Level]
 
 # Voxels along each edge of a brick: large ones are skipped whole, small ones fit the cache.

@@ -20,8 +20,6 @@ from cmfsim.phantom.geometry.shapes import (
 )
 from cmfsim.phantom.parameters import HeadParameters
 
-__all__ = ["skin_shape"]
-
 # The box of the head, mm, with the neck cut off below.
 NECK_CUT = -122.0
 HEAD_BOX = Box((0.0, -140.0, NECK_CUT), (100.0, 115.0, 145.0))

@@ -12,8 +12,6 @@ from cmfsim.phantom.grid import Field, to_surface
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.values.checks import Floats, frozen
 
-__all__ = ["find_skin_landmarks", "find_skull_landmarks"]
-
 # Rays are sampled at this step before the crossing is halved down, mm.
 RAY_STEP = 1.0
 # Halvings of the last step of a ray; the projection onto the surface does the rest.

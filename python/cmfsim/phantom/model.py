@@ -38,8 +38,6 @@ from cmfsim.values.checks import (
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["BONES", "LABELS", "PARTS", "PhantomHead", "make_head"]
-
 BONES = ("cranium", "mandible", "upper_teeth", "lower_teeth")
 # Parts that `surface` draws besides the muscles.
 PARTS = ("skin", *BONES, "teeth", "air", "brain")

@@ -15,8 +15,6 @@ from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
 from cmfsim.values.checks import Floats, as_rows, frozen
 
-__all__ = ["Muscle", "Tissue", "make_muscles"]
-
 # Muscle stays this far below the skin, mm.
 BELOW_SKIN = 0.6
 # Neighbouring straps of one muscle melt over this width, mm.

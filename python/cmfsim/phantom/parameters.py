@@ -8,8 +8,6 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import as_number
 
-__all__ = ["PARAMETER_RANGES", "HeadParameters"]
-
 # Lowest and highest value of each parameter. Within them every part stays inside the skin.
 PARAMETER_RANGES = MappingProxyType(
     {

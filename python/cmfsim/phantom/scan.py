@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["HOUNSFIELD", "add_couch", "add_metal", "mixed", "noisy"]
-
 # Mean HU of each tissue at about 120 kV; round figures of the textbooks (Hounsfield 1973; Bushberg
 # 2012).
 HOUNSFIELD: Mapping[str, float] = MappingProxyType(

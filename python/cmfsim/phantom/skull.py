@@ -12,16 +12,6 @@ from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, FlatTube, Step, Tube
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.values.checks import Floats
 
-__all__ = [
-    "CONDYLE",
-    "airway_shape",
-    "brain_shape",
-    "cranium_shape",
-    "mandible_shape",
-    "metal_pieces",
-    "teeth_shape",
-]
-
 # Centre of the left condyle, mm: the mandible opens about the axis through both.
 CONDYLE = (50.0, -13.0, -5.0)
 # Middle line of the alveolar arch of either jaw as seen from above: x, y in mm.

@@ -16,14 +16,6 @@ from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "add_bone",
-    "picture_anatomy",
-    "picture_node_kinds",
-    "picture_segments",
-    "segment_colours",
-]
-
 SKIN_COLOUR = "#e3b7a0"
 # Kim et al. (2010), Figure 4: fixed pink, joined orange, sliding blue, free white.
 KIND_COLOURS: Mapping[str, str] = MappingProxyType(

@@ -14,8 +14,6 @@ from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import SkinBand
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["band_picture", "picture_band", "picture_half_width"]
-
 # Left round the face, as a share of its extent.
 MARGIN = 0.12
 

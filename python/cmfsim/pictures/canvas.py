@@ -27,25 +27,6 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, as_positive
 
-__all__ = [
-    "LEGEND_ROW",
-    "NO_OPENGL",
-    "SIZE",
-    "Picture",
-    "Shown",
-    "View",
-    "add_scale_bar",
-    "bounds",
-    "check_can_draw",
-    "draw",
-    "look_at",
-    "polydata",
-    "pyvista_module",
-    "silent_vtk",
-    "without_probe",
-    "write_picture",
-]
-
 # What draws a picture at a path: a function of this package with all else that it takes, which can
 # be pickled.
 Picture = partial[None]

@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import as_floats
 
-__all__ = ["MODEL_COLOURS", "chart_errors", "write_figure"]
-
 # By model, in the order of the paper; told apart in grey too.
 MODEL_COLOURS = {
     "no change": "#c9c5bd",

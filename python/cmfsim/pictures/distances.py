@@ -13,8 +13,6 @@ from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
 from cmfsim.values.checks import Floats, as_floats, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["DISTANCE_LIMIT", "distance_colour", "picture_distance_grid", "picture_distances"]
-
 # Ends of the colour bar, mm (Kim et al. 2010, Figure 10).
 DISTANCE_LIMIT = 5.0
 # From behind (blue) over nothing (near white) to in front (red), at equal steps: dark ends that are

@@ -14,15 +14,6 @@ from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "picture_faces",
-    "picture_motions",
-    "picture_plan",
-    "picture_prediction",
-    "plan_picture",
-    "prediction_picture",
-]
-
 # Of six views in two rows, pixels.
 TWO_ROWS = (1650, 1240)
 # Skin shines a little.

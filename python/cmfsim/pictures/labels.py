@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike
 from cmfsim.pictures.canvas import LEGEND_ROW, LETTER, TEXT_SIZE, pyvista_module
 from cmfsim.values.checks import Floats
 
-__all__ = ["Label", "LabelPlaces", "add_labels", "column_width", "label_places", "spread"]
-
 # PyVista draws text of this size with letters twice as high, pixels.
 LABEL_SIZE = 8
 # From one line of text to the next, and from text to the edge of the view and to its line, pixels.

@@ -15,8 +15,6 @@ from cmfsim.pictures.labels import Label, add_labels, column_width
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["picture_landmarks"]
-
 # Of a view, pixels.
 VIEW_SIZE = (700, 700)
 SURE_COLOUR, DOUBTFUL_COLOUR = "#1f4fd8", "#d62728"

@@ -18,8 +18,6 @@ from cmfsim.values.surface_data import SurfaceData
 if TYPE_CHECKING:
     from cmfsim.values.musculature import MuscleSurface, Musculature
 
-__all__ = ["add_muscle", "picture_muscles"]
-
 MUSCLE_COLOUR, BONE_COLOUR = "#b8564b", "#e6dcc3"
 # Boxes whose direction the outline hardly tells are drawn in the second colour.
 BOX_COLOUR, SHEET_COLOUR, LINE_COLOUR = "#1f5fbf", "#e08a00", "#202020"

@@ -8,8 +8,6 @@ import numpy as np
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["SkinEnds", "skin_ends", "trimmed"]
-
 # What is left off, in edges.
 RIM = 2.0
 # A skin's upper end is a cut, not a crown, where its topmost rim is wider than this share of it.

@@ -24,8 +24,6 @@ from cmfsim.pictures.canvas import (
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["ViewPart", "has_screen", "view_parts"]
-
 WINDOW = (1300, 900)
 # Of the letter that shows and hides each part, and its place in the window, pixels.
 ROW, LEFT = 30, 12

@@ -24,8 +24,6 @@ from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import WHOLE_FACE, SkinBand
 from cmfsim.values.uncertainty import ADDED, NOT_COVERED, band_sources
 
-__all__ = ["band_regions", "band_settings", "predict_with_band"]
-
 # Regions of `skin_regions` that a band holds simultaneously, each by itself.
 BAND_REGIONS = (
     WHOLE_FACE,

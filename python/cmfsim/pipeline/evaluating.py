@@ -23,7 +23,6 @@ from cmfsim.evaluation import (
     unmoved_regions,
 )
 from cmfsim.io import Case, CaseOrPath, as_case
-from cmfsim.io.results.metrics import EVALUATION_FILE
 from cmfsim.pipeline.building.inputs import case_key
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative, read_postoperative
@@ -38,8 +37,6 @@ from cmfsim.values.finding_groups import grouped
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import SurfaceData
-
-__all__ = ["EVALUATION_FILE", "CaseEvaluation", "evaluate", "evaluation_key"]
 
 WILCOXON_NOTE = (
     "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices "

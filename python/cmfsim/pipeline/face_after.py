@@ -10,8 +10,6 @@ from cmfsim.io import Case
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["check_face_after", "refuse_other_face"]
-
 # Mean distance between the faces before and after where nothing was operated on, mm, from which on
 # it is reported, and from which on they are not one patient's in one frame. Registration, weight
 # and expression leave 0.1 to 0.7 mm; the face of another patient of like size left 3.05 mm.

@@ -10,8 +10,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.patient_model import PatientModel
 
-__all__ = ["FaceLandmarks", "face_landmarks"]
-
 
 @dataclass(frozen=True)
 class FaceLandmarks:

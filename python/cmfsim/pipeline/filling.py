@@ -28,8 +28,6 @@ from cmfsim.values.site_states import (
 )
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["GivenSites", "filled_landmarks", "head_distribution"]
-
 # The landmarks of a person by kind and label, mm, with who placed each.
 GivenSites = Mapping[SiteKey, tuple[Floats, SiteState]]
 

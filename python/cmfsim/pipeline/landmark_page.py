@@ -16,8 +16,6 @@ from cmfsim.registration.site_covariance import PLACED_STD, SiteDistribution
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.site_states import SiteState
 
-__all__ = ["PAGE_FILE", "head_content", "write_landmark_page"]
-
 PAGE_FILE = "landmarks.html"
 
 

@@ -58,15 +58,6 @@ from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import joined_surface
 
-__all__ = [
-    "WrittenPrediction",
-    "WrittenResults",
-    "optional_pictures",
-    "write_case_report",
-    "write_report_page",
-    "write_results",
-]
-
 _log = logging.getLogger(__name__)
 
 # Predictions, or what gives them and calls a function with the muscles before it solves any.

@@ -16,8 +16,6 @@ from cmfsim.errors import CaseError, CaseInputError
 from cmfsim.pictures.canvas import NO_OPENGL, Picture, pyvista_module, without_probe
 from cmfsim.processes.parallel import Worker
 
-__all__ = ["Painter", "draw_packed", "load"]
-
 
 class Painter:
     """A process that draws pictures one after another while the caller continues.

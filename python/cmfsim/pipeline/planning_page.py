@@ -7,8 +7,6 @@ from pathlib import Path
 from cmfsim.io import replacing
 from cmfsim.planning.page import PageContent, page_text
 
-__all__ = ["PAGE_FILE", "page_state", "write_planning_page"]
-
 PAGE_FILE = "plan.html"
 STATE = re.compile(rb'<meta name="cmfsim-made-for" content="([0-9a-f]{64})">')
 # The state stands before the style and scripts.

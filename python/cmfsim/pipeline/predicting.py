@@ -20,15 +20,6 @@ from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
 
-__all__ = [
-    "build_patient",
-    "case_for_models",
-    "named_models",
-    "predict",
-    "predict_models",
-    "predictions_of",
-]
-
 _log = logging.getLogger(__name__)
 
 

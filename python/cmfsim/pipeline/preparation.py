@@ -10,8 +10,6 @@ from cmfsim.io import Case
 from cmfsim.io.results.prediction_schema import is_prediction_file
 from cmfsim.pipeline.building.inputs import check_output
 
-__all__ = ["check_extras", "prepare"]
-
 _log = logging.getLogger(__name__)
 
 

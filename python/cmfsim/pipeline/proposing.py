@@ -22,16 +22,6 @@ from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "BY_SHAPE",
-    "ProposedHead",
-    "head_surfaces",
-    "propose_landmarks",
-    "proposed_head",
-    "read_template_head",
-    "unproposed_head",
-]
-
 # Surfaces that are made at a time.
 SURFACES_AT_ONCE = 2
 # The finding of a segmentation that separated the jaws without landmarks.

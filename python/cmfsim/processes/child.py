@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 
 from cmfsim import errors
 
-__all__ = ["Answer", "ReadLimits", "ReaderError", "read_in_child", "serve"]
-
 # The child's program: it finds the same modules as its parent, and nothing else is run.
 PROGRAM = (
     "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.readline());"

@@ -6,8 +6,6 @@ from typing import Any
 
 from cmfsim.errors import CaseInputError, third_party
 
-__all__ = ["on_cluster"]
-
 # How long a scheduler may take to answer, s.
 ANSWER_TIME = 10.0
 

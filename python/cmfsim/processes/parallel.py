@@ -21,8 +21,6 @@ from cmfsim import errors
 from cmfsim.errors import CaseError
 from cmfsim.processes.cluster import on_cluster
 
-__all__ = ["Worker", "answer_alone", "answers", "serve"]
-
 # The child's program: it finds the same modules as its parent, and nothing else is run.
 PROGRAM = (
     "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.readline());"

@@ -10,8 +10,6 @@ from cmfsim._core import ThinPlateSpline
 from cmfsim.errors import LandmarkInputError
 from cmfsim.values.checks import Floats, as_rows, frozen
 
-__all__ = ["LandmarkAgreement", "leave_one_out"]
-
 # Landmarks of which four are left when one is taken away.
 LEAST_LANDMARKS = 5
 # Share of a landmark's place that the others' affine map must not need it for.

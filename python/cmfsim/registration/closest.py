@@ -8,8 +8,6 @@ from cmfsim import _core
 from cmfsim._core import IcpFit, Surface
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["icp"]
-
 
 def icp(  # noqa: PLR0913 (options by name)
     moving: ArrayLike | Surface | SurfaceData,

@@ -9,8 +9,6 @@ from cmfsim.errors import LandmarkError, RegistrationError
 from cmfsim.registration.agreement import LandmarkAgreement, leave_one_out
 from cmfsim.values.checks import Floats
 
-__all__ = ["CommonShift", "common_shift", "mirror_agreement", "swapped_names"]
-
 # What the bending of the spline falls to if two exchanged names are exchanged back, as a share. On
 # two real and fourteen synthetic heads no exchange of a correct set gave less than 1, and each of
 # the 496 of a wrong one less than 0.8.

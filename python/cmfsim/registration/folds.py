@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike
 from cmfsim._core import ThinPlateSpline
 from cmfsim.values.checks import Floats, as_rows
 
-__all__ = ["FoldReport", "fold_report"]
-
 
 @dataclass(frozen=True, eq=False)
 class FoldReport:

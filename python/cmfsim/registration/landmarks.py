@@ -13,8 +13,6 @@ from cmfsim.values.checks import Floats, frozen
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 
-__all__ = ["LandmarkMatch", "match_landmarks"]
-
 # Landmarks that a spline needs.
 LEAST_LANDMARKS = 4
 # Landmarks nearer than this to one another are one that was named twice, mm.

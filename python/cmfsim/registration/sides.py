@@ -8,8 +8,6 @@ from cmfsim._core import rigid_fit
 from cmfsim.errors import RegistrationError
 from cmfsim.values.checks import Floats
 
-__all__ = ["side_pairs", "side_vectors", "swapped_pairs", "wrong_sides"]
-
 # A landmark closer to the middle than this does not distinguish left from right, mm.
 SIDE_MARGIN = 3.0
 # Distance to the partner of the other side over that to the own one below which sides are swapped.

@@ -4,8 +4,6 @@ import numpy as np
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["robust_similarity"]
-
 # Rounds of weights.
 ROUNDS = 30
 

@@ -17,8 +17,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 
-__all__ = ["PLACED_STD", "SiteDistribution", "SiteKey", "site_covariance", "write_family"]
-
 FILE = "site_family.npz"
 # Share of the family's variance that its stored modes have.
 KEPT_VARIANCE = 0.999

@@ -5,8 +5,6 @@ from typing import Any
 
 from cmfsim.report.document import NOTHING, Figure, Note, Section, Table, number
 
-__all__ = ["band_section"]
-
 Values = Mapping[str, Any]
 # Sources listed by region, those with the largest effect first.
 MOST_SOURCES = 12

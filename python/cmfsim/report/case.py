@@ -12,8 +12,6 @@ from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import counted, grouped
 
-__all__ = ["case_document", "statistics_table"]
-
 Values = Mapping[str, Any]
 
 MODEL_NAMES: Mapping[str, str] = {

@@ -5,8 +5,6 @@ from typing import Any
 
 from cmfsim.report.document import Note, Table, number
 
-__all__ = ["not_operated_blocks", "statistics_table", "thickness_blocks"]
-
 Values = Mapping[str, Any]
 
 

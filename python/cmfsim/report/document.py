@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 
 from cmfsim.errors import CaseInputError
 
-__all__ = ["Alert", "Document", "Figure", "Note", "Section", "Table", "number", "plain_line"]
-
 # Stands where there is no figure.
 NOTHING = "–"
 

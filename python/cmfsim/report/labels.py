@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping
 
-__all__ = ["MEASURES", "MESH", "MUSCLES", "labelled"]
-
 # How a distance between skins was measured, by the method of `compare_skins`.
 MEASURES: Mapping[str, str] = {
     "landmarks": "from the corresponding point given by a spline through the skin landmarks, as "

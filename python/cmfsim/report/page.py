@@ -6,8 +6,6 @@ from importlib.resources import files
 from cmfsim.errors import third_party
 from cmfsim.report.document import Document, Figure, Note, Table
 
-__all__ = ["render_page"]
-
 DISCLAIMER = "Research software, not a medical device. Not for diagnosis or treatment decisions."
 
 

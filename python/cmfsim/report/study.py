@@ -17,8 +17,6 @@ from cmfsim.report.document import (
 )
 from cmfsim.report.labels import MEASURES
 
-__all__ = ["PAPER_AVERAGES", "study_document", "table3_text"]
-
 Values = Mapping[str, Any]
 
 # Mean errors over the four patients of Kim et al. (2010), Table 3, mm, and those of model M+S by

@@ -6,8 +6,6 @@ from typing import Any
 from cmfsim.evaluation import LEAST_PAIRS, NO_CHANGE, REGIONS, WHOLE
 from cmfsim.report.document import NOTHING, Alert, Document, Note, Section, Table, plain_line
 
-__all__ = ["variants_document", "variants_markdown", "variants_text"]
-
 Values = Mapping[str, Any]
 # Variant, model, region and patient of an error.
 Key = tuple[str, str, str, str]

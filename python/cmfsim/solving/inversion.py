@@ -7,8 +7,6 @@ from cmfsim._core import MassTensors
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["inversion_finding", "least_volume_ratios"]
-
 
 def least_volume_ratios(tensors: MassTensors, displacements: ArrayLike) -> Floats:
     """The smallest volume of each tet over that at rest, (m,): zero or less where it is inverted.

@@ -22,8 +22,6 @@ from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.scene import Scene, SegmentData
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["SolvedPatient", "model_scene", "predict_patient", "solved_patient"]
-
 
 def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     """The scene of a patient under one of the paper's four models.

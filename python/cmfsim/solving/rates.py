@@ -23,8 +23,6 @@ from cmfsim.values.scene import Scene
 from cmfsim.values.surface_data import MovedSurface
 from cmfsim.values.uncertainty import PLAN, TISSUE, Source
 
-__all__ = ["ACCURACY", "SkinRates", "scene_parts", "skin_rates", "tissue_load"]
-
 # Difference of forces, in standard deviations: small enough for its error of first order to be
 # 1e-4 of it, far above rounding. Downwards, away from ν = 0.5 and from a fraction of 1.
 STEP = -1e-4

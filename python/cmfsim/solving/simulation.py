@@ -24,8 +24,6 @@ from cmfsim.values.scene import Scene, SceneResult
 from cmfsim.values.surface_data import MovedSurface
 from cmfsim.values.tissue_data import TissueData
 
-__all__ = ["scene_plan", "scene_solver", "solve_scene", "solved_scene"]
-
 _log = logging.getLogger(__name__)
 
 

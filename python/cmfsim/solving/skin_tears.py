@@ -6,8 +6,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["tear_finding"]
-
 # Skin fails in tension at a stretch of about 1.5 (Ní Annaidh et al. 2012: 54 % ± 17 % at failure).
 MOST_STRETCH = 1.5
 # Edges that lengthen by less, mm, and triangles of less area, mm², are too small to be seen.

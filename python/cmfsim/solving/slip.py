@@ -10,8 +10,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.scene import Scene
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["slip_finding"]
-
 # Of 60 random plans of two real heads, one in thirty has a node that slips further than this
 # multiple of what bones moved: a node that went round an edge of the bone.
 MOST_SLIP = 1.25

@@ -13,8 +13,6 @@ from cmfsim.values.moduli import PRESET_MODULI, FatModuli
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.tissue_data import TissueData
 
-__all__ = ["TissueParts", "tissue_parts"]
-
 
 @dataclass(frozen=True, eq=False)
 class TissueParts:

@@ -23,8 +23,6 @@ from cmfsim.io.results.skin_errors import skin_errors_file
 from cmfsim.pipeline.evaluating import evaluation_key
 from cmfsim.processes.cluster import on_cluster
 
-__all__ = ["CaseJob", "CaseOutcome", "StudyOptions", "StudyReport", "run_studies", "run_study"]
-
 # Lines of a failed case's log that are shown.
 SHOWN_LINES = 12
 LOG_FILE = "log.txt"

@@ -15,14 +15,6 @@ from cmfsim.report import Figure, study_document
 from cmfsim.report.study import table3_text
 from cmfsim.study.cohort import StudyReport
 
-__all__ = [
-    "FIGURE_9_FILE",
-    "FIGURE_10_FILE",
-    "TABLE_3_FILE",
-    "study_table",
-    "write_study_report",
-]
-
 STUDY_FILE, TABLE_FILE, TABLE_3_FILE = "study.json", "study.csv", "table3.md"
 FIGURE_9_FILE, FIGURE_10_FILE = "figure9.png", "figure10.png"
 STUDY_FILES = re.compile(r"study\.(json|csv)|table3\.md|figure(9|10(-\d+)?)\.png|report\.html")

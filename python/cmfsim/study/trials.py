@@ -22,8 +22,6 @@ from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.progress import Progress
 
-__all__ = ["LandmarkTrial", "SensitivityReport", "landmark_trials", "sensitivity"]
-
 # Standard deviation of a landmark's place along each axis that moves the masseter by the 2 mm of
 # the paper's three trials, mm.
 LANDMARK_SD = 2.0

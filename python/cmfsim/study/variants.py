@@ -20,8 +20,6 @@ from cmfsim.report.variants import variants_document, variants_markdown, variant
 from cmfsim.study.cohort import CaseOutcome, StudyOptions, StudyReport, run_studies
 from cmfsim.study.outputs import study_table
 
-__all__ = ["VariantsReport", "run_variants", "write_variants_report"]
-
 _log = logging.getLogger(__name__)
 
 VARIANTS_JSON, VARIANTS_CSV, VARIANTS_TEXT = "variants.json", "variants.csv", "variants.md"

@@ -24,8 +24,6 @@ from cmfsim.pipeline.outputs import write_results
 from cmfsim.pipeline.predicting import case_for_models
 from cmfsim.pipeline.preparation import prepare
 
-__all__ = ["main"]
-
 _log = logging.getLogger(__name__)
 
 

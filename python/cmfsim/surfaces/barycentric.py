@@ -6,8 +6,6 @@ from numpy.typing import ArrayLike
 from cmfsim._core import Surface
 from cmfsim.values.checks import Floats
 
-__all__ = ["at_closest", "barycentric"]
-
 
 def barycentric(corners: Floats, points: Floats) -> Floats:
     """The weights of each triangle's corners at a point in its plane, (k, 3).

@@ -5,8 +5,6 @@ from numpy.typing import NDArray
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["cap_loop"]
-
 Integers = NDArray[np.int64]
 
 # An ear whose area is below this share of the loop's squared extent is cut off only if no other is

@@ -15,15 +15,6 @@ from cmfsim.surfaces.topology import Edges, component_labels, edges_of, orientat
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "BorderLoop",
-    "Component",
-    "SurfaceReport",
-    "border_loops",
-    "check_extent",
-    "check_surface",
-]
-
 # Largest coordinate for which areas and volumes stay finite, mm.
 MAX_COORDINATE = 1e90
 

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["crossing_pairs"]
-
 Integers = NDArray[np.int64]
 
 # Width of a cell, in mean sizes of a triangle.

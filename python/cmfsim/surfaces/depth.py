@@ -10,8 +10,6 @@ from cmfsim.errors import MeshInputError
 from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["MOST_DEPTH", "moved_outward", "tissue_depth"]
-
 # Beyond this the closest bone is not below the skin but beside what was segmented, mm: the thickest
 # soft tissue of the face, in front of the masseter, is about 25 mm (De Greef et al. 2006).
 MOST_DEPTH = 30.0

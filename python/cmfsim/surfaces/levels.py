@@ -18,15 +18,6 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "SurfaceOptions",
-    "block_of",
-    "contact_surface",
-    "detailed_surface",
-    "simplified_surface",
-    "surface_of_level",
-]
-
 _log = logging.getLogger(__name__)
 
 # Taubin (1995): a shrinking step and a slightly larger growing one, which keep the volume.

@@ -21,8 +21,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["INNER_WALL", "RepairOptions", "clean_surface", "repair_surface"]
-
 Integers = NDArray[np.int64]
 
 

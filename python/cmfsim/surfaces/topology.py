@@ -7,15 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Edges",
-    "component_labels",
-    "connected_labels",
-    "edges_of",
-    "orientation_flips",
-    "tet_bodies",
-]
-
 Integers = NDArray[np.int64]
 
 # The cube of fewer items is a long integer.

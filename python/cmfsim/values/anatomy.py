@@ -21,11 +21,6 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "Anatomy",
-    "BoneSegment",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Anatomy(Frozen):

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from cmfsim.errors import CalibrationError
 from cmfsim.values.calibration import Calibration
 
-__all__ = ["BandOptions"]
-
 
 @dataclass(frozen=True)
 class BandOptions:

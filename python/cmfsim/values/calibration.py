@@ -14,8 +14,6 @@ from cmfsim.errors import CalibrationError
 from cmfsim.values.checks import Floats, as_number, as_text, check_one_of
 from cmfsim.values.model_names import MODELS
 
-__all__ = ["BandFactor", "Calibration", "CalibrationCase", "settings_digest"]
-
 
 def settings_digest(settings: Mapping[str, Any]) -> str:
     """The SHA-256 of plain values, whatever the order of their names.

@@ -19,29 +19,6 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.moduli import TissueModuli
 from cmfsim.values.tissue_data import DEFAULT_PRESET
 
-__all__ = [
-    "BAND_COVERAGE",
-    "CUT_UP",
-    "DIRECTIONS",
-    "FRAMES",
-    "LIP_CONTACT",
-    "LIP_DEPTH",
-    "LIP_HEIGHT",
-    "LIP_SEAMS",
-    "PROCEDURES",
-    "UNITS",
-    "CaseBand",
-    "CaseImage",
-    "CaseLandmarks",
-    "CaseLips",
-    "CaseMesh",
-    "CaseMotion",
-    "CaseMuscles",
-    "CaseOsteotomy",
-    "CasePostoperative",
-    "CaseSurfaces",
-]
-
 # Units that a surface file may be in, and their length in mm.
 UNITS: Mapping[str, float] = MappingProxyType(
     {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "inch": 25.4}

@@ -10,8 +10,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, as_direction, as_point, as_rows
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["Plane", "Region"]
-
 # Distance of the posterior plane behind the roots of the zygomatic arches, mm: behind the whole
 # ramus and its joint, so that the jaw moves inside tissue, and before the mastoid and neck.
 POSTERIOR_DEPTH = 10.0

@@ -9,25 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 
-__all__ = [
-    "Floats",
-    "Indices",
-    "as_direction",
-    "as_floats",
-    "as_index_rows",
-    "as_indices",
-    "as_number",
-    "as_point",
-    "as_positive",
-    "as_rows",
-    "as_text",
-    "as_unmasked",
-    "check_instance",
-    "check_one_of",
-    "frozen",
-    "nearest",
-]
-
 Floats = NDArray[np.float64]
 Indices = NDArray[np.uint32]
 

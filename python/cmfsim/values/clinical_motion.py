@@ -24,8 +24,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.motion import decompose_motion, rigid_motion
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["ClinicalMotion", "clinical_motion", "plan_lines", "planned_motion"]
-
 # Below this, mm and degrees, a motion is rounding of none.
 NOTHING = 1e-6
 # What prints as 0.0, mm and degrees, is left out beside larger parts.

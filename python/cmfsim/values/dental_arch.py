@@ -13,8 +13,6 @@ from cmfsim.values.checks import (
 )
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["JAWS", "LEAST_ARCH", "SHEET_DEPTH", "DentalArch"]
-
 JAWS = ("upper", "lower")
 # Half the width, and the length, of the smallest arch, mm: less is landmarks exchanged or in cm.
 LEAST_ARCH = 2.0

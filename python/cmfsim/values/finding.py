@@ -8,8 +8,6 @@ from typing import Any
 from cmfsim.values.checks import as_text, check_one_of
 from cmfsim.values.finding_table import FINDING_KINDS, FORMER_CODES, filled
 
-__all__ = ["SEVERITIES", "Finding", "OnFindings"]
-
 SEVERITIES = ("error", "warning", "note")
 
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from cmfsim.values.finding import SEVERITIES, Finding
 
-__all__ = ["FindingGroup", "counted", "grouped"]
-
 # What several findings of one code have in common. Others are stated by the worst of them.
 TITLES: Mapping[str, str] = {
     "muscle-does-not-fit": "{n} muscles partly outside the tissue",

@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-__all__ = ["FINDING_KINDS", "FORMER_CODES", "FindingKind", "filled"]
-
 # What is filled in: a name, and how it is written.
 BLANK = re.compile(r"\{(\w+)(?:!r)?(?::[^}]*)?\}")
 

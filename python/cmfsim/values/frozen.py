@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Frozen", "frozen_mapping"]
-
 
 class Frozen:
     """Base of values whose arrays are still read-only after a pickle or a deep copy."""

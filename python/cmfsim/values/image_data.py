@@ -16,8 +16,6 @@ from cmfsim.values.checks import (
 )
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["ImageData"]
-
 # Points that are looked up at a time.
 AT_A_TIME = 8192
 

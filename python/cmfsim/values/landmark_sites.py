@@ -7,21 +7,6 @@ from types import MappingProxyType
 
 from cmfsim.errors import LandmarkInputError
 
-__all__ = [
-    "CEPHALOMETRY",
-    "JAW_SITES",
-    "SKIN_LANDMARKS",
-    "SKIN_SITES",
-    "SKULL_LANDMARKS",
-    "CephalometricSite",
-    "is_lower_site",
-    "label_key",
-    "named_site",
-    "short_name",
-    "site_labels",
-    "site_part",
-]
-
 # The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
 # in its text, so the choice is ours.
 SKIN_LANDMARKS = (

@@ -14,8 +14,6 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.scene import SegmentData
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["LiftedTissue"]
-
 Plan = Mapping[str, ArrayLike | MovedSurface]
 
 

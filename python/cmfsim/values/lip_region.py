@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from cmfsim.values.checks import frozen
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["LIPS", "LipRegion"]
-
 LIPS = ("upper", "lower")
 
 

@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-__all__ = ["BINS", "MeshReport"]
-
 # Bins of the histogram of smallest dihedral angles, degrees; a regular tet has 70.5.
 BINS = tuple(float(angle) for angle in range(0, 80, 5))
 

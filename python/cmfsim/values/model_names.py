@@ -1,7 +1,5 @@
 """The names of the paper's four models."""
 
-__all__ = ["MODELS"]
-
 # Kim et al. 2010, section 3.2: homogeneous or with muscles, without or with sliding at teeth and
 # mucosa.
 MODELS = ("H", "M", "H+S", "M+S")

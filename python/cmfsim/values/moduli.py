@@ -10,16 +10,6 @@ from cmfsim.values.checks import as_number, as_text, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.tissue_data import TissueData
 
-__all__ = [
-    "MOST_POISSON",
-    "PRESET_MODULI",
-    "YOUNG_RANGE",
-    "FatModuli",
-    "MuscleModuli",
-    "TissueModuli",
-    "moduli_unusual",
-]
-
 # Young's moduli that a muscle or fat may have, MPa: from a thousandth of the softest fat that was
 # measured to that of tendon. The largest ratio, 1e9, is far from where rounding makes a stiffness
 # indefinite.

@@ -12,8 +12,6 @@ from cmfsim.values.checks import (
 )
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["NODE_KINDS", "NodeKinds"]
-
 # Kinds of node (paper 2.5), by the number that files hold.
 NODE_KINDS = ("free", "fixed", "joined", "sliding")
 

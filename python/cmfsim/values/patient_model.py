@@ -27,8 +27,6 @@ from cmfsim.values.tissue_data import TissueData
 if TYPE_CHECKING:
     from cmfsim.values.musculature import Musculature
 
-__all__ = ["PatientModel"]
-
 
 @dataclass(frozen=True, eq=False)
 class PatientModel(Frozen):

@@ -8,8 +8,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.site_states import SiteState
 
-__all__ = ["ProposedLandmarks", "ProposedSite"]
-
 
 @dataclass(frozen=True, eq=False)
 class ProposedSite:

@@ -11,8 +11,6 @@ import numpy as np
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["REFERENCE_PLACES"]
-
 _SKULL_MIDLINE: Mapping[str, tuple[float, float, float]] = {
     "glabella": (0.0, -93.5, 43.2),
     "infradentale": (0.0, -89.8, -53.5),

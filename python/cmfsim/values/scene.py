@@ -36,12 +36,6 @@ from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TissueData
 from cmfsim.values.touching import ObstacleData, TouchingData
 
-__all__ = [
-    "Scene",
-    "SceneResult",
-    "SegmentData",
-]
-
 CONFLICTS = ("error", "resolve")
 
 DEFAULT_OPTIONS = SolverOptions()

@@ -3,16 +3,6 @@
 import re
 from dataclasses import dataclass
 
-__all__ = [
-    "CLEARED_SHARE",
-    "GOOD_ERROR",
-    "MOST_ERROR",
-    "ORIGINS",
-    "SURFACE_REACH",
-    "SiteState",
-    "site_state",
-]
-
 # A missing or doubtful site whose expected error has fallen to this, mm, need not be placed.
 GOOD_ERROR = 4.0
 # And a doubt is lifted only if placed sites have lowered the expected error to this share of it:

@@ -14,8 +14,6 @@ from cmfsim.values.calibration import BandFactor, settings_digest
 from cmfsim.values.checks import Floats
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["WHOLE_FACE", "SkinBand"]
-
 # The region that holds the others: what lies in none of them has its factor.
 WHOLE_FACE = "face"
 

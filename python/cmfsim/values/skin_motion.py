@@ -13,8 +13,6 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Attachment", "SkinEnd", "attachment", "carried_points", "skin_end"]
-
 # A point up to so many edges from the mesh's skin follows it fully.
 FOLLOWS = 2.0
 # Beyond, its movement fades over this distance, mm: over so much the skin of cheek and neck

@@ -10,8 +10,6 @@ from cmfsim.values.checks import (
     check_one_of,
 )
 
-__all__ = ["CONTACTS", "SolverOptions"]
-
 CONTACTS = ("bilateral", "unilateral")
 
 

@@ -13,8 +13,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, Indices, as_index_rows, as_number, as_rows
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["MovedSurface", "SurfaceData", "joined_surface"]
-
 
 @dataclass(frozen=True, eq=False)
 class SurfaceData(Frozen):

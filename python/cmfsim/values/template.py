@@ -15,8 +15,6 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.musculature import MuscleSurface, Musculature
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["TemplateData", "as_landmarks", "is_template_name"]
-
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]{0,63}")
 
 

@@ -17,8 +17,6 @@ from cmfsim.values.checks import (
 )
 from cmfsim.values.frozen import Frozen
 
-__all__ = ["DEFAULT_PRESET", "MIXINGS", "TISSUE_ARRAYS", "TISSUE_OPTIONAL", "TissueData"]
-
 # Arrays that each kind of tissue needs, with the number of axes after the first.
 TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(
     {

@@ -9,8 +9,6 @@ from cmfsim.values.checks import Indices, as_index_rows, as_indices, as_text, ch
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["ObstacleData", "TouchingData"]
-
 
 @dataclass(frozen=True, eq=False)
 class TouchingData(Frozen):

@@ -10,8 +10,6 @@ from typing import Any
 
 from cmfsim.values.checks import as_positive
 
-__all__ = ["ADDED", "NOT_COVERED", "PLAN", "TISSUE", "Source", "band_sources"]
-
 
 @dataclass(frozen=True)
 class Source:

@@ -21,8 +21,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["CutBones", "CutOptions", "cut_bones", "segments_from_surfaces"]
-
 Levels = NDArray[np.float32]
 # The upper jaw's cuts come before the lower's, the larger piece before the one inside it.
 ORDER = {"le_fort_3": 0, "le_fort_1": 1, "bsso": 2, "genioplasty": 3}

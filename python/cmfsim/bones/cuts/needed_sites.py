@@ -17,8 +17,6 @@ from cmfsim.values.landmark_sites import is_lower_site
 from cmfsim.values.motion import carried
 from cmfsim.values.reference_places import REFERENCE_PLACES
 
-__all__ = ["NEEDED", "PLACING", "with_missing_sites"]
-
 # The sites of each procedure. Nasion is not among those of Le Fort I: it would only state which
 # side of the plane of the upper teeth is up.
 NEEDED: Mapping[str, tuple[str, ...]] = MappingProxyType(

@@ -15,8 +15,6 @@ from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["part_segment"]
-
 # Beyond this distance from the box round a smaller piece, mm, bone belongs to the largest: the
 # hollows of a jaw reach no further over its surface.
 BESIDE = 15.0

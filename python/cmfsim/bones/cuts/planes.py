@@ -13,8 +13,6 @@ from cmfsim.values.checks import Floats, as_direction, as_point, as_rows, as_tex
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["Cut", "CuttingPlane", "Procedure", "free_cut"]
-
 
 @dataclass(frozen=True, eq=False)
 class CuttingPlane:

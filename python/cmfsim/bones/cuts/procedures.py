@@ -21,8 +21,6 @@ from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 
-__all__ = ["PROCEDURES", "place_procedure", "procedure_options"]
-
 # How far roots reach beyond the bone landmark of their arch, mm, after Wheeler's mean root lengths
 # (Nelson, Dental Anatomy): upper canine 17 with its neck 1 above that of the incisors, upper second
 # molar 11 above the alveolar bone point, lower canine 16 with its neck 1 below and 1 for its lean.

@@ -12,8 +12,6 @@ from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["AlongSurface"]
-
 # The least area of a vertex, mm²: one of triangles without area weighs next to nothing.
 LEAST_AREA = 1e-9
 # Error of averages from polynomials that are left out, as a share of the largest value.

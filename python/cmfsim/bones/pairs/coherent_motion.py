@@ -28,8 +28,6 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["CoherentMotion", "RigidPiece", "coherent_motion"]
-
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 

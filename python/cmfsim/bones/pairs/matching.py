@@ -15,8 +15,6 @@ from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.values.checks import Floats, as_number, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["MatchOptions", "lay_on"]
-
 _LOG = logging.getLogger(__name__)
 
 # Points of the quick search for a start, and its steps from each candidate.

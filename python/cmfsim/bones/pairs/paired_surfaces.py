@@ -27,8 +27,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["PairedShape", "paired_shape"]
-
 # A vertex lies on the post-operative bone if it is this near, mm: the surface of each of the two
 # scans is accurate to half a millimetre.
 LIES = 1.0

@@ -18,8 +18,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["PASSES", "QUIET", "PairedBone", "median", "rigid_pieces"]
-
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 

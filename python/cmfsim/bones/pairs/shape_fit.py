@@ -17,17 +17,6 @@ from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "LEAST_SIGMA",
-    "OPEN",
-    "TO_SIGMA",
-    "TUKEY",
-    "OpenDirection",
-    "ShapeFit",
-    "fit_shape",
-    "vertex_areas",
-]
-
 # Tukey's constant, with which the biweight is 95 % as efficient as least squares on normal noise,
 # and what makes the median of absolute values a standard deviation (Huber 1981).
 TUKEY, TO_SIGMA = 4.685, 1.4826

@@ -17,8 +17,6 @@ from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["LEAST_STRAY", "REACH", "StrayPatch", "stray_patches"]
-
 # A vertex is off if it lies further from the bone than this, mm, three times the accuracy of a
 # segmented bone, and than this many times the rms of the fit: noise does so to 1 vertex in 10 000.
 OFF, OFF_RMS = 1.5, 4.0

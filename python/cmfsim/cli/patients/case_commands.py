@@ -30,8 +30,6 @@ _log = logging.getLogger(__name__)
 # What the planning page states of the case that a plan was made for.
 MADE_FOR = re.compile(r"^# made for: ([0-9a-f]{64})\s*$", re.MULTILINE)
 
-__all__ = ["build", "case_of", "checked", "doctor", "print_findings"]
-
 
 def doctor(options: argparse.Namespace) -> int:
     """Reports the problems of a case; the exit code is bad input if any is an error."""

@@ -18,8 +18,6 @@ from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.values.prediction import Prediction
 
-__all__ = ["DEMO_FOLDER", "DEMO_MODELS", "demo"]
-
 DEMO_FOLDER = Path("cmfsim-demo")
 # Without muscles or sliding, with muscles, with both.
 DEMO_MODELS = ("H", "M", "M+S")

@@ -11,8 +11,6 @@ from cmfsim.planning.face_planning import PointTarget, SurfaceTarget, Target
 from cmfsim.planning.replanning import PlanningModel
 from cmfsim.values.landmark_sites import label_key
 
-__all__ = ["TARGET_STD", "read_targets"]
-
 SURFACES = (".stl", ".ply", ".obj", ".vtp")
 LANDMARKS = (".json", ".fcsv")
 # Tolerance of a point of the face, mm.

@@ -8,8 +8,6 @@ from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.text.terminal import StageProgress, escaped
 from cmfsim.drafting import CASE_FILE, init_case
 
-__all__ = ["init"]
-
 
 def init(options: argparse.Namespace) -> int:
     """Writes the case file, and reports the role assumed for each file."""

@@ -34,8 +34,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import short_name
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 
-__all__ = ["landmarks"]
-
 PICTURE = "landmarks.png"
 FILES = {"skull": "skull_landmarks.mrk.json", "skin": "skin_landmarks.mrk.json"}
 

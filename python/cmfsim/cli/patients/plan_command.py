@@ -39,8 +39,6 @@ from cmfsim.planning.replanning import (
 )
 from cmfsim.planning.server import open_port, serve_planning
 
-__all__ = ["TRIALS", "plan"]
-
 # Name of the plan for a desired face, and the file to which it is saved.
 TOWARDS, PLAN_FILE = "Towards", "towards.toml"
 # Plans that are solved exactly to measure the error of the page.

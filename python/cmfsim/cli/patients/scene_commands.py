@@ -19,8 +19,6 @@ from cmfsim.solving.simulation import solve_scene
 from cmfsim.values.finding import Finding
 from cmfsim.values.scene import Scene
 
-__all__ = ["info", "solve"]
-
 
 def solve(options: argparse.Namespace) -> int:
     """Solves a scene and writes its result."""

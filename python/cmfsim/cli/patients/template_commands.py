@@ -25,8 +25,6 @@ from cmfsim.pictures import picture_muscles
 from cmfsim.values.finding import SEVERITIES, Finding
 from cmfsim.values.musculature import Musculature
 
-__all__ = ["check", "import_atlas", "list_templates", "morph", "show"]
-
 # Landmarks that the table of a morph shows: those that disagree most with the others.
 WORST_SHOWN = 5
 

@@ -16,8 +16,6 @@ from cmfsim.io.results.predictions import predictions_of
 from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
-__all__ = ["parts_of", "view"]
-
 MUSCLE_COLOUR = "#b8564b"
 SURFACES = (".stl", ".ply", ".obj", ".vtp")
 # Bones show through the skin.

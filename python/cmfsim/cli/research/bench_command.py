@@ -24,8 +24,6 @@ from cmfsim.lab.frontier.table import GRID, base_verdict
 from cmfsim.lab.virtual.phantom_case import write_phantom_case
 from cmfsim.phantom import make_head
 
-__all__ = ["FRONTIER_FOLDER", "frontier"]
-
 FRONTIER_FOLDER = Path("cmfsim-frontier")
 # Voxel size of the synthetic head's CT, mm.
 PHANTOM_SPACING = 1.0

@@ -6,8 +6,6 @@ import sys
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.lab.benchmark import run_benchmark
 
-__all__ = ["benchmark"]
-
 
 def benchmark(options: argparse.Namespace) -> int:
     """Makes the package's own entries, and scores all that are there."""

@@ -10,8 +10,6 @@ from cmfsim.lab.virtual.phantom_case import write_phantom_case
 from cmfsim.phantom import HeadParameters, make_head
 from cmfsim.values.checks import as_positive
 
-__all__ = ["phantom"]
-
 
 def phantom(options: argparse.Namespace) -> int:
     """Writes the case of a synthetic head: CT, landmarks and case file."""

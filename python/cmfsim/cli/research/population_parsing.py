@@ -10,8 +10,6 @@ from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.lab.virtual.population import TRUTHS
 from cmfsim.values.model_names import MODELS
 
-__all__ = ["add_population_commands"]
-
 
 def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     """Adds both commands."""

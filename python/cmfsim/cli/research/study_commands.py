@@ -35,8 +35,6 @@ from cmfsim.study.variants import run_variants, write_variants_report
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 
-__all__ = ["achieved_text", "evaluate", "models_of", "predict", "report", "sensitivity", "study"]
-
 
 def models_of(given: Sequence[str] | None, default: Sequence[str]) -> tuple[str, ...]:
     """The models given to a command, in the paper's order."""

@@ -13,8 +13,6 @@ from cmfsim.lab.virtual import virtual_patients as write_patients
 from cmfsim.lab.virtual.patient_folder import PATIENTS_WITH_JOINED_LIPS
 from cmfsim.lab.virtual.population import OWN
 
-__all__ = ["virtual_patients"]
-
 
 def virtual_patients(options: argparse.Namespace) -> int:
     """Writes virtual patients: the case before, the truth after the operation."""

@@ -5,8 +5,6 @@ from typing import Any
 
 from cmfsim.cli.text.terminal import escaped
 
-__all__ = ["band_lines"]
-
 
 def band_lines(band: Mapping[str, Any] | None) -> list[str]:
     """The band of a prediction and its reliability; no lines if there is no band.

@@ -7,8 +7,6 @@ from typing import Any
 from cmfsim.cli.text.terminal import escaped
 from cmfsim.values.mesh_report import MeshReport
 
-__all__ = ["WIDTH", "build_text"]
-
 # Columns of the text in a pipe, and at most on a terminal.
 WIDTH = 100
 # Columns before the values, as in the lines of `MeshReport.as_text`.

@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["not_operated_line", "thickness_lines"]
-
 
 def not_operated_line(found: Mapping[str, Any] | None) -> str:
     """The error where nothing was operated on.

@@ -9,8 +9,6 @@ from cmfsim.cli.text.terminal import CLEAR_LINE, escaped, in_colour
 from cmfsim.values.finding import Finding
 from cmfsim.values.finding_groups import FindingGroup, counted, grouped
 
-__all__ = ["FindingsError", "Notices"]
-
 # ANSI colours of what is printed.
 COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}
 

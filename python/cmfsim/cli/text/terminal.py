@@ -12,17 +12,6 @@ from typing import TextIO
 
 from cmfsim.errors import error_text
 
-__all__ = [
-    "CLEAR_LINE",
-    "ProgressHandler",
-    "StageProgress",
-    "columns",
-    "escaped",
-    "in_colour",
-    "print_error",
-    "spell_out",
-]
-
 # Back to the start of the line and erase it.
 CLEAR_LINE = "\r\x1b[K"
 # Time between two updates of the line that shows the stage, s.

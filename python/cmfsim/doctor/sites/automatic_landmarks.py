@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.values.finding import Finding
 
-__all__ = ["check_automatic"]
-
 
 def check_automatic(evidence: Evidence) -> Iterator[Finding]:
     """A note for a case without landmarks, with the checks that are left to the build."""

@@ -23,14 +23,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.reference_places import REFERENCE_PLACES
 
-__all__ = [
-    "LANDMARK_CODES",
-    "Nearest",
-    "check_landmarks",
-    "nearest_of_level",
-    "nearest_of_surfaces",
-]
-
 # The closest points on a surface of (n, 3) points, mm.
 Nearest = Callable[[Floats], Floats]
 

@@ -21,8 +21,6 @@ from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["check_placement"]
-
 # Longest extent of a skin surface from a face mask to a head with neck, mm.
 SKIN_EXTENT = (110.0, 420.0)
 # Longest extents that other units give a head, and their name; normalised to 1 or to −1…1.

@@ -4,8 +4,6 @@ import numpy as np
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["direction_text", "place_text", "shift_text"]
-
 # A direction is named by its largest component, and by another that is at least this share of it.
 NAMED_SHARE = 0.6
 # Components of a shift that are named: at least this share of the largest.

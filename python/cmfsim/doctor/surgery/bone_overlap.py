@@ -14,8 +14,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
-__all__ = ["BonePart", "check_jaws", "jaw_of"]
-
 # How much deeper than before bone of one jaw may lie within that of the other, mm: planned bites
 # overlap by some tenths, for scans blur teeth.
 OVERLAPS = 1.0

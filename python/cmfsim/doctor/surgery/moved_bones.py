@@ -16,8 +16,6 @@ from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
-__all__ = ["check_moved", "check_pairs"]
-
 # A bone whose vertices all move less than this was not moved, mm: rounding in a surface file.
 STILL = 1e-4
 # A motion that leaves less than this of its vertices' own, mm RMS, was computed, not measured.

@@ -28,8 +28,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["check_against_skin", "check_cuts", "check_plan", "pieces_of", "vertices_of"]
-
 # Depth by which a moved bone may pass the undeformed skin before it is reported, mm: skin goes with
 # the bone, and an ordinary advancement exceeds the thickness of tissue over the piriform rim.
 THROUGH_SKIN = 2.0

@@ -9,8 +9,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["state_plan"]
-
 # A bone whose vertices deviate by less than this from a rigid motion, mm RMS, was not cut.
 BENT = 0.5
 

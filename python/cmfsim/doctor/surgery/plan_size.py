@@ -11,17 +11,6 @@ from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import decompose_motion
 
-__all__ = [
-    "FAR",
-    "TOO_FAR",
-    "SizedMotion",
-    "check_motion_size",
-    "check_tiny",
-    "check_turn",
-    "check_typed",
-    "nothing_moves",
-]
-
 # Motions of bone above which a plan is unusual, and above which it is implausible; mm and degrees.
 # The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
 FAR, TOO_FAR = 20.0, 60.0

@@ -13,8 +13,6 @@ from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["check_after"]
-
 # Vertices of two files that lie within this of each other are the same, mm: rounding in a file.
 SAME = 1e-3
 

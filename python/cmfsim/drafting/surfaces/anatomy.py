@@ -10,8 +10,6 @@ from cmfsim.drafting.case_lines import Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.values.checks import Floats
 
-__all__ = ["FLIP", "SAMPLES", "UNITS", "Anatomy", "Question", "index_of"]
-
 # Lengths of other units that numbers may be in, mm.
 UNITS: Mapping[str, float] = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inch": 25.4, "um": 0.001}
 # Vertices at which it is asked whether one surface holds another.

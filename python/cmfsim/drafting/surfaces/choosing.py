@@ -18,8 +18,6 @@ from cmfsim.drafting.surfaces.anatomy import (
 from cmfsim.drafting.surfaces.teeth import ROWS, add_teeth, report_joined
 from cmfsim.values.checks import Floats
 
-__all__ = ["choose_surfaces"]
-
 # Longest extent of a skin from a face mask to a head with neck, and of bones, mm.
 SKIN_EXTENT, BONE_EXTENT = (110.0, 420.0), (15.0, 320.0)
 # Share of a piece in a bone from which on it is part of it, and distance that counts as in it, mm.

@@ -15,8 +15,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["ROWS", "add_teeth", "report_joined"]
-
 # Rows of teeth, by what names say.
 ROWS = ("teeth", *JAWS_OF_TEETH)
 # Teeth are those of the nearer jaw where its distance is below this part of the other's.

@@ -17,8 +17,6 @@ from cmfsim.io.landmarks.landmark_files import read_landmarks
 from cmfsim.io.slicer.transforms import read_transform
 from cmfsim.values.checks import Floats
 
-__all__ = ["UNDECIDED", "Shown", "check_written", "unaccounted"]
-
 # What single precision leaves of coordinates of a head, mm, and what a rotation may differ by.
 SAME_PLACE, SAME_MOTION = 1e-3, 1e-9
 UNDECIDED = "init did not decide about it: please report this"

@@ -20,18 +20,6 @@ from cmfsim.io.surfaces import write_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "SAME",
-    "Draft",
-    "Place",
-    "choices_of",
-    "image_path",
-    "landmark_path",
-    "place_after",
-    "place_before",
-    "surface_path",
-]
-
 # Entries of two transforms that are one differ by less.
 SAME = 1e-9
 

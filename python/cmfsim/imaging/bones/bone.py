@@ -25,8 +25,6 @@ from cmfsim.imaging.skins.skin import Skin
 from cmfsim.imaging.working_grid import Working, coarse_of
 from cmfsim.values.finding import Finding
 
-__all__ = ["Bone", "find_bone"]
-
 # Teeth are denser than compact bone, HU; smaller groups of such voxels are none, mm³.
 ENAMEL = 1400.0
 LEAST_TEETH = 200.0

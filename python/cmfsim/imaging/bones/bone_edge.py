@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from cmfsim.imaging.intensities.intensity import SOFT
 from cmfsim.imaging.morphology import Mask, Volume, depth, grown, ndimage
 
-__all__ = ["at_half_height"]
-
 # The blur of a step from soft tissue to bone is over within this, voxels of the scan.
 BLUR = 2.0
 # Half of the step to compact bone; enamel, three times as dense, would draw the bone beside it in.

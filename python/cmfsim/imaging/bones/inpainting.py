@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from cmfsim.imaging.bones.projections import Projector, projector
 from cmfsim.imaging.morphology import Mask, Volume, ndimage
 
-__all__ = ["deviations", "without_metal"]
-
 # Rays through less metal than this are kept, mm.
 LEAST_PATH = 0.05
 # The plain image: air below the first, bone above the second, soft tissue between, HU. It is made

@@ -30,8 +30,6 @@ from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["Jaws", "part_jaws"]
-
 # Landmarks (Phillips & Smuts 1996) that lie on each bone.
 ON_MANDIBLE = (
     "infradentale",

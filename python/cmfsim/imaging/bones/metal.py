@@ -22,8 +22,6 @@ from cmfsim.imaging.options import METAL, SegmentOptions
 from cmfsim.imaging.working_grid import Working
 from cmfsim.values.finding import Finding
 
-__all__ = ["Metal", "find_metal", "metal_within", "without_streaks"]
-
 # Averaging leaves this part of a cut-off value in voxels that hold nothing else.
 SATURATED_PART = 0.97
 # Images cut off below this show dense bone as bright as metal, HU.

@@ -15,8 +15,6 @@ from cmfsim.registration.proposed.shape_model.model import MANDIBLE, SKIN
 from cmfsim.registration.proposed.shape_model.samples import Cylinder, HeadSamples
 from cmfsim.values.checks import Floats
 
-__all__ = ["fitted_to", "model_box", "model_seeds"]
-
 # Points of bone and of skin that the model is fitted to, and the grid they are taken from, mm.
 BONE_POINTS, SKIN_POINTS, STEP = 3000, 2500, 2.0
 # Blur from which normals are taken, in voxels of that grid.

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from cmfsim.imaging.morphology import Volume, sparse
 
-__all__ = ["Projector", "projector"]
-
 # Directions over half a turn: at the rim of a head (100 mm) they are 1.3 mm apart.
 DIRECTIONS = 240
 

@@ -14,8 +14,6 @@ from cmfsim.imaging.morphology import Mask, Volume, depth, largest, ndimage, res
 from cmfsim.imaging.working_grid import Working, coarse_of
 from cmfsim.values.finding import Finding
 
-__all__ = ["without_cupping"]
-
 # Voxels that the loss is fitted on, mm: noise averages out, and bone is still apart from the rest.
 STEP = 4.0
 # Scatter reaches about this far, mm.

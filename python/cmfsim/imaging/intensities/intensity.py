@@ -12,17 +12,6 @@ from cmfsim.imaging.field_of_view import round_field
 from cmfsim.imaging.morphology import Volume
 from cmfsim.values.finding import Finding
 
-__all__ = [
-    "AIR",
-    "SOFT",
-    "STATE_IT",
-    "Calibration",
-    "calibration",
-    "noise_of",
-    "saturation_of",
-    "weak_bone",
-]
-
 # Air by definition, and muscle and brain as scanners show them (25 to 60), HU.
 AIR = -1000.0
 SOFT = 40.0

@@ -7,8 +7,6 @@ import numpy as np
 
 from cmfsim.imaging.morphology import Block, Mask, Volume, box_of, grown, shrunk, smoothed
 
-__all__ = ["level_of"]
-
 # Voxels of width over which a mask is smoothed where the image cannot place the surface.
 MASK_SIGMA = 1.0
 # Least size of the level a voxel away from the surface, of 1.

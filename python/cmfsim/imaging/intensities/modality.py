@@ -7,8 +7,6 @@ from cmfsim.errors import ImageInputError
 from cmfsim.imaging.intensities.intensity import AIR, SOFT, STATE_IT
 from cmfsim.imaging.morphology import Mask, Volume, closed, depth, filled, largest, opened
 
-__all__ = ["check_is_ct"]
-
 # Bone is brighter than this above soft tissue, HU.
 BRIGHT = 250.0
 # The layer below the skin that holds fat but little bone, and where depth begins, mm.

@@ -4,8 +4,6 @@ from cmfsim.imaging.intensities.intensity import noise_of
 from cmfsim.imaging.morphology import Volume, smoothed
 from cmfsim.values.finding import Finding
 
-__all__ = ["without_noise"]
-
 # From this noise on (HU on the working grid), a Gaussian of this many voxels: it leaves a third or
 # less of the noise, which then is a tenth of the step from soft tissue to the bone threshold.
 SMOOTHING = ((45.0, 0.8), (25.0, 0.6))

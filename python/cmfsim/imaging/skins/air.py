@@ -9,8 +9,6 @@ from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skins.skin import SKIN_SCALE, Skin
 from cmfsim.imaging.working_grid import Working
 
-__all__ = ["air_level"]
-
 # Smaller bubbles are part of the tissue, mm³.
 LEAST_AIR = 200.0
 

@@ -31,8 +31,6 @@ from cmfsim.imaging.skins.skin import Skin
 from cmfsim.imaging.working_grid import Working, coarse_of
 from cmfsim.values.finding import Finding
 
-__all__ = ["attached_findings"]
-
 # Voxels that things on the face are told apart on, mm.
 STEP = 2.0
 # What a ball of this radius does not fit into stands out from the head, mm: tubes for the airway

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from cmfsim.imaging.morphology import Mask, Volume, label, ndimage, smoothed
 from cmfsim.values.checks import Floats
 
-__all__ = ["STEP", "find_plates"]
-
 # Voxels that steps are looked for on, mm.
 STEP = 1.6
 # The skin's own direction is that of its level after the first Gaussian, the direction of the face

@@ -30,8 +30,6 @@ from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.working_grid import Working, coarse_of
 from cmfsim.values.finding import Finding
 
-__all__ = ["Skin", "find_skin"]
-
 # Full range of the skin's level, HU: half of the step from air to fat.
 SKIN_SCALE = 400.0
 # What is darker than this, such as foam or hair, is no tissue, HU.

@@ -15,8 +15,6 @@ from cmfsim.imaging.two_scans.mutual_information import Clipped, Places, align, 
 from cmfsim.values.checks import Floats, check_instance
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["VolumeAlignment", "register_volumes"]
-
 _LOG = logging.getLogger(__name__)
 
 # Values outside these shares of the voxels, %, (metal, noise) would spend the histogram's bins.

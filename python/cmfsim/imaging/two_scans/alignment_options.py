@@ -8,8 +8,6 @@ import numpy as np
 from cmfsim.errors import RegistrationInputError
 from cmfsim.values.checks import as_number, as_positive
 
-__all__ = ["AlignmentOptions"]
-
 
 @dataclass(frozen=True)
 class AlignmentOptions:

@@ -14,8 +14,6 @@ from cmfsim.imaging.two_scans.alignment_options import AlignmentOptions
 from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["Clipped", "Places", "align", "inverse", "matrix_of"]
-
 _ONE_AT_A_TIME = threading.Lock()
 
 # A mask needs this many voxels at the coarsest resolution for a histogram, and this extent, mm, for

@@ -10,8 +10,6 @@ from cmfsim.imaging.morphology import distance
 from cmfsim.values.checks import as_floats, as_number, as_positive, as_rows, check_instance
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["undeformed_mask"]
-
 # Landmarks through which the plane runs above which surgery of the jaws moves no bone: the lower
 # rims of the orbits and the roots of the zygomatic arches, close to the Frankfurt plane.
 CRANIAL_LANDMARKS = ("suborbital_L", "suborbital_R", "supraglenoid_L", "supraglenoid_R")

@@ -8,8 +8,6 @@ from typing import Any
 
 from cmfsim.io.files.toml_lines import KeyPath
 
-__all__ = ["CaseChanges"]
-
 
 @dataclass(frozen=True)
 class CaseChanges:

@@ -47,8 +47,6 @@ from cmfsim.values.checks import as_text
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import TissueData
 
-__all__ = ["CASE_FORMAT", "Case", "CaseOrPath", "as_case"]
-
 CASE_FORMAT = "cmfsim-case"
 # What a case's file is called where its folder alone is given.
 CASE_FILE = "case.toml"

@@ -14,12 +14,6 @@ from cmfsim.values.case_parts import (
 )
 from cmfsim.values.motion import rigid_matrix, rigid_motion
 
-__all__ = [
-    "is_achieved",
-    "osteotomies_of",
-    "plan_of",
-]
-
 # What stands for the plan where it is read off the bones after the operation.
 ACHIEVED = "achieved"
 

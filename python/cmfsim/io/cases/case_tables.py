@@ -25,27 +25,6 @@ from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE, MuscleModuli, Tissue
 from cmfsim.values.solver_options import CONTACTS, SolverOptions
 from cmfsim.values.tissue_data import MIXINGS, TissueData
 
-__all__ = [
-    "band_of",
-    "checked_name",
-    "file_of",
-    "file_or_none",
-    "image_of",
-    "landmarks_of",
-    "lips_of",
-    "mesh_of",
-    "muscles_of",
-    "node_kinds_of",
-    "output_folder",
-    "plane_of",
-    "postoperative_of",
-    "region_of",
-    "solver_of",
-    "stated_frame",
-    "surfaces_of",
-    "tissue_of",
-]
-
 # What [muscles] and each table below [muscles.moduli] may set, as `MuscleModuli` has it.
 MODULI = ("young_along", "young_across", "poisson")
 # Wider, mm, than any muscle of the face is thick.

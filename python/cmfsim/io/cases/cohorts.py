@@ -12,8 +12,6 @@ from cmfsim.io.files.reading_writing import FORMAT_VERSION, is_there
 from cmfsim.values.checks import as_text, check_one_of
 from cmfsim.values.prediction import MODELS
 
-__all__ = ["COHORT_FORMAT", "Cohort"]
-
 COHORT_FORMAT = "cmfsim-cohort"
 # What a cohort's file is called where its folder alone is given.
 COHORT_FILE = "cohort.toml"

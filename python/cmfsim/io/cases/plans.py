@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.values.motion import rigid_matrix
 
-__all__ = ["write_plan"]
-
 # A name that TOML takes as a key without quotes.
 BARE = re.compile(r"[A-Za-z0-9_-]+")
 

@@ -30,8 +30,6 @@ from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TISSUE_ARRAYS, TissueData
 from cmfsim.values.touching import ObstacleData, TouchingData
 
-__all__ = ["read_plan", "read_scene", "write_scene"]
-
 SCENE_FORMAT = "cmfsim-scene"
 SCENE_KEYS = (
     *("format", "version", "units", "mesh", "conflicts"),

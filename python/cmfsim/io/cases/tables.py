@@ -27,8 +27,6 @@ from cmfsim.io.files.reading_writing import (
 from cmfsim.io.files.toml_lines import KeyPath, line_of, toml_lines
 from cmfsim.values.checks import Floats, nearest
 
-__all__ = ["UNDECIDED", "Table", "read_tables"]
-
 # A case file above this size is not what it says it is, bytes.
 MAX_CASE_TEXT = 2**20
 # What `cmfsim init` writes where it cannot tell what is meant.

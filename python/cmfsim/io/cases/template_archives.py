@@ -14,8 +14,6 @@ from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
-__all__ = ["TEMPLATE_FORMAT", "mirrored_muscle", "read_template_archive", "write_template_archive"]
-
 TEMPLATE_FORMAT = "cmfsim-template"
 # The factors by which a place is mirrored to the other side.
 MIRROR = np.array([-1.0, 1.0, 1.0])

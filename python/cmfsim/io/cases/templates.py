@@ -33,8 +33,6 @@ from cmfsim.values.musculature import MOST_BOXES, MUSCLE_KINDS, MUSCLE_SIDES, Mu
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
-__all__ = ["TEMPLATE_FILE", "TemplateSurvey", "read_template", "survey_template", "write_template"]
-
 TEMPLATE_FILE = "template.toml"
 KEYS = (
     "format",

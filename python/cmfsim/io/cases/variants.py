@@ -11,8 +11,6 @@ from cmfsim.io.cases.case_changes import CaseChanges
 from cmfsim.io.cases.tables import Table, read_tables
 from cmfsim.values.prediction import MODELS
 
-__all__ = ["AS_GIVEN", "Variant", "Variants"]
-
 # The variant without changes, with which all others are compared.
 AS_GIVEN = "as-given"
 # Keys of a case file that no result depends on.

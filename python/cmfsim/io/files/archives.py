@@ -27,12 +27,6 @@ from cmfsim.io.files.reading_writing import (
     replacing,
 )
 
-__all__ = [
-    "member_of",
-    "read_archive",
-    "write_archive",
-]
-
 # Members of an archive: a scene has ten for each segment.
 MAX_MEMBERS = 10_000
 # Unpacked size up to which an archive is read, bytes: a scene of 20 million tets fits, a

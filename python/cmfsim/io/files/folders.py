@@ -15,8 +15,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.leftovers import abandoned, holding, temporary_folder
 from cmfsim.io.files.reading_writing import deleted_meanwhile
 
-__all__ = ["check_below", "check_writable", "finish_writing", "replacing_files"]
-
 PREFIX = ".writing-"
 # In a folder of new files that are whole: which take their places, and which old ones go. A run
 # that is killed after it wrote this is finished by the next.

@@ -15,8 +15,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-__all__ = ["abandoned", "holding", "temporary_file", "temporary_folder"]
-
 # Age of what was left where there are no locks, s: longer than any run writes.
 LEFT_AFTER = 86_400.0
 

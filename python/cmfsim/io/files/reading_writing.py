@@ -22,31 +22,6 @@ from typing import Any, BinaryIO
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files.leftovers import abandoned, temporary_file
 
-__all__ = [
-    "FORMAT_VERSION",
-    "LINE_IN_MESSAGE",
-    "beside",
-    "check_numbers",
-    "check_plain_toml",
-    "check_readable",
-    "check_units",
-    "check_version",
-    "deleted_meanwhile",
-    "is_below",
-    "is_there",
-    "known_keys",
-    "named",
-    "parsed_json",
-    "read_document",
-    "refuse_constant",
-    "replacing",
-    "table_of",
-    "toml_hint",
-    "toml_module",
-    "utf8_path",
-    "utf8_text",
-]
-
 # Text files (plans, scene descriptions) above this size are not what they say they are, bytes.
 MAX_TEXT = 16 * 2**20
 FORMAT_VERSION = 1

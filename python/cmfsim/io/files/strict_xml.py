@@ -5,8 +5,6 @@ from xml.parsers import expat
 
 from cmfsim.errors import CaseInputError
 
-__all__ = ["strict_parser"]
-
 
 def strict_parser(text: bytes, separator: str | None = None) -> XMLParserType:
     """A parser for a text that refuses zero bytes, document types and entities.

@@ -18,27 +18,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import refuse_constant
 from cmfsim.values.finding import SEVERITIES
 
-__all__ = [
-    "Check",
-    "checked_file",
-    "file_of",
-    "finding",
-    "flag",
-    "hashes_of",
-    "listing",
-    "mapping",
-    "number",
-    "one_of",
-    "optional",
-    "plain",
-    "plain_json",
-    "read_summary",
-    "table",
-    "text",
-    "whole",
-    "write_summary",
-]
-
 # Above these a summary is not what it says it is: bytes, characters of a text, entries of a list.
 MOST_BYTES = 16 * 2**20
 MOST_TEXT = 20_000

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files.text_numbers import real_numbers, whole_numbers
 
-__all__ = ["Cursor"]
-
 # A line with a keyword is no longer than this, bytes.
 MAX_LINE = 2**12
 

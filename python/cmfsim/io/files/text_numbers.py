@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats
 
-__all__ = ["real_numbers", "shown", "whole_numbers"]
-
 # Characters of a word that an error repeats.
 SHOWN = 40
 

@@ -7,8 +7,6 @@ so it need not find what is wrong with one; it only has to tell keys from values
 import re
 from collections.abc import Mapping
 
-__all__ = ["KeyPath", "line_of", "toml_lines"]
-
 # Names of tables and keys; the number of a table in an array of tables stands as a whole number.
 KeyPath = tuple[str | int, ...]
 

@@ -26,8 +26,6 @@ from cmfsim.processes.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["ImageFile", "read_image", "read_image_file", "write_image"]
-
 # What is written; reading goes by content.
 SUFFIXES = (".nrrd", ".nii", ".nii.gz", ".mha")
 # Names of files that are no DICOM, whose content is none of their formats.

@@ -14,8 +14,6 @@ from cmfsim.values.image_data import ImageData
 
 Floats: TypeAlias = NDArray[np.float64]
 
-__all__ = ["OUTSIDE", "aligned", "of_slices", "shear_of", "turn_of", "upright"]
-
 # An axis farther than this from a patient's axis (as a sine), or from a right angle with another,
 # is resampled: 0.06 degrees, which is 0.25 mm over a head.
 OBLIQUE = 1e-3

@@ -21,25 +21,6 @@ from cmfsim.errors import ImageInputError
 from cmfsim.io.files.reading_writing import check_readable, is_below
 from cmfsim.values.finding import Finding
 
-__all__ = [
-    "KNOWN",
-    "LENGTHS",
-    "MOST_DIGITS",
-    "MOST_HEADER",
-    "MOST_PACKED",
-    "MOST_VOXELS",
-    "ImageHeader",
-    "PackedVoxels",
-    "apart",
-    "check_affine",
-    "check_length",
-    "check_shape",
-    "data_file",
-    "number",
-    "unstated",
-    "whole",
-]
-
 # Larger images are refused before memory is taken, voxels: 1024 × 1024 × 2000.
 MOST_VOXELS = 2_100_000_000
 # Longer text headers are none, bytes: those of scanners' exports have some 20 kB.

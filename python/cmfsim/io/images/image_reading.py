@@ -9,8 +9,6 @@ import numpy as np
 from cmfsim.errors import ImageInputError
 from cmfsim.processes.child import Answer
 
-__all__ = ["LIBRARIES", "read_frames", "read_slices", "read_volume"]
-
 # What the child process imports before the time of a file begins.
 LIBRARIES = ("SimpleITK",)
 

@@ -24,8 +24,6 @@ from cmfsim.io.images.image_headers import (
 )
 from cmfsim.values.finding import Finding
 
-__all__ = ["is_meta", "meta_header"]
-
 BYTES: Mapping[str, int] = {
     "MET_CHAR": 1, "MET_UCHAR": 1, "MET_SHORT": 2, "MET_USHORT": 2, "MET_INT": 4, "MET_UINT": 4,
     "MET_LONG": 8, "MET_ULONG": 8, "MET_LONG_LONG": 8, "MET_ULONG_LONG": 8, "MET_FLOAT": 4,

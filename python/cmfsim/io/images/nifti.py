@@ -27,8 +27,6 @@ from cmfsim.io.images.image_headers import (
 )
 from cmfsim.values.finding import Finding
 
-__all__ = ["is_nifti", "read_nifti"]
-
 # Two statements of one image's place agree up to this at its corners, mm.
 PLACES_AGREE = 0.25
 # Spacings stated twice agree up to this part.

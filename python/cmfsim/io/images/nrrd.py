@@ -25,8 +25,6 @@ from cmfsim.io.images.image_headers import (
 )
 from cmfsim.values.finding import Finding
 
-__all__ = ["BYTES", "nrrd_affine", "nrrd_fields", "nrrd_header"]
-
 # NRRD's encodings whose length is known beforehand; text and hexadecimal are ITK's to read.
 PACKINGS: Mapping[str, str] = {
     "raw": "", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2",

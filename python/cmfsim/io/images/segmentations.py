@@ -21,15 +21,6 @@ from cmfsim.io.images.nifti import read_nifti
 from cmfsim.io.images.nrrd import BYTES, nrrd_affine, nrrd_fields
 from cmfsim.values.finding import Finding
 
-__all__ = [
-    "NAMES_FILE",
-    "Segment",
-    "Segmentation",
-    "are_labels",
-    "read_labels",
-    "read_segmentation",
-]
-
 MAX_SEGMENTS = 200
 # Voxels of all layers, bytes in memory: those of a head CT in eight layers.
 MAX_VOXELS = 2**31

@@ -11,8 +11,6 @@ from cmfsim.errors import LandmarkInputError
 from cmfsim.io.landmarks.markups import Markup, markup_of, markup_text, markups_of, write_markups
 from cmfsim.values.checks import Floats, as_rows
 
-__all__ = ["read_curves", "write_curves"]
-
 # What Slicer calls markups whose points follow one another along a line.
 CURVE_KINDS = ("Curve", "ClosedCurve", "Line")
 

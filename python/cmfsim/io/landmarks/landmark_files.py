@@ -35,8 +35,6 @@ from cmfsim.values.landmark_sites import (
     named_site,
 )
 
-__all__ = ["LandmarkFile", "read_landmark_file", "read_landmarks", "write_landmarks"]
-
 # What each format means where it does not say: Slicer's markups schema, and its fiducial reader.
 UNSTATED: Mapping[str, str] = MappingProxyType({".json": "LPS", ".fcsv": "RAS"})
 # A number as Slicer writes it; Python takes more for one, 1_0 among them.

@@ -14,19 +14,6 @@ from cmfsim.errors import LandmarkInputError
 from cmfsim.io.files.reading_writing import MAX_WHOLE, check_readable, parsed_json, replacing
 from cmfsim.values.checks import Floats
 
-__all__ = [
-    "Markup",
-    "MarkupPoint",
-    "as_position",
-    "frame_name",
-    "frame_signs",
-    "markup_of",
-    "markup_text",
-    "markups_of",
-    "markups_text",
-    "write_markups",
-]
-
 # A landmark file above this size is not what it says it is, bytes.
 MAX_LANDMARK_TEXT = 16 * 2**20
 # Slicer's names of its two frames; the numbers are those of older versions.

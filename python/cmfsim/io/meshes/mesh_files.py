@@ -26,8 +26,6 @@ from cmfsim.io.meshes.vtk.xml import read_vtk_xml
 from cmfsim.processes.child import Answer, ReaderError, ReadLimits, read_in_child
 from cmfsim.values.finding import Finding
 
-__all__ = ["read_mesh", "read_tet_mesh", "read_tets"]
-
 # Formats of meshio whose files name other files, which may lie anywhere, or hold no mesh.
 NAME_OTHERS = frozenset({".xdmf", ".xmf", ".hmf", ".node", ".ele", ".svg"})
 # Processor time, s, and memory, bytes, that meshio may take for a small file.

@@ -15,8 +15,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.text_cursor import Cursor
 from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
 
-__all__ = ["read_msh"]
-
 Integers = NDArray[np.int64]
 # Gmsh's numbers of elements (its manual, MSH file format): name, number of nodes.
 ELEMENTS = {

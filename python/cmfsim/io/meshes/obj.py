@@ -12,8 +12,6 @@ from cmfsim.io.files.text_numbers import real_numbers, shown, whole_numbers
 from cmfsim.io.meshes.polygons import triangles_of
 from cmfsim.values.checks import Floats
 
-__all__ = ["read_obj", "write_obj"]
-
 Integers = NDArray[np.int64]
 # Keywords that say nothing about where a surface lies.
 PASSED_OVER = frozenset(

@@ -11,8 +11,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["CELL_CORNERS", "Cells", "PlainMesh"]
-
 # Largest coordinate, whatever its unit: a head in µm has 1e6. Far larger ones overflow in areas and
 # volumes.
 MAX_COORDINATE = 1e9

@@ -14,8 +14,6 @@ from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["read_ply", "write_ply"]
-
 Integers = NDArray[np.int64]
 Column = NDArray[np.float64] | NDArray[np.int64]
 # Length of a header with any number of properties and comments, bytes.

@@ -6,8 +6,6 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats
 
-__all__ = ["checked_indices", "triangles_of", "triangles_of_strips"]
-
 Integers = NDArray[np.int64]
 # A corner may turn inwards by this share of a polygon's area and count as rounding.
 FLAT_SHARE = 1e-9

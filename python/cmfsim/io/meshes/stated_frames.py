@@ -9,8 +9,6 @@ from pathlib import Path
 
 from cmfsim.errors import CaseInputError
 
-__all__ = ["is_own_file", "stated_frame", "stated_in_field"]
-
 # As 3D Slicer writes it; and the words of this package's own files.
 SLICER = re.compile(rb"\bSPACE=([A-Za-z]+)")
 OWN = re.compile(rb"^(?:cmfsim |comment |# )LPS mm\b", re.MULTILINE)

@@ -11,8 +11,6 @@ from cmfsim.io.files.text_numbers import real_numbers, shown
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["read_stl", "write_stl"]
-
 HEADER = 80
 ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 # Lines that open and close a solid; their names may hold anything.

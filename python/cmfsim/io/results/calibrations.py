@@ -22,8 +22,6 @@ from cmfsim.io.files.summaries import (
 from cmfsim.values.calibration import Calibration, CalibrationCase
 from cmfsim.values.prediction import MODELS
 
-__all__ = ["CALIBRATION_FORMAT", "CALIBRATION_VERSION", "read_calibration", "write_calibration"]
-
 CALIBRATION_FORMAT, CALIBRATION_VERSION = "cmfsim-calibration", 1
 
 _CASE = table(

@@ -26,17 +26,6 @@ from cmfsim.io.files.summaries import (
 )
 from cmfsim.values.prediction import MODELS
 
-__all__ = [
-    "AGAIN",
-    "EVALUATION_FILE",
-    "REPORT_FILE",
-    "is_evaluation_file",
-    "read_evaluation",
-    "read_evaluation_picture",
-    "read_picture",
-    "write_metrics",
-]
-
 # Written last, so that a case that has it is finished.
 EVALUATION_FILE = "metrics.json"
 REPORT_FILE = "report.html"

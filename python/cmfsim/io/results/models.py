@@ -18,9 +18,6 @@ from cmfsim.io.surfaces import write_surface
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import PatientModel
 
-__all__ = ["is_model_file", "write_model"]
-
-
 # What models are written as: an earlier build's files of these names go when a later lacks them.
 MODEL_FILES = re.compile(
     r"scene\.npz|tissue\.vtu|skin\.ply|segment-[A-Za-z0-9_+-]+\.ply|anatomy\.png|node_kinds\.png|"

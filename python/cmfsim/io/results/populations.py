@@ -18,20 +18,6 @@ from cmfsim.io.files.reading_writing import (
 )
 from cmfsim.values.checks import check_one_of
 
-__all__ = [
-    "CALIBRATION",
-    "FAILED",
-    "MADE",
-    "PARTS",
-    "PENDING",
-    "POPULATION_FILE",
-    "TEST",
-    "TRAIN",
-    "Population",
-    "PopulationEntry",
-    "part_of",
-]
-
 POPULATION_FILE = "population.json"
 FORMAT = "cmfsim-population"
 STATES = MADE, FAILED, PENDING = "made", "failed", "pending"

@@ -19,8 +19,6 @@ from cmfsim.io.files.summaries import (
 from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE
 from cmfsim.values.prediction import MODELS
 
-__all__ = ["PREDICTION", "is_prediction_file"]
-
 PREDICTION_FILES = re.compile(
     r"prediction\.(vtp|stl|vtu|npz|png|json|mrb)|face\.(vtp|stl)|face_before\.vtp|(bones|muscles)\.vtp"
     r"|(plan|muscles|band)\.png|timings\.json"

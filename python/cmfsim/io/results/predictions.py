@@ -28,18 +28,6 @@ from cmfsim.io.surfaces import write_surface
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "fill_prediction",
-    "is_result_file",
-    "predictions_of",
-    "read_parts",
-    "read_prediction",
-    "read_prediction_picture",
-    "stale_results",
-    "write_prediction",
-    "write_timings",
-]
-
 PREDICTION_FILE = "prediction.json"
 TIMINGS_FILE = "timings.json"
 AGAIN = "run cmfsim predict again"

@@ -15,8 +15,6 @@ from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import SceneResult
 
-__all__ = ["read_result", "result_suffixes", "write_result"]
-
 RESULT_FORMAT = "cmfsim-result"
 
 

@@ -18,8 +18,6 @@ from cmfsim.io.results.metrics import AGAIN
 from cmfsim.values.checks import Floats, as_floats, as_rows, frozen
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["SkinErrors", "read_skin_errors", "skin_errors_file", "write_skin_errors"]
-
 DISTANCE, EVALUATED = "signed_distance_mm", "evaluated"
 
 

@@ -10,8 +10,6 @@ from pathlib import Path, PurePosixPath
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import check_readable, named
 
-__all__ = ["unpack_bundle"]
-
 # A planning scene has some hundred files, with a CT of half a gigabyte.
 MAX_MEMBERS = 5000
 MAX_UNPACKED = 8 * 2**30

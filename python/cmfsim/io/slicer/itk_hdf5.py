@@ -15,8 +15,6 @@ from cmfsim.io.files.reading_writing import utf8_path
 from cmfsim.processes.child import Answer, ReaderError, ReadLimits, read_in_child
 from cmfsim.values.checks import Floats
 
-__all__ = ["parse_itk_hdf5", "read_itk_hdf5"]
-
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # A rigid transform takes some 8 kB; above this a file holds a displacement field, bytes.
 MAX_FILE = 2**26

@@ -25,8 +25,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["SLICER_FILE", "write_slicer_bundle"]
-
 # The bundle of a prediction, in its output folder.
 SLICER_FILE = "prediction.mrb"
 

@@ -22,8 +22,6 @@ from cmfsim.io.slicer.transforms import motion_in_lps, read_transform_file
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix
 
-__all__ = ["KINDS", "SceneNode", "SlicerScene", "read_slicer_scene"]
-
 # A scene of some hundred nodes has a megabyte.
 MAX_SCENE = 64 * 2**20
 MAX_ELEMENTS, MAX_DEPTH = 100_000, 64

@@ -21,17 +21,6 @@ from cmfsim.values.case_parts import DIRECTIONS, FRAMES
 from cmfsim.values.checks import Floats, as_floats, check_one_of
 from cmfsim.values.motion import rigid_matrix
 
-__all__ = [
-    "DIRECTION_CHOICE",
-    "TransformFile",
-    "is_itk_file",
-    "motion_in_lps",
-    "read_transform",
-    "read_transform_file",
-    "transform_text",
-    "write_transform",
-]
-
 MATRIX_SUFFIXES = (".txt", ".mat")
 HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf")
 ITK_HEADER = "#Insight Transform File"

@@ -16,8 +16,6 @@ from cmfsim.lab.benchmark.patients import BenchmarkPatient
 from cmfsim.lab.benchmark.skin_predictions import SkinPrediction, read_skin_prediction
 from cmfsim.values.calibration import BandFactor, Calibration, CalibrationCase
 
-__all__ = ["COVERAGE", "MethodBand", "calibrated_band"]
-
 # The share of patients that a band must cover in each region.
 COVERAGE = 0.9
 GROUP = "virtual"

@@ -29,19 +29,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 
-__all__ = [
-    "ENTRIES",
-    "FAILURE",
-    "LEARNED",
-    "NO_CHANGE",
-    "ON_REQUEST",
-    "EntryFolder",
-    "check_own",
-    "learned_entries",
-    "patient_entries",
-    "times_of",
-]
-
 NO_CHANGE, RATIOS, LEARNED, HYPERELASTIC = "no-change", "ratios", "pls", "hyperelastic"
 ENTRIES = (NO_CHANGE, RATIOS, LEARNED, *MODELS)
 # Entries that are made only on request: they take longer.

@@ -15,8 +15,6 @@ from cmfsim.evaluation import SKIN_LANDMARKS
 from cmfsim.lab.benchmark.patients import BenchmarkPatient
 from cmfsim.values.checks import Floats
 
-__all__ = ["LEAST_TRAINED", "LearnedFace", "PartialLeastSquares", "learn_face"]
-
 # Fewer patients than this teach nothing: one is left out at a time to choose the components.
 LEAST_TRAINED = 4
 MOST_COMPONENTS = 8

@@ -19,8 +19,6 @@ from cmfsim.io.results.populations import MADE, Population
 from cmfsim.values.checks import Floats
 from cmfsim.values.uncertainty import ADDED, PLAN, Source
 
-__all__ = ["LIPS", "BenchmarkPatient", "far_from_models", "patients_of"]
-
 LIPS = "lips"
 SKIN, CASE = "skin.ply", "case.toml"
 READ = (CASE, "ct.nrrd", "skull.mrk.json", "skin.mrk.json", SKIN)

@@ -12,8 +12,6 @@ from cmfsim._core import ThinPlateSpline
 from cmfsim.lab.benchmark.patients import BenchmarkPatient
 from cmfsim.values.checks import Floats
 
-__all__ = ["RATIOS", "Ratio", "predict_by_ratios"]
-
 
 @dataclass(frozen=True)
 class Ratio:

@@ -9,8 +9,6 @@ from cmfsim.lab.benchmark.bands import MethodBand
 from cmfsim.lab.benchmark.patients import LIPS
 from cmfsim.lab.benchmark.scores import RegionScore
 
-__all__ = ["REGIONS", "MethodResult"]
-
 # Regions in the order of the tables.
 REGIONS = (
     "face",

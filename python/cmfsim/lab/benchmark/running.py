@@ -38,8 +38,6 @@ from cmfsim.processes.parallel import answers
 from cmfsim.values.checks import as_number, check_one_of
 from cmfsim.values.model_names import MODELS
 
-__all__ = ["Benchmark", "run_benchmark"]
-
 OWN = (*ENTRIES, *ON_REQUEST)
 PREDICTIONS, RESULTS = "predictions", "benchmark"
 

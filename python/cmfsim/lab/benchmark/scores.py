@@ -12,8 +12,6 @@ from cmfsim.lab.benchmark.skin_predictions import SkinPrediction
 from cmfsim.values.calibration import BandFactor
 from cmfsim.values.checks import Floats
 
-__all__ = ["WITHIN", "RegionScore", "score"]
-
 # What is usually called acceptable, mm.
 WITHIN = 2.0
 # Decimals of figures in files, mm and shares: beyond what a prediction in single precision has.

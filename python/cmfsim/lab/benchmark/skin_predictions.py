@@ -12,8 +12,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import check_readable, named, replacing
 from cmfsim.values.checks import Floats, as_rows
 
-__all__ = ["SkinPrediction", "read_skin_prediction", "write_skin_prediction"]
-
 # Vertices of a prediction may differ by this from those of the patient's skin, mm: they are written
 # in single precision.
 SAME_PLACE = 0.01

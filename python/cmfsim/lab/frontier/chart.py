@@ -10,8 +10,6 @@ from cmfsim.lab.frontier.rows import Frontier, FrontierRow, unbeaten
 from cmfsim.lab.frontier.table import GRID, TARGET
 from cmfsim.pictures.charts import write_figure
 
-__all__ = ["chart_frontier"]
-
 # Told apart in grey too, and by those who see no red or green.
 ELEMENT_COLOURS = {"p1": "#8a5a2b", "anp": "#e0a53f", "p2": "#3f7fb5"}
 KINEMATICS_MARKS = {"linear": "o", "corotational": "s", "hyperelastic": "^"}

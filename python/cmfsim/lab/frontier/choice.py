@@ -14,8 +14,6 @@ from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import MIXINGS
 
-__all__ = ["Choice", "case_choice"]
-
 # What a patient's model is built from; all else is chosen when it is solved.
 BUILD_FIELDS = ("edge_length", "samples", "mixing")
 # Characters of a hash that name a file: collisions among a few hundred are out of question.

@@ -8,8 +8,6 @@ from cmfsim.lab.frontier.chart import chart_frontier
 from cmfsim.lab.frontier.rows import Frontier
 from cmfsim.lab.frontier.table import frontier_page
 
-__all__ = ["write_frontier"]
-
 SUMMARY, TABLE, PAGE, PICTURE = "frontier.json", "frontier.csv", "frontier.md", "frontier.png"
 
 

@@ -26,8 +26,6 @@ from cmfsim.pipeline.building.inputs import input_hashes
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.progress import Progress, no_progress
 
-__all__ = ["content_key", "frontier"]
-
 _log = logging.getLogger(__name__)
 
 # A solve that takes longer than this is timed once, s: repeats tell short ones apart.

@@ -6,8 +6,6 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import as_floats
 
-__all__ = ["pareto_front"]
-
 
 def pareto_front(first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
     """Which rows no other row beats: as low in both costs, and lower in one. (k,) bool.

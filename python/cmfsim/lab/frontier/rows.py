@@ -13,8 +13,6 @@ from cmfsim.lab.frontier.choice import Choice
 from cmfsim.lab.frontier.pareto import pareto_front
 from cmfsim.lab.frontier.skin_points import WHOLE
 
-__all__ = ["Frontier", "FrontierRow", "Spread", "unbeaten", "with_front"]
-
 # Errors are told apart in steps of this, mm: two methods that solve the same system differ by less.
 ERROR_STEP = 1e-3
 

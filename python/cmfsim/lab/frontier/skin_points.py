@@ -18,8 +18,6 @@ from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.patient_model import PatientModel
 
-__all__ = ["SKIN", "WHOLE", "read_points", "skin_errors", "skin_points", "write_points"]
-
 Regions = dict[str, NDArray[np.bool_]]
 
 POINTS_FORMAT = "cmfsim-bench-points"

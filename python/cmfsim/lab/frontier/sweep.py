@@ -12,8 +12,6 @@ from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
 from cmfsim.values.tissue_data import MIXINGS
 
-__all__ = ["EDGES", "FACTORS", "reference_choice", "sweep_choices"]
-
 # Edge lengths of the grid, mm.
 EDGES = (10.0, 8.0, 6.0, 5.0, 4.0)
 # Each varied by itself from the base. Edge length, element and kinematics are in the grid.

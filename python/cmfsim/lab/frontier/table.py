@@ -6,8 +6,6 @@ from cmfsim.lab.frontier.choice import Choice
 from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread
 from cmfsim.lab.frontier.skin_points import SKIN, WHOLE
 
-__all__ = ["TARGET", "base_verdict", "frontier_page", "row_label"]
-
 # Mean error on the skin that a default may have, mm: a tenth of what surgeons can see, and below
 # what a CT resolves.
 TARGET = 0.1

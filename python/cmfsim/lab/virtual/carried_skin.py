@@ -9,8 +9,6 @@ from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.checks import Floats, as_index_rows, as_number, as_rows
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["carried", "scanned"]
-
 # Tets whose middles lie nearest to a point are tried for it.
 CANDIDATES = 24
 # Rounds of averaging over neighbours that give smooth noise its length: about 4 edges.

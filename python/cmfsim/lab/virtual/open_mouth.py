@@ -18,8 +18,6 @@ from cmfsim.phantom.skull import UPPER_ARCH
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 
-__all__ = ["LEAST_GAP", "MARGIN", "MouthSlit", "with_open_mouth"]
-
 # The slit between the lips in the canonical head, mm: distance from the midline and height of its
 # line, as in the phantom's skin. Its thickness is constant almost to the corner, because the mesh
 # does not resolve a slit that narrows like the skin's.

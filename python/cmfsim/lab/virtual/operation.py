@@ -17,16 +17,6 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import decompose_motion, rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
 
-__all__ = [
-    "Operation",
-    "bone_distances",
-    "node_areas",
-    "operate",
-    "screw",
-    "without_bite",
-    "without_gaps",
-]
-
 # Tissue is stripped off both sides of a cut, as a surgeon lifts the periosteum there: over this
 # length, mm, plus this multiple of the distance by which the two sides separate.
 STRIPPED, STRIPPED_PER_SHIFT = 5.0, 1.5

@@ -34,18 +34,6 @@ from cmfsim.values.checks import Floats, as_number, as_positive
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "EXECUTED",
-    "PATIENTS_WITH_JOINED_LIPS",
-    "TRUTH",
-    "case_text",
-    "cohort_text",
-    "is_made",
-    "patient_settings",
-    "virtual_patients",
-    "write_virtual_patient",
-]
-
 _log = logging.getLogger(__name__)
 
 

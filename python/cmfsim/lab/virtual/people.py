@@ -7,8 +7,6 @@ from types import MappingProxyType
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
 
-__all__ = ["DRAWN", "PATIENTS", "Relocation", "TrueTissue", "VirtualPatient", "patient_named"]
-
 Triple = tuple[float, float, float]
 
 # Numbers above this belong to patients drawn at random.

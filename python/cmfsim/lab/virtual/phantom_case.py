@@ -7,8 +7,6 @@ from cmfsim.io import write_image, write_landmarks
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.phantom import PhantomHead
 
-__all__ = ["write_phantom_case"]
-
 CASE = """\
 # A synthetic head: no patient. `cmfsim build case.toml` makes its model.
 format = "cmfsim-case"

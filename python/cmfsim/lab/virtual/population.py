@@ -16,8 +16,6 @@ from cmfsim.phantom.geometry.courses import COURSES
 from cmfsim.values.checks import as_number, check_one_of
 from cmfsim.values.uncertainty import ADDED, PLAN
 
-__all__ = ["OWN", "PHANTOM", "TRUTHS", "drawn_patient"]
-
 # Mean, standard deviation and largest departure from the mean.
 Distribution = tuple[float, float, float]
 

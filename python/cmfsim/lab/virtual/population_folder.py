@@ -34,8 +34,6 @@ from cmfsim.lab.virtual.population import OWN, drawn_patient
 from cmfsim.processes.parallel import answers
 from cmfsim.values.checks import as_number, as_positive
 
-__all__ = ["PatientOutcome", "make_patient", "virtual_population"]
-
 FAILURE = "failed.json"
 # Of the level images that the true mesh is made from, and of the skin, in the mesh's edge length:
 # 1.5 mm and 2.25 mm at 6 mm.

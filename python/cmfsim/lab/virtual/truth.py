@@ -50,9 +50,6 @@ from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["PostoperativeTruth", "largest_body", "postoperative_truth"]
-
-
 # Where the sum of the distances to both tooth rows is less than the gap of the bite plus this, mm,
 # there is no tissue.
 BEYOND_BITE = 1.5

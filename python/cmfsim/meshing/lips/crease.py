@@ -14,8 +14,6 @@ from cmfsim.meshing.lips.frame import MouthFrame
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 
-__all__ = ["MouthLine", "SkinProfiles", "crease_line", "skin_profiles", "smoothed"]
-
 # Grid of the profiles, mm: planes across, places along a profile, and steps of a ray into the head.
 COLUMN, STEP, RAY = 1.0, 0.5, 0.5
 # Profiles are taken up to this far to either side of the middle, mm: half the widest mouth, plus a

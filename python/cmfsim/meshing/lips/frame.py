@@ -8,8 +8,6 @@ import numpy as np
 from cmfsim.values.checks import Floats
 from cmfsim.values.dental_arch import DentalArch
 
-__all__ = ["MouthFrame", "mouth_frame"]
-
 
 @dataclass(frozen=True, eq=False)
 class MouthFrame:

@@ -12,8 +12,6 @@ from cmfsim.values.lip_region import LIPS, LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["lip_regions", "seam_faces"]
-
 # A triangle lies above or below the seam, and not past a corner of the mouth or behind the teeth,
 # where the way to it leads off the normal of the seam by this share of its length, or so many mm.
 ASLANT, ASLANT_MM = 0.5, 1.0

@@ -19,8 +19,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["LIP_LANDMARKS", "LipSeam", "lip_seam"]
-
 LIP_LANDMARKS = ("cheilion_R", "cheilion_L", "labiale_superius", "labiale_inferius")
 # The mouth ends at a cheilion landmark if that lies within this distance of the line found on the
 # skin, mm; a landmark further away is reported.

@@ -15,8 +15,6 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["LipSheet", "lip_sheet"]
-
 # Distance of the centre of the rows behind the foremost point of the mouth's line, mm: about the
 # radius of an arch in front.
 CENTRE = 30.0

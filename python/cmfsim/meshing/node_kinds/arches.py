@@ -12,8 +12,6 @@ from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.dental_arch import DentalArch
 from cmfsim.values.finding import Finding
 
-__all__ = ["LOWER_ARCH", "UPPER_ARCH", "DentalArches", "dental_arches"]
-
 # Bone landmarks of the two dental arches: front, left and right.
 UPPER_ARCH = ("supradentale", "supra_m2_L", "supra_m2_R")
 LOWER_ARCH = ("infradentale", "sub_m2_L", "sub_m2_R")

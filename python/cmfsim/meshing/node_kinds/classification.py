@@ -24,8 +24,6 @@ from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import SegmentData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["ClassifiedNodes", "classify_nodes", "segment_data"]
-
 FREE, FIXED, JOINED, SLIDING = range(4)
 # A body is held if at least this many of its nodes, not on one line, are prescribed.
 HOLDING_NODES = 3

@@ -12,8 +12,6 @@ from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["cut_off_skull", "lifted_tissue"]
-
 # Faces of a cut lie on each other: this close, mm, and facing each other with this cosine.
 CUT_GAP, CUT_FACING = 0.5, 0.9
 # Least share of the smaller piece's area in such faces. After Le Fort I on three heads it is 0.08

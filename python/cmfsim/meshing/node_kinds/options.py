@@ -19,8 +19,6 @@ from cmfsim.values.checks import (
     nearest,
 )
 
-__all__ = ["BORDERS", "KindOptions", "SlidingBox", "SlidingSphere", "kind_options"]
-
 CONTACT_SURFACES = ("bone", "sheet")
 BORDERS = ("left", "right", "anterior", "posterior", "inferior", "superior")
 

@@ -12,8 +12,6 @@ from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 
-__all__ = ["Septum", "septum"]
-
 SKULL_LANDMARKS = ("nasion", "rhinion", "mid_philtrum", "supradentale")
 SKIN_LANDMARKS = ("pronasale", "subnasale")
 # Half the thickness of the septum with its mucosa, mm: cartilage of 1.75 mm (mean of 40 cadavers)

@@ -14,8 +14,6 @@ from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["sliding_nodes"]
-
 # Share of the nodes at an arch that lie on its sheet at least: half or more on three heads, and the
 # others on lingual faces and the palate. Fewer nodes than this on a segment are not conclusive.
 LEAST_SHARE, MANY = 0.25, 50

@@ -22,8 +22,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["FittedMuscle", "MuscleFit", "fit_muscles"]
-
 # Spacing of the displacement's coefficients, mm: the width of a strap muscle. With a finer one, a
 # thin muscle follows every voxel of bone; with a coarser one, it cannot follow the zygomatic arch.
 SPACING = 10.0

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.checks import Floats
 
-__all__ = ["Lattice", "sparse"]
-
 # Number of coefficients of the quadratic B-spline that influence a point, along each axis.
 REACH = 3
 

@@ -10,8 +10,6 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["Room"]
-
 # Distances are kept on a grid of this spacing, mm: half the thickness of the thinnest muscles. Near
 # a surface the levels place it more exactly than the voxels.
 SPACING = 1.5

@@ -13,8 +13,6 @@ from cmfsim.muscles.fitting.volumes import Volumes
 from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["Problem", "Targets"]
-
 _log = logging.getLogger(__name__)
 
 # Gap between a muscle's surface and the skin or bone, mm. Half a voxel, so that a muscle placed

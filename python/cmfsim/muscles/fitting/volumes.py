@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Volumes"]
-
 
 @dataclass(frozen=True, eq=False)
 class Volumes:

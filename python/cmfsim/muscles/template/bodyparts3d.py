@@ -37,8 +37,6 @@ from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 from cmfsim.values.template import as_landmarks
 
-__all__ = ["WHERE", "import_bodyparts3d"]
-
 WHERE = (
     "https://github.com/LuisLuisLuisLuisLuisLuisLuisLuis/AnatomyExplorer3D at 53e1aebb, folder "
     "src/main/resources/Project/anatomy/BodyParts3D_3.0_obj_99"

@@ -11,8 +11,6 @@ from cmfsim.muscles.template.fibre_lines import fan_lines, lane_lines
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["atlas_course"]
-
 # Vertices that the tip of temporalis is the mean of; its tendon ends broadly.
 TIP_VERTICES = 20
 # Share of buccinator's vertices that its hind and its front end are the means of.

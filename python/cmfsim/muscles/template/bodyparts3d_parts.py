@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-__all__ = ["BONES", "HASHES", "MIDLINE_MUSCLES", "PAIRED_MUSCLES", "TEETH", "MusclePair"]
-
 
 class MusclePair(NamedTuple):
     """A muscle on either side: its name without side, its kind, its parts on the right and left."""

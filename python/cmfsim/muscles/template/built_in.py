@@ -7,8 +7,6 @@ from types import MappingProxyType
 
 from cmfsim.io.files.reading_writing import is_there
 
-__all__ = ["template_names", "template_path"]
-
 # Made by scripts/make_default_template.py.
 BUILT_IN: Mapping[str, str] = MappingProxyType({"default": "default.npz"})
 

@@ -17,8 +17,6 @@ from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.template import TemplateData
 
-__all__ = ["check_contents", "check_template"]
-
 # Longest extents of a skull or its face, mm: from the facial skeleton alone to a head with neck.
 SKULL_EXTENT = (90.0, 400.0)
 # Distance of a landmark from the skull reference beyond which it lies on something else, mm: twice

@@ -12,8 +12,6 @@ from cmfsim.errors import MeshInputError
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["fan_lines", "lane_lines"]
-
 # Lines across a muscle, and points along each; a line's points lie a few millimetres apart.
 LINES, POINTS = 9, 25
 # Share of the width at either side that no line runs in: there the muscle is too thin to be met.

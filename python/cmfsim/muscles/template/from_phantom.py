@@ -12,8 +12,6 @@ from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
-__all__ = ["phantom_muscle", "phantom_template"]
-
 # Edges of the marching cubes, mm: muscles are as thin as 2 mm, the skull is there to be looked at
 # and to measure distances from.
 MUSCLE_SPACING = 1.0

@@ -26,14 +26,6 @@ from cmfsim.values.musculature import MuscleSurface, Musculature
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 
-__all__ = [
-    "MorphedMusculature",
-    "missing_landmarks",
-    "morph_template",
-    "too_few",
-    "without_lost",
-]
-
 # How many landmarks a finding lists.
 MOST_NAMES = 6
 # Landmarks below which a map is little more than affine.

@@ -14,8 +14,6 @@ from cmfsim.muscles.template.morphing import MorphedMusculature, morph_template
 from cmfsim.values.finding import Finding
 from cmfsim.values.template import TemplateData
 
-__all__ = ["MuscleTemplate"]
-
 
 class MuscleTemplate(TemplateData):
     """Facial muscles of one head, to be mapped to others by landmarks (Kim et al. 2010, 2.2).

@@ -10,8 +10,6 @@ anatomy (Gray 1918; Netter); lengths and widths are round figures of adults.
 from types import MappingProxyType
 from typing import NamedTuple
 
-__all__ = ["COURSES", "Course", "Row"]
-
 Row = tuple[float, float, float, float, float, float]
 
 

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["Level", "Table", "clipped", "smooth_curve", "smooth_max", "smooth_step", "turn_about"]
-
 # Values of a level, or coordinates, in float32 on grids and float64 at points.
 Level = NDArray[np.floating]
 

@@ -17,21 +17,6 @@ import numpy as np
 from cmfsim.phantom.geometry.curves import Level, Table, clipped, smooth_max, smooth_step
 from cmfsim.values.checks import Floats
 
-__all__ = [
-    "REACH",
-    "Blend",
-    "Box",
-    "Egg",
-    "Engraving",
-    "FlatTube",
-    "Loft",
-    "Plane",
-    "Shape",
-    "Step",
-    "Tube",
-    "Within",
-]
-
 # Shapes further away than this are left out, mm: twice the widest melt, so that not even a melt of
 # melts feels them.
 REACH = 24.0

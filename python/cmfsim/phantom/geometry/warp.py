@@ -13,8 +13,6 @@ from cmfsim.phantom.geometry.shapes import REACH, Box, Shape
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.values.checks import Floats
 
-__all__ = ["FaceWarp", "JawWarp", "JawWarped"]
-
 Triple = tuple[Level, Level, Level]
 
 # The face is stretched from the nasion down to below the chin, mm above the Frankfort plane.

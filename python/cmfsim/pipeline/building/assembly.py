@@ -26,8 +26,6 @@ from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene, SegmentData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["assembled"]
-
 
 def assembled(
     head: Head,

@@ -19,8 +19,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["cut_segments", "jaws", "misplaced", "plan_sizes", "untouched"]
-
 
 def misplaced(
     case: Case,

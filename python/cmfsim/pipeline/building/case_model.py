@@ -44,8 +44,6 @@ from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import Progress, no_progress
 
-__all__ = ["build_case", "build_model", "kind_options_of", "model_of"]
-
 _log = logging.getLogger(__name__)
 
 

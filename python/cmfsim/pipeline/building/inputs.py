@@ -39,20 +39,6 @@ from cmfsim.values.surface_data import MovedSurface, SurfaceData
 if TYPE_CHECKING:
     from cmfsim.imaging import SegmentOptions
 
-__all__ = [
-    "case_key",
-    "check_output",
-    "input_hashes",
-    "motion_source",
-    "plan_key",
-    "read_anatomy",
-    "read_case_landmarks",
-    "read_motion",
-    "read_placed_sites",
-    "segment_options",
-]
-
-
 # Voxels of the grid that surfaces are worked on, in edges of the mesh to come, and in mm at least.
 VOXELS_PER_EDGE = 3.0
 LEAST_VOXEL = 0.5

@@ -20,8 +20,6 @@ from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Head", "Nodes", "Tissue"]
-
 
 @dataclass(frozen=True, eq=False)
 class Head:

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     # A case without muscles loads nothing of them.
     from cmfsim.values.musculature import Musculature
 
-__all__ = ["BuildOptions", "OnMuscles", "Stages"]
-
 # What is called with the muscles of a patient and the segments of the bones.
 OnMuscles = Callable[["Musculature", Sequence[BoneSegment]], None]
 

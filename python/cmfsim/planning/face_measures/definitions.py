@@ -13,8 +13,6 @@ import numpy as np
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["FORMULAS", "MEASURES", "Measure", "measure_sites"]
-
 
 @dataclass(frozen=True)
 class Measure:

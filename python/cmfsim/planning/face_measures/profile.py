@@ -10,8 +10,6 @@ from cmfsim.errors import LandmarkInputError
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["MIDLINE", "MidlineProfile", "midline_profile"]
-
 # Skin landmarks that determine the midsagittal plane, and how many are needed.
 MIDLINE = (
     "nasion",

@@ -19,8 +19,6 @@ from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 
-__all__ = ["BoneSite", "FaceSites", "face_sites", "measure_face"]
-
 UPPER_INCISOR = "upper_incisor"
 # Segments that may bear the upper teeth, the smallest first.
 UPPER_BEARERS = ("maxilla", "midface", "cranium", "skull")

@@ -20,8 +20,6 @@ from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
 from cmfsim.values.prediction import Prediction
 
-__all__ = ["NUMBERS", "FacePlan", "FaceSearch", "plan_for_face"]
-
 # Names of the numbers of a segment, in order: mm and degrees.
 NUMBERS = ("forwards", "up", "left", "pitch", "yaw", "roll")
 # A number this close to a bound is at the bound, mm or degrees.

@@ -11,8 +11,6 @@ import numpy as np
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["Minimum", "bounded_least_squares"]
-
 # Forward differences, mm and degrees: residuals are smooth on this scale, and central differences
 # would cost twice as much.
 STEP = 1e-4

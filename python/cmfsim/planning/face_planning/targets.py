@@ -16,16 +16,6 @@ from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.skin_motion import attachment
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = [
-    "CarriedPoints",
-    "MeasureTarget",
-    "PointTarget",
-    "SurfaceTarget",
-    "Target",
-    "Wish",
-    "wish_of",
-]
-
 # A point of the face further from the desired surface than this, mm, has no partner on it.
 MOST_APART = 25.0
 # A point whose closest point is within this distance of the surface's border, mm, has no partner.

@@ -21,8 +21,6 @@ from cmfsim.values.landmark_sites import (
 from cmfsim.values.site_states import CLEARED_SHARE, GOOD_ERROR, SURFACE_REACH, SiteState
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["LandmarkContent", "PageSite", "landmark_content"]
-
 # Triangles that the page draws of the skull, of a jaw and of the skin: about 2 MB together.
 MOST_TRIANGLES: Mapping[str, int] = {"cranium": 60_000, "mandible": 24_000, "skin": 40_000}
 # And of the average head that shows where a site is.

@@ -3,8 +3,6 @@
 from cmfsim.planning.landmark_page.content import LandmarkContent
 from cmfsim.planning.page.document import Document, document_text
 
-__all__ = ["landmark_page_text"]
-
 
 def landmark_page_text(content: LandmarkContent) -> str:
     """The text of a page of landmarks, which loads nothing and sends nothing.

@@ -1,7 +1,5 @@
 """From where each landmark is seen best: the standard views of the page of landmarks."""
 
-__all__ = ["site_view"]
-
 # Degrees as in camera.js (azimuth 0 from the front, 90 from the patient's left; elevation 90 from
 # above), and the height of the picture, mm. Of pairs, the view of the left one.
 MIDLINE = (35.0, 5.0, 110.0)

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from cmfsim.planning.replanning import PlanBand
 
-__all__ = ["band_content"]
-
 
 def band_content(band: PlanBand | None) -> tuple[dict[str, Any] | None, dict[str, NDArray[Any]]]:
     """Values and arrays of a band; none where the page has no band.

@@ -29,8 +29,6 @@ from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_motion import attachment
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["PageContent", "page_content"]
-
 # Triangles that the page draws of the face, and of all bones together.
 FACE_TRIANGLES, BONE_TRIANGLES, LEAST_BONE = 40_000, 60_000, 500
 # Largest number of skin nodes on a page: a larger file is slow to open and to send.

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.page.packing import packed_arrays
 
-__all__ = ["Document", "document_text", "joined_scripts"]
-
 MAIN = "main.js"
 # The folder of the template, of the style and of the scripts that all pages share.
 SHARED = "cmfsim.planning.page"

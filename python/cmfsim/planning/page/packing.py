@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 
-__all__ = ["packed_arrays"]
-
 TYPES = ("float32", "float16", "uint32")
 # Arrays begin at multiples of this, bytes, as typed arrays of JavaScript need it.
 ALIGNED = 8

@@ -5,8 +5,6 @@ import re
 from cmfsim.planning.page.content import PageContent
 from cmfsim.planning.page.document import Document, document_text
 
-__all__ = ["page_text"]
-
 EXACT_NOTE = (
     "Away from the case's own plan, the contact of soft tissue with teeth and gums is "
     "extrapolated, not solved again. For the exact face, save the plan next to the case file "

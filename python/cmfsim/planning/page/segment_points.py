@@ -10,8 +10,6 @@ import numpy as np
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import clinical_motion
 
-__all__ = ["SegmentPoint", "segment_points"]
-
 # A piece of a bone that was separated has the bone's name with a number.
 NUMBERED = re.compile(r"_\d+$")
 # A landmark that several segments could have belongs to one within this of its surface, mm.

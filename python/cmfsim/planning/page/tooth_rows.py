@@ -19,8 +19,6 @@ from cmfsim.values.dental_arch import DentalArch
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.patient_model import PatientModel
 
-__all__ = ["ToothRows", "tooth_rows"]
-
 UPPER_BEARERS = ("maxilla", "midface", "cranium")
 LOWER_BEARERS = ("mandible_body", "mandible")
 # The lower row: its bone within these of the arch, to the side, behind the molars, before the

@@ -16,8 +16,6 @@ from cmfsim.errors import SolverError
 from cmfsim.values.checks import Floats, frozen
 from cmfsim.values.motion import rigid_motion
 
-__all__ = ["COLUMNS", "PlanColumns", "plan_columns"]
-
 # Numbers of a segment: nine of R − I, three for the displacement of its centre.
 COLUMNS = 12
 # Largest difference between the columns and their operator, mm, for a rotation by 7°.

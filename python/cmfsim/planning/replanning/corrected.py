@@ -18,8 +18,6 @@ from cmfsim.planning.replanning.expected_error import (
 from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.values.checks import Floats, as_positive
 
-__all__ = ["CORRECTIONS", "corrected_planning"]
-
 # Plans that are solved for a correction.
 CORRECTIONS = 96
 # With fewer solved plans, interpolation between them is meaningless.

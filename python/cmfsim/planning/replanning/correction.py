@@ -22,8 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["PlanCorrection", "PlanNumbers", "fitted_correction"]
-
 # Lengths ℓ, mm, and noise as a share of the variance, among which plans that are left out choose.
 LENGTHS = (7.0, 10.0, 14.0, 20.0)
 NOISES = (1e-3, 1e-2, 1e-1)

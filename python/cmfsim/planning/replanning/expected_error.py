@@ -13,17 +13,6 @@ from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.progress import Progress
 
-__all__ = [
-    "USUAL",
-    "ExpectedError",
-    "PlanTrial",
-    "expected_error",
-    "moving_segments",
-    "plan_distance",
-    "plan_near",
-    "segment_boxes",
-]
-
 # Plans are tried at these shares of the range, one after the other.
 SHARES = (1.0, 0.5)
 # The usual error is the one that this percentage of the plans stays within.

@@ -21,8 +21,6 @@ from cmfsim.values.scene import Scene
 from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
-__all__ = ["Motions", "PlanningModel", "planning_model"]
-
 # Rigid motions by segment, (4, 4) mm each.
 Motions = Mapping[str, ArrayLike]
 

@@ -28,8 +28,6 @@ from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import SkinBand
 from cmfsim.values.uncertainty import TISSUE, Source
 
-__all__ = ["PlanBand", "plan_band"]
-
 # The sources whose effect grows with the plan by tenths of a millimetre; that of the others, below
 # 0.1 mm, is taken as at the reference.
 MODULI = ("fat modulus", "muscle modulus along", "muscle modulus across")

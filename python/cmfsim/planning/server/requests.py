@@ -16,8 +16,6 @@ from cmfsim.errors import BoundaryError, CaseInputError
 from cmfsim.planning.replanning import PlanningModel
 from cmfsim.values.checks import Floats
 
-__all__ = ["MOST_BYTES", "RefusedError", "check_headers", "check_token", "plan_of_body"]
-
 # A plan of fifty segments takes about 16 kB.
 MOST_BYTES = 65_536
 # Longest motion of a plan, mm: anything longer is a wrong unit.

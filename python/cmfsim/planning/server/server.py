@@ -23,8 +23,6 @@ from cmfsim.planning.server.requests import (
     plan_of_body,
 )
 
-__all__ = ["PlanningServer", "open_port", "serve_planning"]
-
 # Local address only: no other machine on the network can connect.
 HOST = "127.0.0.1"
 # Headers of every response: never cached, never framed, never read by another site.

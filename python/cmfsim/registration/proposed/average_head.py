@@ -13,8 +13,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["average_head", "read_average_head", "write_average_head"]
-
 FILE = "average_head.npz"
 # Coordinates are rounded to this, mm: they pack into 16 bits.
 GRAIN = 1.0 / 100.0

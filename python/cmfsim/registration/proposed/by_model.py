@@ -13,8 +13,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.proposed_landmarks import ProposedSite
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["SitesOfKind", "with_model"]
-
 # Deviations from which a site is doubtful, and from which it is the model's: of normal errors along
 # three axes 3 % and 0.03 % are larger.
 DOUBTFUL, REPLACED = 1.75, 2.5

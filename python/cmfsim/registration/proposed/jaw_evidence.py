@@ -16,8 +16,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.proposed_landmarks import ProposedSite
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["JawEvidence", "jaw_evidence", "separation_points", "weakened"]
-
 # How far the plane of the tooth rows rises to the back against the Frankfort plane, degrees: Downs
 # (1948) measured 1.5 to 14 with a mean of 9.3; synthetic heads have −2.5, the two real ones 6 to 9.
 # A row of which the back belongs to the other jaw has 14 and more.

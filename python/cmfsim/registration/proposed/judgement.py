@@ -13,8 +13,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedSite
 
-__all__ = ["IMAGE_ENDS", "MissingSites", "judged", "missing_sites"]
-
 # Expected error of a site on a head unlike any template, mm: what docs/landmarks.md reports of two
 # real heads, rounded up; sites not named, and heads like a template.
 _ERRORS: Mapping[str, float] = MappingProxyType(

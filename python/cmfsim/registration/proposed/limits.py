@@ -8,8 +8,6 @@ import numpy as np
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["CutPlane", "cut_planes"]
-
 # A surface is cut where so much of it lies in a plane at its end, mm²: the vertex of a round head
 # has some 150 mm² there.
 LEAST_CAP = 400.0

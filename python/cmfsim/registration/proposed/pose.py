@@ -10,8 +10,6 @@ from cmfsim.errors import LandmarkInputError, RegistrationError
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Pose", "distance_from", "levelled", "refined_pose", "surface_samples"]
-
 # Points of a surface that poses are fitted with.
 SAMPLES = 4000
 # Share of the worst pairs that fits leave out: spine, couch and what the other head lacks.

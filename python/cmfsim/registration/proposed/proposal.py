@@ -40,8 +40,6 @@ from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
-__all__ = ["landmarks_from", "measured_biases"]
-
 # Distance of a head from a template at which the template's bias counts half, average-head mm.
 LIKENESS = 0.8
 # Share by which a pair moves towards its mirror image.

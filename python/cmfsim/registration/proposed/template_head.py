@@ -9,8 +9,6 @@ from cmfsim.values.checks import Floats, as_text, check_instance
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["TemplateHead"]
-
 
 @dataclass(frozen=True, eq=False)
 class TemplateHead(Frozen):

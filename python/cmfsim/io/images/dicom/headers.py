@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 
-__all__ = ["SHOWN_INVERTED", "DicomHeader", "Frame", "Tags", "dicom_header"]
-
 # Pixels whose lowest value is shown white (PS3.3 C.7.6.3.1), and the element that states it.
 SHOWN_INVERTED = "MONOCHROME1"
 INVERTED = re.compile(

@@ -17,8 +17,6 @@ from cmfsim.io.images.image_headers import check_shape
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["dicom_files", "dicom_places", "read_dicom_file", "read_dicom_folder"]
-
 # A folder with more files is not one patient's scan.
 MOST_FILES = 20_000
 # How far below a folder its series go on.

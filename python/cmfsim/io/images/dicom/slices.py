@@ -9,9 +9,6 @@ from numpy.typing import NDArray
 from cmfsim.errors import ImageInputError
 from cmfsim.io.images.dicom.headers import DicomHeader, numbers_of
 
-__all__ = ["Slice", "Stack", "counted", "is_localizer", "listed", "slices_of"]
-
-
 # More frames than this are no head's.
 MOST_FRAMES = 20_000
 # Where a classic image of several frames states how far apart they are, by the names of DICOM.

@@ -27,8 +27,6 @@ from cmfsim.processes.child import ReaderError, ReadLimits, read_in_child
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["volume_of"]
-
 # Slices of another orientation than the rest, up to this many, are scouts.
 MOST_SCOUTS = 3
 # Direction cosines of parallel slices agree up to this.

@@ -7,8 +7,6 @@ from types import MappingProxyType
 
 from cmfsim.errors import CaseInputError
 
-__all__ = ["UNPACKERS"]
-
 
 def _zlib(block: bytes, size: int) -> bytes:
     worker = zlib.decompressobj()

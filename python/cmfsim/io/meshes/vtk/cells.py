@@ -6,8 +6,6 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.io.meshes.plain_mesh import CELL_CORNERS, Cells
 
-__all__ = ["cells_by_type"]
-
 Integers = NDArray[np.int64]
 # VTK's numbers (vtkCellType.h); other cells keep their number as their name.
 NAMES = {

@@ -21,8 +21,6 @@ from cmfsim.io.meshes.stated_frames import stated_frame
 from cmfsim.io.meshes.vtk.cells import cells_by_type
 from cmfsim.processes.child import Answer, ReaderError, ReadLimits, read_in_child
 
-__all__ = ["LIBRARIES", "legacy_answer", "read_vtk_legacy"]
-
 # What the child process imports before the time of a file begins.
 LIBRARIES = ("vtkmodules.vtkIOLegacy", "vtkmodules.util.numpy_support")
 # Words by which VTK's writers begin a file; its third line states how numbers are written.

@@ -7,14 +7,6 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "VTK_TETRA",
-    "data_array",
-    "write_tets",
-    "write_triangles",
-    "write_vtk",
-]
-
 VTK_TETRA = 10
 VTK_TYPES = {
     "float64": "Float64",

@@ -25,8 +25,6 @@ from cmfsim.io.meshes.stated_frames import stated_in_field
 from cmfsim.io.meshes.vtk.blocks import UNPACKERS
 from cmfsim.io.meshes.vtk.cells import cells_by_type
 
-__all__ = ["read_vtk_xml"]
-
 # Nested elements and all elements that a file may have; VTK nests eight.
 MAX_DEPTH, MAX_ELEMENTS = 32, 100_000
 MAX_COMPONENTS = 1000

@@ -9,8 +9,6 @@ from cmfsim.lab.benchmark.bands import COVERAGE
 from cmfsim.lab.benchmark.results import REGIONS, MethodResult
 from cmfsim.lab.benchmark.tables.markdown import DASH, cell, table
 
-__all__ = ["band_sections"]
-
 ABOUT = (
     "Number of patients whose true skin lies within the band at all vertices of a region; in "
     "brackets, the range of this number that a band of this calibration has with a probability "

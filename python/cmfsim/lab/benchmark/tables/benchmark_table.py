@@ -15,8 +15,6 @@ from cmfsim.lab.benchmark.results import REGIONS, MethodResult
 from cmfsim.lab.benchmark.tables.band_table import band_sections
 from cmfsim.lab.benchmark.tables.markdown import DASH, cell, table
 
-__all__ = ["BenchmarkTable"]
-
 FORMAT = "cmfsim-benchmark"
 COLUMNS = (
     "method",

@@ -11,8 +11,6 @@ import numpy as np
 
 from cmfsim._core import __version__
 
-__all__ = ["machine"]
-
 
 def machine(threads: int | None) -> dict[str, Any]:
     """Processor, cores and threads, versions and commit: plain values.

@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-__all__ = ["STOPPED", "Answer", "kept", "run_job"]
-
 Answer = dict[str, Any]
 # Begins the error of a job that took too long.
 STOPPED = "stopped after the time limit"

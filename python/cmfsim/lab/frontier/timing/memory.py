@@ -4,8 +4,6 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-__all__ = ["peak_memory"]
-
 STATUS = Path("/proc/self/status")
 
 

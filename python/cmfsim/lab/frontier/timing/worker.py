@@ -26,8 +26,6 @@ from cmfsim.solving.simulation import solve_scene
 from cmfsim.values.skin_motion import SkinEnd, carried_points
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["MOVED_FORMAT", "main"]
-
 SKIN_FORMAT = "cmfsim-bench-skin"
 MOVED_FORMAT = "cmfsim-bench-moved"
 

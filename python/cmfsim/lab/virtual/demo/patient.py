@@ -16,8 +16,6 @@ from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import as_positive
 
-__all__ = ["DEMO_PARAMETERS", "DemoCase", "write_demo_case"]
-
 # Of class III: a long mandible with a strong chin under a maxilla that lies back.
 DEMO_PATIENT = PATIENTS[1]
 DEMO_PARAMETERS = DEMO_PATIENT.parameters

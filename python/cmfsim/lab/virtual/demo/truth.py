@@ -19,8 +19,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, as_index_rows, as_rows
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["TRUTH_FILE", "DemoTruth", "read_demo_truth"]
-
 TRUTH_FILE = "truth.npz"
 MEMBERS = ("vertices", "triangles", "landmark_names", "landmarks", "parameters")
 

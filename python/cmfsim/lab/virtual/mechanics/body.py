@@ -9,8 +9,6 @@ from cmfsim.errors import CaseInputError, third_party
 from cmfsim.lab.virtual.mechanics.hyperelastic import HyperelasticTissue, cofactor
 from cmfsim.values.checks import Floats, as_index_rows, as_rows
 
-__all__ = ["HyperelasticBody"]
-
 # Tets whose stiffness is made at a time, so that their blocks (1 kB each) stay in the cache.
 TETS_AT_ONCE = 2_000
 PAIRS = tuple((p, q) for p in range(4) for q in range(p + 1, 4))

@@ -15,8 +15,6 @@ from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["BoneContact", "SmoothDistance"]
-
 # Pressure per depth of penetration, MPa/mm: under the pressures of soft tissue (a few kPa), nodes
 # penetrate by less than a tenth of a mm.
 STIFFNESS = 0.1

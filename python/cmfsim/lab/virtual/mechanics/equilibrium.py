@@ -15,8 +15,6 @@ from cmfsim.errors import CaseInputError, SolverError, third_party
 from cmfsim.lab.virtual.mechanics.body import HyperelasticBody
 from cmfsim.values.checks import Floats
 
-__all__ = ["Contact", "Equilibrium", "EquilibriumOptions", "NoContact", "find_equilibrium"]
-
 _log = logging.getLogger(__name__)
 
 # Forces below this share of shear modulus times the body's size squared are rounding errors.

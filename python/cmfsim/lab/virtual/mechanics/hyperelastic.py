@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats
 
-__all__ = ["FAT", "MUSCLE", "HyperelasticTissue", "Moduli", "SkinLayer", "cofactor"]
-
 # (i, j, k, ε_ijk) that are not zero.
 PERMUTATIONS = (
     (0, 1, 2, 1.0),

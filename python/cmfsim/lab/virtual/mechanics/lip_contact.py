@@ -16,8 +16,6 @@ from cmfsim.lab.virtual.mechanics.equilibrium import Contact
 from cmfsim.lab.virtual.open_mouth import MARGIN, MouthSlit
 from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
 
-__all__ = ["ContactSum", "Lip", "LipContact", "lips_of"]
-
 # Pressure per depth of penetration, MPa/mm: under the pressures between lips (a few kPa), they
 # penetrate by less than a tenth of a millimetre. With a stiffer contact, Newton's method stalls
 # where rough surfaces slide.

@@ -12,8 +12,6 @@ from cmfsim.phantom.geometry.shapes import FlatTube
 from cmfsim.phantom.muscles import MELT
 from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows, check_one_of
 
-__all__ = ["muscle_field", "skin_share", "thickened"]
-
 # Barycentric places at which a tet is asked whether it is muscle: corners of the four smaller tets
 # about its corners and the middle, drawn in so that none lies on a face.
 NEAR_CORNER = 0.7

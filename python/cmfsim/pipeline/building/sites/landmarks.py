@@ -19,9 +19,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import is_lower_site
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 
-__all__ = ["found_landmarks", "is_to_be_found", "landmark_summary", "needs_lower_jaw"]
-
-
 # Found sites of which one lies farther than this from where it was placed, mm, are of no use:
 # landmarks of unseen heads are 2 to 5 mm off on average.
 DISAGREE = 12.0

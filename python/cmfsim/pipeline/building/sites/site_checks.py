@@ -18,8 +18,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS, is_lower_site
 
-__all__ = ["check_bones_of_sites", "check_pieces"]
-
 # A site farther than this from any bone lies on none: that is a finding of its own, mm.
 REACH = 20.0
 # A site is on the other bone if it is nearer to that by more than this, mm, and by a voxel. Correct

@@ -27,8 +27,6 @@ from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.touching import ObstacleData, TouchingData
 
-__all__ = ["CaseLipContact", "find_seam", "lip_contact", "lip_summary", "separated_at_seam"]
-
 # Nodes of a lip further than this from the other lip, or from the teeth, do not come to them, mm.
 REACH = 8.0
 # Where a sheet goes on past the edges of the teeth it lies further from them than this, mm: a wall

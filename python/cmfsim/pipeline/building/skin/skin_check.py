@@ -8,8 +8,6 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-__all__ = ["check_skin"]
-
 # Sites of the skull that skin covers whatever the lips do.
 COVERED = ("nasion", "mid_philtrum", "pogonion", "suborbital_L", "suborbital_R")
 # Skin alone is 1.5 mm thick: less of all tissue in front of bone is none, mm.

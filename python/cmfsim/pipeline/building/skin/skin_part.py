@@ -8,8 +8,6 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["on_skin"]
-
 # What a triangle's centroid may lie further from the skin than from the tissue's surface, mm.
 SLACK = 0.25
 # Smaller patches, mm², belong to what surrounds them: where tissue is hardly thicker than a tet, a

@@ -9,8 +9,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.renumbering import used_nodes
 
-__all__ = ["held_part"]
-
 # Held nodes that a body needs: three hold it unless they are in line.
 LEAST_HELD = 3
 # What is left out below this volume nobody will miss, mm³.

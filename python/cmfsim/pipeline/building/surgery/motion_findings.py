@@ -16,8 +16,6 @@ from cmfsim.values.finding import Finding
 if TYPE_CHECKING:
     from cmfsim.bones.achieved import AchievedMotion
 
-__all__ = ["motion_findings", "plan_key"]
-
 # A size that differs by less was segmented otherwise, and is not reported. From the second on it is
 # a warning, as for bones that are followed vertex by vertex.
 NOTED, SCALED = 0.01, 0.03

@@ -30,8 +30,6 @@ from cmfsim.values.surface_data import MovedSurface, SurfaceData, joined_surface
 if TYPE_CHECKING:
     from cmfsim.bones.achieved import AchievedMotion, AchievedPlan
 
-__all__ = ["PlannedBones", "planned_bones"]
-
 Motions = Mapping[str, Floats | MovedSurface]
 
 

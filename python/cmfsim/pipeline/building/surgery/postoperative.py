@@ -24,8 +24,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["REFERENCES", "Postoperative", "read_postoperative"]
-
 _log = logging.getLogger(__name__)
 
 # Bones that jaw surgery does not change, by which scans are registered.

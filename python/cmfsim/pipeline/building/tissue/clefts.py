@@ -13,8 +13,6 @@ from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["cleft_tets", "crushed_tets", "without_clefts", "without_crushed"]
-
 # Distances from two segments, taken together and relative to the width of a cleft, up to which
 # tissue cannot move out of their way.
 CONFINED = 3.0

@@ -23,8 +23,6 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["CaseContacts", "arch_sheets", "mean_edge"]
-
 # Least radius of curvature of a sheet, as a part of the tissue's edge length: what tets can follow.
 RADIUS_IN_EDGES = 0.5
 

@@ -18,8 +18,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.moduli import FatModuli
 from cmfsim.values.patient_model import PatientModel
 
-__all__ = ["NoMuscles", "PlacedMuscles", "placed_muscles", "with_muscles"]
-
 
 @dataclass(frozen=True, eq=False)
 class PlacedMuscles:

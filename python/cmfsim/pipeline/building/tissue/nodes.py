@@ -27,8 +27,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.surface_data import MovedSurface
 
-__all__ = ["made_contacts", "nodes_of"]
-
 
 def nodes_of(
     head: Head, stages: Stages, bones: PlannedBones, tissue: Tissue, options: KindOptions

@@ -9,8 +9,6 @@ from cmfsim.meshing.lips import LipSeam
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.image_data import ImageData
 
-__all__ = ["GAP_REFINEMENTS", "allowed_halvings", "lip_halvings", "needed_halvings"]
-
 Counts = NDArray[np.uint8]
 
 # Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of

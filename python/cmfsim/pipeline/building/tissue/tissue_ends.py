@@ -11,8 +11,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
 
-__all__ = ["end_findings"]
-
 # Soft tissue follows a bone that moves over about its own thickness, mm: what is fixed nearer than
 # that holds the face back.
 NEAR_END = 20.0

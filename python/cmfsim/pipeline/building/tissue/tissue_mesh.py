@@ -30,8 +30,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.mesh_report import MeshReport
 
-__all__ = ["end_planes", "region_of", "tissue_mesh"]
-
 # Bodies of tissue below this volume are specks between bones, mm³.
 LEAST_BODY = 1000.0
 # A head ends in a cut, not a crown, where its cross-section near the end is above this share of the

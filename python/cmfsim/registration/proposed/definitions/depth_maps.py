@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from cmfsim.errors import third_party
 from cmfsim.values.checks import Floats
 
-__all__ = ["STEP", "DepthMap", "depth_map"]
-
 # Edge of a cell, mm.
 STEP = 0.75
 # Cells without a point are filled from their neighbours this many cells around.

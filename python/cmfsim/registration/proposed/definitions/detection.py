@@ -19,8 +19,6 @@ from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Detected", "HeadSurfaces", "biases", "detect", "is_lower"]
-
 # Points on a surface per mm² for depth maps: some four in a cell.
 DENSITY = 6.0
 MOST_POINTS = 1_000_000

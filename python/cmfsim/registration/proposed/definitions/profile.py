@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from cmfsim.registration.proposed.definitions.depth_maps import STEP, DepthMap
 from cmfsim.values.checks import Floats
 
-__all__ = ["farthest_from_chord", "local_midline", "most_outside", "smoothed", "upper_end"]
-
 # How far from the plane of symmetry the midline of a jaw is looked for, mm.
 LEAN = 9.0
 # Half the width over which both sides are compared, and cells that are left out at the middle, mm.

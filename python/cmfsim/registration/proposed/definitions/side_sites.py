@@ -9,8 +9,6 @@ from cmfsim.registration.proposed.definitions.depth_maps import STEP, DepthMap
 from cmfsim.registration.proposed.definitions.profile import most_outside, smoothed
 from cmfsim.values.checks import Floats
 
-__all__ = ["Orbit", "SideView", "Sites", "find_orbit", "find_side_sites"]
-
 Sites = dict[str, Floats]
 
 

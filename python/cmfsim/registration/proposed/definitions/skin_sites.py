@@ -8,8 +8,6 @@ from cmfsim.registration.proposed.definitions.depth_maps import STEP, DepthMap
 from cmfsim.registration.proposed.definitions.profile import local_midline, smoothed
 from cmfsim.values.checks import Floats
 
-__all__ = ["find_skin_sites"]
-
 # The soft nasion lies so far below that of the bone, mm.
 NASION_BELOW = 1.0
 # The wing of the nose is widest so far behind its tip, mm.

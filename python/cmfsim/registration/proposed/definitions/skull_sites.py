@@ -20,8 +20,6 @@ from cmfsim.registration.proposed.definitions.side_sites import (
 )
 from cmfsim.values.checks import Floats
 
-__all__ = ["SkullViews", "find_skull_sites", "skull_views"]
-
 
 @dataclass(frozen=True, eq=False)
 class SkullViews:

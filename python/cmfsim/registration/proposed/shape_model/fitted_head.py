@@ -29,8 +29,6 @@ from cmfsim.registration.proposed.shape_model.state import JAW_DEVIATIONS, POSE_
 from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 
-__all__ = ["FittedHead", "fit_head"]
-
 # Rounds in the first place, of all rough poses, and of the best: noise in mm and modes.
 FIRST = ((8.0, 0), (6.0, 0), (5.0, 20), (4.0, 20))
 OPENED = ((5.0, 20), (4.0, 40), (3.0, 40), (3.0, 80))

@@ -20,8 +20,6 @@ from cmfsim.registration.proposed.shape_model.state import (
 )
 from cmfsim.values.checks import Floats
 
-__all__ = ["Evidence", "Known", "refined"]
-
 # Degrees of freedom of the distances: few, so that what the model lacks (spine, couch, metal) is
 # outvoted rather than averaged.
 FREEDOM = 3.0

@@ -13,8 +13,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["CRANIUM", "HINGE", "MANDIBLE", "SITES", "SKIN", "HeadModel", "head_model"]
-
 CRANIUM, MANDIBLE, SKIN = 0, 1, 2
 # Sites of the model in the order of its rows: kind and label.
 SITES = tuple(("skull", name) for name in SKULL_LANDMARKS) + tuple(

@@ -9,8 +9,6 @@ from cmfsim.errors import third_party
 from cmfsim.registration.proposed.shape_model.state import POSE_UNITS
 from cmfsim.values.checks import Floats
 
-__all__ = ["Finder", "pose_columns"]
-
 # Normals at a right angle count as this far apart times √2, mm of the average head.
 NORMAL_REACH = 14.0
 

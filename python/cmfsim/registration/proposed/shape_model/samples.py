@@ -11,8 +11,6 @@ from cmfsim.registration.proposed.pose import surface_samples
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["Cylinder", "HeadSamples", "samples_of"]
-
 # Points on bone and skin that a fit is made with.
 BONE_POINTS, SKIN_POINTS = 3000, 2500
 # Points this near to a flat end, with a normal this far along it, lie on the cut, mm.

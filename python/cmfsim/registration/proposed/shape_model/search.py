@@ -19,8 +19,6 @@ from cmfsim.registration.proposed.shape_model.state import (
 )
 from cmfsim.values.checks import Floats
 
-__all__ = ["SIZE_DEVIATION", "Start", "found_poses"]
-
 # Heads are offered nodding, leaning and turned by this much, degrees, in these sizes, and, where
 # the image ends above, with so much missing there, mm.
 TURNS = (-28.0, 0.0, 28.0)

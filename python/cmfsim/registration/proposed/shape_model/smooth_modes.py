@@ -6,8 +6,6 @@ import numpy as np
 
 from cmfsim.values.checks import Floats
 
-__all__ = ["Kernel", "SmoothModes"]
-
 MIRROR = np.array([-1.0, 1.0, 1.0])
 # Eigenvalues below this share of the largest are rounding.
 ROUNDING = 1e-7

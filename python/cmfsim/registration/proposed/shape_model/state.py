@@ -7,18 +7,6 @@ import numpy as np
 from cmfsim.registration.proposed.shape_model.model import HINGE, HeadModel
 from cmfsim.values.checks import Floats
 
-__all__ = [
-    "JAW_DEVIATIONS",
-    "N_JAW",
-    "N_POSE",
-    "POSE_UNITS",
-    "State",
-    "jaw_rotation",
-    "moved_with_jaw",
-    "rotation_of",
-    "similarity_step",
-]
-
 # Standard deviations of the jaw: opening, lean and turn, rad, and shift across, back and up, mm. A
 # condyle slides forwards by some 10 mm as the mouth opens by 25°.
 JAW_DEVIATIONS = np.array([0.20, 0.04, 0.04, 1.5, 5.0, 3.0])
