@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim._core import IcpFit, Surface, icp
+from cmfsim._core import IcpFit, Surface
 from cmfsim.bones.pairs.shape_fit import ShapeFit, fit_shape
 from cmfsim.errors import RegistrationError, RegistrationInputError
+from cmfsim.registration import icp
 from cmfsim.values.checks import Floats, as_number, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
@@ -90,17 +91,13 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
     try:
         moving = Surface(segment.vertices, segment.triangles, crease_angle=segment.crease_angle)
         found = icp(
-            moving.vertices,
+            moving,
             bone,
-            normals=moving.vertex_normals,
             initial=_start(segment.vertices, bone, options),
             trim=options.trim,
-            max_angle=np.radians(options.max_angle),
+            max_angle=options.max_angle,
             max_iterations=MOST_STEPS,
             tolerance=REST,
-            method=None,
-            max_distance=None,
-            keep_border=False,
         )
         found_matrix = found.matrix
         fit = fit_shape(
@@ -179,11 +176,6 @@ def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
             max_iterations=QUICK_STEPS,
             # Reaching the step limit is expected: the search continues from the best.
             tolerance=0.0,
-            method=None,
-            max_distance=None,
-            max_angle=None,
-            keep_border=False,
-            normals=None,
         )
         if best is None or fit.rms < best.rms:
             best = fit
