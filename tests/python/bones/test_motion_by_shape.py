@@ -45,7 +45,7 @@ def test_slip_size_noise_and_resected_bone_leave_the_motion_of_paired_bone(seed)
     assert json.loads(json.dumps(found.as_dict(), allow_nan=False))["shape"]["open"] == []
 
 
-@pytest.mark.parametrize("scale", [0.95, 0.97, 1.0, 1.03, 1.05])
+@pytest.mark.parametrize("scale", [0.95, 1.0, 1.05])
 def test_a_bone_of_other_triangles_keeps_its_motion_whatever_its_size(scale):
     """5 % were refused; the size is in its interval, and no part of the motion."""
     before = pebble(4, 2)

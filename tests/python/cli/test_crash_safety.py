@@ -338,6 +338,7 @@ def test_a_killed_worker_is_reported_and_does_not_stop_the_rest(case, tmp_path):
     assert not leftovers(cohort.output)
 
 
+@pytest.mark.slow
 def test_a_study_on_a_dask_cluster_gives_what_one_machine_gives(case, tmp_path):
     distributed = pytest.importorskip("distributed")
     cohort = cohort_of(tmp_path, case, ("one",))

@@ -30,9 +30,8 @@ def test_a_turned_image_ends_the_run(tmp_path, axis, said, capsys):
     turned = image.with_values(np.flip(image.values, axis).copy())
     cmfsim.write_image(turned, tmp_path / "ct.nrrd")
     path = write_case(tmp_path, HEAD + IMAGE + PLAN)
-    with pytest.raises(cmfsim.CaseError, match=said) as refused:
-        cmfsim.build_case(cmfsim.Case.load(path))
-    assert "export the image again" in str(refused.value)
     assert main(["predict", str(path), "-o", str(tmp_path / "out"), "--quiet"]) == 2
-    assert said in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert said in err
+    assert "export the image again" in err
     assert not (tmp_path / "out" / "report.html").exists()

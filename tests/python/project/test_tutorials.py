@@ -106,6 +106,7 @@ def test_the_block_is_in_balance(ran):
     assert float(re.search(rf"{NUMBER} mm apart", text)[1]) < 1e-9
 
 
+@pytest.mark.slow
 def test_the_evaluation_finds_the_model_that_made_the_face(ran):
     text, pictures = ran("evaluation")
     means = dict(re.findall(rf"^(no change|H|M) +mean {NUMBER}", text, re.MULTILINE))

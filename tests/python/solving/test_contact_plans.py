@@ -49,7 +49,7 @@ def test_random_plans_converge_in_few_steps(scene, plans):
 def test_the_face_is_a_continuous_function_of_the_plan(model, solver, plans):
     """0.01 mm more motion moves no point of the skin by more than 0.05 mm."""
     skin = model.skin_nodes
-    for plan in plans[:4]:
+    for plan in plans[:2]:
         name = next(n for n, m in plan.items() if not np.allclose(m, np.eye(4)))
         more = {**plan, name: cmfsim.rigid_motion((0.006, -0.008, 0.0)) @ plan[name]}
         here, there = (solver.solve(p).displacements[skin] for p in (plan, more))
