@@ -246,31 +246,41 @@ impl System {
         Ok(iterative.solve_projected(b, conditions, leave, &mut trail, solve)?.rows)
     }
 
+    /// [`solve_columns`](Self::solve_columns) without contact.
+    fn solve_free_columns(
+        &self,
+        mut columns: Vec<Vec<[f64; 3]>>,
+        (scales, share): (&[f64], Option<f64>),
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<Vec<[f64; 3]>>> {
+        if let Kept::Factor { factor, .. } = &self.kept {
+            factor.solve_many(&mut columns);
+            return Ok(columns);
+        }
+        let linked = RowLinks { share, ..RowLinks::default() };
+        let solve = |(b, &scale): (&Rows, &f64)| {
+            let mut solve = PlanSolve::new(scale, interrupted);
+            match (&self.kept, share) {
+                (Kept::Matrix(Unfactored::Iterative(_)), Some(_)) => {
+                    self.solve_linked(b, linked, &[], &mut solve)
+                }
+                _ => self.solve(b, &mut solve),
+            }
+        };
+        columns.iter().zip(scales).map(solve).collect()
+    }
+
     /// Rows for several right-hand sides; `scales` are the lengths of their prescribed fields, mm. With a
     /// `share`, iterative solves may leave that error relative to the solution, in the energy norm.
     pub fn solve_columns(
         &self,
-        mut columns: Vec<Vec<[f64; 3]>>,
+        columns: Vec<Vec<[f64; 3]>>,
         (scales, share): (&[f64], Option<f64>),
         sliding: Option<(&Sliding, Frozen<'_>)>,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
         let Some((sliding, frozen)) = sliding else {
-            if let Kept::Factor { factor, .. } = &self.kept {
-                factor.solve_many(&mut columns);
-                return Ok(columns);
-            }
-            let linked = RowLinks { share, ..RowLinks::default() };
-            let solve = |(b, &scale): (&Rows, &f64)| {
-                let mut solve = PlanSolve::new(scale, interrupted);
-                match (&self.kept, share) {
-                    (Kept::Matrix(Unfactored::Iterative(_)), Some(_)) => {
-                        self.solve_linked(b, linked, &[], &mut solve)
-                    }
-                    _ => self.solve(b, &mut solve),
-                }
-            };
-            return columns.iter().zip(scales).map(solve).collect();
+            return self.solve_free_columns(columns, (scales, share), interrupted);
         };
         let still = vec![[0.0; 3]; sliding.nodes().len()];
         let check = || if interrupted() { Err(MtmError::Interrupted) } else { Ok(()) };

@@ -7,6 +7,7 @@
 use rayon::prelude::*;
 
 use crate::boundary::{Motion, NodeKind, Plan, Segment, matched};
+use crate::contact::{ContactState, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::statics::linear::system::Frozen;
@@ -50,20 +51,7 @@ impl StaticSolver {
         interrupted: Interrupt<'_>,
     ) -> Result<PlanOperator> {
         self.check_linear("a plan operator")?;
-        let mesh = self.tensors.mesh();
-        let places = self.tensors.element_nodes().positions();
-        let n = places.len();
-        let nodes = nodes.unwrap_or_else(|| (0..mesh.n_nodes() as u32).collect());
-        if let Some(row) = nodes.iter().position(|&j| j as usize >= n) {
-            return Err(MtmError::IndexOutOfRange {
-                what: "nodes".into(),
-                row,
-                item: "node",
-                index: nodes[row] as usize,
-                count: n,
-                kind: ErrorKind::Boundary,
-            });
-        }
+        let nodes = self.nodes_or_all(nodes)?;
         let segments = self.node_kinds.segments();
         let rest: Plan = segments
             .iter()
@@ -72,99 +60,159 @@ impl StaticSolver {
         let reference = reference.unwrap_or(&rest);
         rigid_plan(reference)?;
         let contact = self.settled(reference, interrupted)?;
-        let centres: Vec<[f64; 3]> = segments
-            .iter()
-            .map(|s| {
-                let members = s.joined.iter().chain(&s.sliding);
-                let count = (s.joined.len() + s.sliding.len()) as f64;
-                let mut c = [0.0; 3];
-                for &j in members {
-                    c = [0, 1, 2].map(|i| c[i] + places[j as usize][i] / count);
-                }
-                c
-            })
-            .collect();
-
-        // Prescribed fields of all columns, followed by the constant column if there is contact.
-        let (mut fields, mut scales) = (Vec::new(), Vec::new());
-        for (s, segment) in segments.iter().enumerate() {
-            for column in 0..COLUMNS {
-                let mut u = vec![[0.0; 3]; n];
-                for &j in &segment.joined {
-                    u[j as usize] = Rate::unit(column, centres[s]).at(places[j as usize]);
-                }
-                scales.push(if column < 9 { mesh.diagonal() } else { 1.0 });
-                fields.push(self.coupled(&u));
-            }
-        }
+        let centres = self.centres();
+        let columns = self.unit_columns(&centres);
         let solved = match (&contact, &self.sliding) {
             (Some(state), Some(sliding)) => {
-                scales.push(1.0);
-                fields.push(vec![[0.0; 3]; self.reduction.unknowns.len()]);
-                let identity = RigidMotion::identity();
-                let motion = |s: &Segment| *find(reference, &s.name).unwrap_or(&identity);
-                let motions: Vec<RigidMotion> = segments.iter().map(motion).collect();
-                let about = ContactEquilibrium {
-                    rows: &state.rows,
-                    springs: &state.springs,
-                    normals: &state.normals,
-                    forces: &state.forces,
-                    active: &state.active,
-                    sliding: sliding.nodes(),
-                    motions: &motions,
-                };
-                let (mut offsets, mut goals) = (Vec::new(), Vec::new());
-                for (k, field) in fields.iter_mut().enumerate() {
-                    let slope = match centres.get(k / COLUMNS) {
-                        Some(&centre) => {
-                            let rate = Rate::unit(k % COLUMNS, centre);
-                            let mut slope = about.still();
-                            about.add(k / COLUMNS, &rate, &mut slope, field);
-                            slope
-                        }
-                        None => about.at_rest(&state.displacements, places, field),
-                    };
-                    offsets.push(slope.offsets);
-                    goals.push(slope.goals);
-                }
-                let frozen = Frozen {
-                    rows: &state.rows,
-                    offsets: &offsets,
-                    springs: &state.springs,
-                    goals: &goals,
-                };
-                self.solve_columns(fields, (&scales, None), Some(frozen), interrupted)?
+                self.solve_in_contact(columns, (state, sliding), &centres, reference, interrupted)?
             }
-            _ => self.solve_columns(fields, (&scales, None), None, interrupted)?,
+            _ => self.solve_columns(columns.fields, (&columns.scales, None), None, interrupted)?,
         };
+        let rows = self.rows_of(&nodes, &centres, &solved)?;
+        // The last column is that which does not depend on the plan.
+        let constant = contact.is_some().then(|| solved.last()).flatten();
+        let offset = constant.map(|u| self.values_of(&nodes, u));
+        let segments = segments.iter().map(|s| s.name.clone()).collect();
+        Ok(PlanOperator { nodes, segments, centres, rows, offset })
+    }
 
-        let kinds = self.node_kinds.kinds(n)?;
-        let mut rows = vec![[0.0; COLUMNS]; 3 * nodes.len() * segments.len()];
-        let mut offset = contact.as_ref().map(|_| vec![0.0; 3 * nodes.len()]);
+    /// The `nodes` of an operator, checked: all nodes of the mesh if there are none.
+    fn nodes_or_all(&self, nodes: Option<Vec<u32>>) -> Result<Vec<u32>> {
+        let n = self.tensors.element_nodes().positions().len();
+        let nodes = nodes.unwrap_or_else(|| (0..self.tensors.mesh().n_nodes() as u32).collect());
+        match nodes.iter().position(|&j| j as usize >= n) {
+            Some(row) => Err(MtmError::IndexOutOfRange {
+                what: "nodes".into(),
+                row,
+                item: "node",
+                index: nodes[row] as usize,
+                count: n,
+                kind: ErrorKind::Boundary,
+            }),
+            None => Ok(nodes),
+        }
+    }
+
+    /// Mean position of the joined and sliding nodes of each segment, mm.
+    fn centres(&self) -> Vec<[f64; 3]> {
+        let places = self.tensors.element_nodes().positions();
+        let centre = |s: &Segment| {
+            let count = (s.joined.len() + s.sliding.len()) as f64;
+            s.joined
+                .iter()
+                .chain(&s.sliding)
+                .fold([0.0; 3], |c, &j| [0, 1, 2].map(|i| c[i] + places[j as usize][i] / count))
+        };
+        self.node_kinds.segments().iter().map(centre).collect()
+    }
+
+    /// The right-hand sides of the unit fields of all segments.
+    fn unit_columns(&self, centres: &[[f64; 3]]) -> UnitColumns {
+        let places = self.tensors.element_nodes().positions();
+        let mut columns = UnitColumns::default();
+        for (segment, &centre) in self.node_kinds.segments().iter().zip(centres) {
+            for column in 0..COLUMNS {
+                let mut u = vec![[0.0; 3]; places.len()];
+                for &j in &segment.joined {
+                    u[j as usize] = Rate::unit(column, centre).at(places[j as usize]);
+                }
+                columns.scales.push(if column < 9 { self.tensors.mesh().diagonal() } else { 1.0 });
+                columns.fields.push(self.coupled(&u));
+            }
+        }
+        columns
+    }
+
+    /// The rows of all `columns` under the contact of the plan `reference`, and last those of the column that does
+    /// not depend on the plan.
+    fn solve_in_contact(
+        &self,
+        mut columns: UnitColumns,
+        (state, sliding): (&ContactState, &Sliding),
+        centres: &[[f64; 3]],
+        reference: &Plan,
+        interrupted: Interrupt<'_>,
+    ) -> Result<Vec<Vec<[f64; 3]>>> {
+        columns.scales.push(1.0);
+        columns.fields.push(vec![[0.0; 3]; self.reduction.unknowns.len()]);
+        let identity = RigidMotion::identity();
+        let motion = |s: &Segment| *find(reference, &s.name).unwrap_or(&identity);
+        let motions: Vec<RigidMotion> = self.node_kinds.segments().iter().map(motion).collect();
+        let about = ContactEquilibrium {
+            rows: &state.rows,
+            springs: &state.springs,
+            normals: &state.normals,
+            forces: &state.forces,
+            active: &state.active,
+            sliding: sliding.nodes(),
+            motions: &motions,
+        };
+        let places = self.tensors.element_nodes().positions();
+        let (mut offsets, mut goals) = (Vec::new(), Vec::new());
+        for (k, field) in columns.fields.iter_mut().enumerate() {
+            let slope = match centres.get(k / COLUMNS) {
+                Some(&centre) => {
+                    let rate = Rate::unit(k % COLUMNS, centre);
+                    let mut slope = about.still();
+                    about.add(k / COLUMNS, &rate, &mut slope, field);
+                    slope
+                }
+                None => about.at_rest(&state.displacements, places, field),
+            };
+            offsets.push(slope.offsets);
+            goals.push(slope.goals);
+        }
+        let (rows, springs) = (&state.rows[..], &state.springs[..]);
+        let frozen = Frozen { rows, offsets: &offsets, springs, goals: &goals };
+        self.solve_columns(columns.fields, (&columns.scales, None), Some(frozen), interrupted)
+    }
+
+    /// The coefficients of an operator for `nodes`, of the columns that were `solved`.
+    fn rows_of(
+        &self,
+        nodes: &[u32],
+        centres: &[[f64; 3]],
+        solved: &[Vec<[f64; 3]>],
+    ) -> Result<Vec<[f64; COLUMNS]>> {
+        let places = self.tensors.element_nodes().positions();
+        let kinds = self.node_kinds.kinds(places.len())?;
+        let width = centres.len();
+        let mut rows = vec![[0.0; COLUMNS]; 3 * nodes.len() * width];
         for (at, &j) in nodes.iter().enumerate() {
             let row = self.reduction.row_of[j as usize];
-            for s in 0..segments.len() {
+            for (s, &centre) in centres.iter().enumerate() {
                 for column in 0..COLUMNS {
                     let u = if row != NO_ROW {
                         solved[COLUMNS * s + column][row as usize]
                     } else if kinds[j as usize] == NodeKind::Joined(s) {
-                        Rate::unit(column, centres[s]).at(places[j as usize])
+                        Rate::unit(column, centre).at(places[j as usize])
                     } else {
                         [0.0; 3]
                     };
                     for i in 0..3 {
-                        rows[(3 * at + i) * segments.len() + s][column] = u[i];
+                        rows[(3 * at + i) * width + s][column] = u[i];
                     }
                 }
             }
-            if let (Some(offset), true) = (&mut offset, row != NO_ROW) {
-                let u = solved[COLUMNS * segments.len()][row as usize];
-                offset[3 * at..3 * at + 3].copy_from_slice(&u);
-            }
         }
-        let segments = segments.iter().map(|s| s.name.clone()).collect();
-        Ok(PlanOperator { nodes, segments, centres, rows, offset })
+        Ok(rows)
     }
+
+    /// The components of the rows `u` at `nodes`, 0 where a node has no row.
+    fn values_of(&self, nodes: &[u32], u: &[[f64; 3]]) -> Vec<f64> {
+        let row = |&j: &u32| match self.reduction.row_of[j as usize] {
+            NO_ROW => [0.0; 3],
+            row => u[row as usize],
+        };
+        nodes.iter().flat_map(row).collect()
+    }
+}
+
+/// Right-hand sides of an operator, with the lengths of their prescribed fields, mm.
+#[derive(Default)]
+struct UnitColumns {
+    fields: Vec<Vec<[f64; 3]>>,
+    scales: Vec<f64>,
 }
 
 impl PlanOperator {
