@@ -26,7 +26,7 @@ PYTHON_DIRS := python tests/python scripts examples benches fuzz slicer
 CORE_FEATURES := --features mtm-core/metis
 
 .DEFAULT_GOAL := help
-.PHONY: help build test test-rust test-python test-slow lint lint-rust lint-python format wheel notices bench peers stability elements frontier fuzz demo docs tutorials clean
+.PHONY: help build quick test test-rust test-python test-slow lint lint-rust lint-python format wheel notices bench peers stability elements frontier fuzz demo docs tutorials clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sort | sed -E 's/^([a-z-]+):.*## /  \1\t/' | expand -t 16
@@ -51,6 +51,11 @@ $(DOCS_STAMP): $(BUILD_STAMP)
 	@touch $@
 
 build: $(BUILD_STAMP) ## create .venv, compile the core and install cmfsim into it
+
+# The stamps go, so that whatever runs next compiles the core fully again.
+quick: $(ENV_STAMP) ## compile a change of the core in seconds, less optimised (the first time in minutes)
+	@rm -f $(BUILD_STAMP) $(DEVELOP_STAMP)
+	$(subst --release,--profile quick,$(DEVELOP)) --extras imaging,mesh,report,study,test,lint
 
 test: test-rust test-python ## build, then run every test of the project
 
