@@ -289,9 +289,13 @@ def main() -> None:
         variant = VARIANTS[name]
         to_variant = getattr(variant, "to_variant", lambda _: np.eye(4))(image)
         motion = to_variant[:3, :3] @ FORWARDS
+        # A smaller head has smaller tets, or its mesh would be compared as well.
+        edge = options.edge * float(np.cbrt(np.linalg.det(to_variant[:3, :3])))
 
-        def make(variant: Any = variant, motion: np.ndarray = motion) -> dict[str, Any]:
-            return predicted(variant.make(image), motion, options.edge)
+        def make(
+            variant: Any = variant, motion: np.ndarray = motion, edge: float = edge
+        ) -> dict[str, Any]:
+            return predicted(variant.make(image), motion, edge)
 
         row = _kept(options.cache, name, options.edge, make)
         if not row["error"]:
