@@ -84,20 +84,7 @@ impl PyBoundary {
             segment(&mut segments, &name).contact = Some(surface.get().core.clone());
         }
         for (name, value) in entries(gap, "gap")? {
-            let gap = if let Ok(text) = value.cast::<PyString>() {
-                match text.to_str()? {
-                    "rest" => Gap::Rest,
-                    other => {
-                        let problem =
-                            format!("gap[\"{name}\"] is \"{other}\": give mm or \"rest\"");
-                        return Err(errors::input(BOUNDARY, problem));
-                    }
-                }
-            } else {
-                let what = format!("gap[\"{name}\"]");
-                let values = arrays::values(&value, Named(&what, BOUNDARY))?;
-                if values.len() == 1 { Gap::Uniform(values[0]) } else { Gap::PerNode(values) }
-            };
+            let gap = read_gap(&name, &value)?;
             let Some(segment) = segments.iter_mut().find(|s| s.name == name) else {
                 let problem = format!("gap[\"{name}\"]: no such segment");
                 return Err(errors::input(BOUNDARY, problem));
@@ -259,4 +246,20 @@ fn segment<'a>(segments: &'a mut Vec<Segment>, name: &str) -> &'a mut Segment {
         segments.len() - 1
     });
     &mut segments[at]
+}
+
+/// The gap of the segment `name`: mm for all of its nodes or for each, or "rest".
+fn read_gap(name: &str, value: &Bound<'_, PyAny>) -> PyResult<Gap> {
+    if let Ok(text) = value.cast::<PyString>() {
+        return match text.to_str()? {
+            "rest" => Ok(Gap::Rest),
+            other => {
+                let problem = format!("gap[\"{name}\"] is \"{other}\": give mm or \"rest\"");
+                Err(errors::input(BOUNDARY, problem))
+            }
+        };
+    }
+    let what = format!("gap[\"{name}\"]");
+    let values = arrays::values(value, Named(&what, BOUNDARY))?;
+    Ok(if values.len() == 1 { Gap::Uniform(values[0]) } else { Gap::PerNode(values) })
 }

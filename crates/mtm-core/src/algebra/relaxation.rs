@@ -48,25 +48,7 @@ pub fn relax(
     options: &RelaxationOptions,
     interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<RelaxationOutcome> {
-    let inverse = (0..a.n_rows())
-        .map(|j| {
-            let block = Matrix3::from_row_slice(a.diagonal_block(j));
-            block
-                .cholesky()
-                .map(|c| {
-                    let m = c.inverse();
-                    let mut out: Block = [0.0; 9];
-                    for (i, v) in out.iter_mut().enumerate() {
-                        *v = m[(i / 3, i % 3)];
-                    }
-                    out
-                })
-                .ok_or_else(|| MtmError::NotPositiveDefinite {
-                    node: j,
-                    detail: "its vertex tensor is not positive definite".into(),
-                })
-        })
-        .collect::<Result<Vec<Block>>>()?;
+    let inverse = (0..a.n_rows()).map(|j| inverse_block(a, j)).collect::<Result<Vec<Block>>>()?;
     let mut x = start.to_vec();
     let (mut steps, mut bound) = (Vec::new(), f64::INFINITY);
     for sweep in 1..=options.max_sweeps {
@@ -115,4 +97,15 @@ pub fn relax(
         },
         advice: "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison",
     })
+}
+
+/// K_jj⁻¹.
+fn inverse_block(a: &BlockMatrix, j: usize) -> Result<Block> {
+    let block = Matrix3::from_row_slice(a.diagonal_block(j));
+    let factor = block.cholesky().ok_or_else(|| MtmError::NotPositiveDefinite {
+        node: j,
+        detail: "its vertex tensor is not positive definite".into(),
+    })?;
+    let m = factor.inverse();
+    Ok(std::array::from_fn(|i| m[(i / 3, i % 3)]))
 }

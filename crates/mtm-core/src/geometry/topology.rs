@@ -61,17 +61,7 @@ impl Topology {
         normals: &[Vec3],
         crease_angle: f64,
     ) -> Self {
-        let mut sides: Vec<TriangleSide> = Vec::with_capacity(3 * triangles.len());
-        for (t, triangle) in triangles.iter().enumerate() {
-            for k in 0..3 {
-                let (from, to) = (triangle[k], triangle[(k + 1) % 3]);
-                let (edge, ascending) =
-                    if from < to { ([from, to], true) } else { ([to, from], false) };
-                sides.push(TriangleSide { edge, triangle: t as u32, k: k as u8, ascending });
-            }
-        }
-        sides.par_sort_unstable();
-
+        let sides = TriangleSide::sorted(&triangles);
         let mut edges = Vec::with_capacity(sides.len() / 2 + 1);
         let mut border_edges = Vec::new();
         let mut neighbours = vec![[NO_TRIANGLE; 3]; triangles.len()];
@@ -127,6 +117,21 @@ impl Topology {
 }
 
 impl TriangleSide {
+    /// The sides of `triangles`, those of one edge next to each other.
+    fn sorted(triangles: &[[u32; 3]]) -> Vec<Self> {
+        let mut sides: Vec<Self> = Vec::with_capacity(3 * triangles.len());
+        for (t, triangle) in triangles.iter().enumerate() {
+            for k in 0..3 {
+                let (from, to) = (triangle[k], triangle[(k + 1) % 3]);
+                let (edge, ascending) =
+                    if from < to { ([from, to], true) } else { ([to, from], false) };
+                sides.push(Self { edge, triangle: t as u32, k: k as u8, ascending });
+            }
+        }
+        sides.par_sort_unstable();
+        sides
+    }
+
     /// Corner number `3 * triangle + k` at the start (0) or end (1) of the side.
     fn corner(&self, end: u32) -> u32 {
         3 * self.triangle + (u32::from(self.k) + end) % 3

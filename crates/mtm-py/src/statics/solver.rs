@@ -108,15 +108,7 @@ impl PyStaticSolver {
                 .into());
             }
         };
-        let memory_limit = match memory_limit {
-            Some(mb) if mb.is_finite() && mb > 0.0 => Some((mb * 1e6) as usize),
-            Some(value) => {
-                let problem =
-                    format!("memory_limit is {value}: allowed is a positive number of MB");
-                return Err(errors::input(ErrorKind::Solver, problem));
-            }
-            None => available_memory().map(|bytes| (MEMORY_SHARE * bytes) as usize),
-        };
+        let memory_limit = memory_bytes(memory_limit)?;
         let count = |value: Option<&Bound<'_, PyAny>>, name| {
             value
                 .map(|v| arrays::whole::<usize>(v, Named(name, SOLVER), 1..=MOST_ITERATIONS))
@@ -309,4 +301,16 @@ fn available_memory() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find(|l| l.starts_with("MemAvailable:"))?;
     line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|kb| 1024.0 * kb)
+}
+
+/// The limit of memory in bytes; without one in MB, a share of what is available.
+fn memory_bytes(limit: Option<f64>) -> PyResult<Option<usize>> {
+    match limit {
+        Some(mb) if mb.is_finite() && mb > 0.0 => Ok(Some((mb * 1e6) as usize)),
+        Some(value) => {
+            let problem = format!("memory_limit is {value}: allowed is a positive number of MB");
+            Err(errors::input(ErrorKind::Solver, problem))
+        }
+        None => Ok(available_memory().map(|bytes| (MEMORY_SHARE * bytes) as usize)),
+    }
 }

@@ -123,6 +123,35 @@ impl Reached {
     }
 }
 
+impl PcgOutcome {
+    /// The solution of `n` rows without a right-hand side.
+    fn at_rest(n: usize) -> Self {
+        Self {
+            solution: vec![[0.0; 3]; n],
+            iterations: 0,
+            error_estimate_mm: 0.0,
+            energy_error: 0.0,
+            residual: 0.0,
+            residual_history: Vec::new(),
+            ritz: [1.0; 2],
+        }
+    }
+}
+
+/// Checks that there are `n` finite `rows` called `what`.
+fn check_rows(what: &str, rows: &[[f64; 3]], n: usize) -> Result<()> {
+    if rows.len() != n {
+        return Err(MtmError::Length {
+            what: what.to_owned(),
+            found: rows.len(),
+            expected: n,
+            why: "one row per block row of the matrix",
+            kind: ErrorKind::Solver,
+        });
+    }
+    check_finite_rows(what, rows, ErrorKind::Solver)
+}
+
 /// [`pcg`] for one of several systems that differ little, with the same preconditioner.
 ///
 /// `seen`: what earlier systems revealed of the spectrum. With `enough`, the solution is only an intermediate
@@ -136,30 +165,12 @@ pub(crate) fn pcg_near(
     seen: &mut Spectrum,
 ) -> Result<Reached> {
     let &Problem { a, b, preconditioner, interrupted } = problem;
-    let n = a.n_rows();
     for (what, rows) in [("right-hand side", b), ("start vector", x0)] {
-        if rows.len() != n {
-            return Err(MtmError::Length {
-                what: what.to_owned(),
-                found: rows.len(),
-                expected: n,
-                why: "one row per block row of the matrix",
-                kind: ErrorKind::Solver,
-            });
-        }
-        check_finite_rows(what, rows, ErrorKind::Solver)?;
+        check_rows(what, rows, a.n_rows())?;
     }
     let b_norm = dot(b, b).sqrt();
     if b_norm == 0.0 {
-        return Ok(Reached::Solution(PcgOutcome {
-            solution: vec![[0.0; 3]; n],
-            iterations: 0,
-            error_estimate_mm: 0.0,
-            energy_error: 0.0,
-            residual: 0.0,
-            residual_history: Vec::new(),
-            ritz: [1.0; 2],
-        }));
+        return Ok(Reached::Solution(PcgOutcome::at_rest(a.n_rows())));
     }
 
     let mut state = State::new(a, b, x0, preconditioner, seen);

@@ -39,13 +39,9 @@ pub(crate) fn trial(
     max_iterations: usize,
     interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<Trial> {
-    let n = a.n_rows();
-    let zeros = vec![[0.0; 3]; n];
-    let mut known: Vec<[f64; 3]> =
-        (0..n).map(|j| [0, 1, 2].map(|i| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin())).collect();
-    a.project(&mut known);
-    let size = farthest(&known, &zeros);
-    let mut seen = Spectrum::default();
+    let zeros = vec![[0.0; 3]; a.n_rows()];
+    let known = known_field(a);
+    let (size, mut seen) = (farthest(&known, &zeros), Spectrum::default());
     if size == 0.0 {
         return Ok(Trial { seen, error: 0.0, iterations: 0 });
     }
@@ -95,4 +91,12 @@ pub(crate) fn trial(
         }
     }
     Ok(Trial { seen, error: best, iterations })
+}
+
+/// A field in which every node moves independently.
+fn known_field(a: &dyn Operator) -> Vec<[f64; 3]> {
+    let wave = |j: usize, i: usize| 1.0 + 0.5 * ((3 * j + i) as f64 * 0.7).sin();
+    let mut known: Vec<[f64; 3]> = (0..a.n_rows()).map(|j| [0, 1, 2].map(|i| wave(j, i))).collect();
+    a.project(&mut known);
+    known
 }

@@ -47,61 +47,11 @@ impl Aggregates {
     /// rows join the neighbour they are most strongly connected to; rows still left form their own aggregates.
     /// Rows without any strong connection stay outside: the smoother suffices for them.
     fn from_weights(row_start: &[usize], columns: &[u32], weights: &[f32]) -> Self {
-        let n = row_start.len() - 1;
-        let mut of_row = vec![UNASSIGNED; n];
-        let mut count = 0_u32;
-        let strong = |i: usize| {
-            let range = row_start[i]..row_start[i + 1];
-            columns[range.clone()]
-                .iter()
-                .zip(&weights[range])
-                .filter(|(_, w)| **w > 0.0)
-                .map(|(j, w)| (*j as usize, *w))
-        };
-        for i in 0..n {
-            if of_row[i] != UNASSIGNED || strong(i).any(|(j, _)| of_row[j] != UNASSIGNED) {
-                continue;
-            }
-            let mut founded = false;
-            for (j, _) in strong(i) {
-                of_row[j] = count;
-                founded = true;
-            }
-            if founded {
-                of_row[i] = count;
-                count += 1;
-            }
-        }
-        let founders = of_row.clone();
-        for i in 0..n {
-            if founders[i] != UNASSIGNED {
-                continue;
-            }
-            let mut best = (0.0, UNASSIGNED);
-            for (j, weight) in strong(i) {
-                if founders[j] != UNASSIGNED && weight > best.0 {
-                    best = (weight, founders[j]);
-                }
-            }
-            of_row[i] = best.1;
-        }
-        for i in 0..n {
-            if of_row[i] != UNASSIGNED {
-                continue;
-            }
-            let mut founded = false;
-            for (j, _) in strong(i) {
-                if of_row[j] == UNASSIGNED {
-                    of_row[j] = count;
-                }
-                founded = true;
-            }
-            if founded {
-                of_row[i] = count;
-                count += 1;
-            }
-        }
-        let count = count as usize;
+        let graph = StrongGraph { row_start, columns, weights };
+        let mut of_row = vec![UNASSIGNED; row_start.len() - 1];
+        let founded = graph.found(&mut of_row);
+        graph.join(&mut of_row);
+        let count = graph.found_by_the_rest(&mut of_row, founded) as usize;
         let mut sizes = vec![0; count];
         for &aggregate in &of_row {
             if aggregate != UNASSIGNED {
@@ -118,5 +68,86 @@ impl Aggregates {
             }
         }
         Self { of_row, count, member_start, members }
+    }
+}
+
+/// Strong connections between rows, with their weights.
+struct StrongGraph<'a> {
+    row_start: &'a [usize],
+    columns: &'a [u32],
+    weights: &'a [f32],
+}
+
+impl StrongGraph<'_> {
+    fn n_rows(&self) -> usize {
+        self.row_start.len() - 1
+    }
+
+    /// The rows strongly connected to row `i`.
+    fn strong(&self, i: usize) -> impl Iterator<Item = (usize, f32)> {
+        let range = self.row_start[i]..self.row_start[i + 1];
+        self.columns[range.clone()]
+            .iter()
+            .zip(&self.weights[range])
+            .filter(|(_, w)| **w > 0.0)
+            .map(|(j, w)| (*j as usize, *w))
+    }
+
+    /// Aggregates of rows whose neighbours are all free; their number.
+    fn found(&self, of_row: &mut [u32]) -> u32 {
+        let mut count = 0;
+        for i in 0..self.n_rows() {
+            if of_row[i] != UNASSIGNED || self.strong(i).any(|(j, _)| of_row[j] != UNASSIGNED) {
+                continue;
+            }
+            let mut founded = false;
+            for (j, _) in self.strong(i) {
+                of_row[j] = count;
+                founded = true;
+            }
+            if founded {
+                of_row[i] = count;
+                count += 1;
+            }
+        }
+        count
+    }
+
+    /// Free rows join the aggregate, of those so far, that they are most strongly connected to.
+    fn join(&self, of_row: &mut [u32]) {
+        let founders = of_row.to_vec();
+        for i in 0..self.n_rows() {
+            if founders[i] != UNASSIGNED {
+                continue;
+            }
+            let mut best = (0.0, UNASSIGNED);
+            for (j, weight) in self.strong(i) {
+                if founders[j] != UNASSIGNED && weight > best.0 {
+                    best = (weight, founders[j]);
+                }
+            }
+            of_row[i] = best.1;
+        }
+    }
+
+    /// Aggregates of the rows still free, after the first `count`; the number of all.
+    fn found_by_the_rest(&self, of_row: &mut [u32], mut count: u32) -> u32 {
+        for i in 0..self.n_rows() {
+            if of_row[i] != UNASSIGNED {
+                continue;
+            }
+            let mut founded = false;
+            for (j, _) in self.strong(i) {
+                if of_row[j] == UNASSIGNED {
+                    of_row[j] = count;
+                }
+                founded = true;
+            }
+            if founded {
+                of_row[i] = count;
+                count += 1;
+            }
+        }
+        count
     }
 }

@@ -217,6 +217,15 @@ struct Level<const N: usize, P: Precision> {
     transfer: Option<Transfer<N, P>>,
 }
 
+/// Modes in scaled unknowns: x̃ = Lᵀ x.
+fn scale_modes<const N: usize>(modes: &mut [[[f64; MODES]; N]], scaling: &Scaling<N>) {
+    modes.par_iter_mut().zip(&scaling.factors).with_min_len(1024).for_each(|(m, l)| {
+        let mut out = [[0.0; MODES]; N];
+        add_transposed_product(&mut out, l, m);
+        *m = out;
+    });
+}
+
 impl<const N: usize, P: Precision> Level<N, P> {
     /// The level without a coarser one.
     fn lone(a: &impl SystemRows<N>, scaling: &Scaling<N>, parts: &mut Parts) -> Self {
@@ -256,12 +265,7 @@ impl<const N: usize, P: Precision> Level<N, P> {
         let coarse_modes = parts.timed(
             "tentative prolongator",
             || {
-                // Modes in scaled unknowns: x̃ = Lᵀ x.
-                modes.par_iter_mut().zip(&scaling.factors).with_min_len(1024).for_each(|(m, l)| {
-                    let mut out = [[0.0; MODES]; N];
-                    add_transposed_product(&mut out, l, m);
-                    *m = out;
-                });
+                scale_modes(&mut modes, scaling);
                 orthonormalise(&aggregates, &mut modes)
             },
             |_| (4 * mode_bytes, 0),

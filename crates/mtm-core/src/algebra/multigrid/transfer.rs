@@ -71,13 +71,7 @@ impl<const N: usize, P: Precision> Transfer<N, P> {
             .with_min_len(1024)
             .map(|&position| {
                 let block = &fine_blocks[position as usize];
-                let mut out = [[P::Stored::default(); MODES]; N];
-                for r in 0..N {
-                    for c in 0..MODES {
-                        out[r][c] = block[c][r];
-                    }
-                }
-                out
+                std::array::from_fn(|r| std::array::from_fn(|c| block[c][r]))
             })
             .collect();
         let n_coarse = transposed.start.len() - 1;

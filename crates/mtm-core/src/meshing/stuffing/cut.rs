@@ -235,34 +235,39 @@ impl<'a> Crossings<'a> {
                 prism(columns).into_iter().for_each(push);
             }
             _ => {
-                let [m1, m2] = [next_minus(), next_minus()];
-                let [a, b] = [next_plus(), next_plus()];
-                let columns = [[a, b], [cut(a, m1), cut(b, m1)], [cut(a, m2), cut(b, m2)]];
-                // Column 0 before column 1 stands for the diagonal from a to the crossing of b.
-                let first = self.ordered(a, b, m1)[0] == a;
-                let second = self.ordered(a, b, m2)[0] == a;
-                let orders: &[[usize; 3]] = match (first, second) {
-                    (true, true) => &[[0, 1, 2], [0, 2, 1]],
-                    (true, false) => &[[2, 0, 1]],
-                    (false, true) => &[[1, 0, 2]],
-                    (false, false) => &[[1, 2, 0], [2, 1, 0]],
-                };
-                // The diagonal inside the cut can be chosen freely: the one with the better tets is used.
-                let best = orders
-                    .iter()
-                    .map(|order| prism(order.map(|c| columns[c])).map(|p| self.oriented(p, n)))
-                    .map(|pieces| {
-                        let worst = pieces
-                            .iter()
-                            .map(|p| shape(p.map(|v| self.position(v, n))))
-                            .fold(f64::INFINITY, f64::min);
-                        (worst, pieces)
-                    })
-                    .reduce(|best, other| if other.0 > best.0 { other } else { best })
-                    .expect("one order at least");
-                out.extend(best.1);
+                let plus = [next_plus(), next_plus()];
+                out.extend(self.halves(plus, [next_minus(), next_minus()], n));
             }
         }
+    }
+
+    /// The tets of a lattice tet with two vertices inside, `a` and `b`, and two outside.
+    fn halves(&self, [a, b]: [u32; 2], [m1, m2]: [u32; 2], n: u32) -> [[u32; 4]; 3] {
+        let cut = |v: u32, w: u32| n + self.edge_number(v, w);
+        let columns = [[a, b], [cut(a, m1), cut(b, m1)], [cut(a, m2), cut(b, m2)]];
+        // Column 0 before column 1 stands for the diagonal from a to the crossing of b.
+        let first = self.ordered(a, b, m1)[0] == a;
+        let second = self.ordered(a, b, m2)[0] == a;
+        let orders: &[[usize; 3]] = match (first, second) {
+            (true, true) => &[[0, 1, 2], [0, 2, 1]],
+            (true, false) => &[[2, 0, 1]],
+            (false, true) => &[[1, 0, 2]],
+            (false, false) => &[[1, 2, 0], [2, 1, 0]],
+        };
+        // The diagonal inside the cut can be chosen freely: the one with the better tets is used.
+        let worst = |pieces: &[[u32; 4]; 3]| {
+            pieces
+                .iter()
+                .map(|p| shape(p.map(|v| self.position(v, n))))
+                .fold(f64::INFINITY, f64::min)
+        };
+        orders
+            .iter()
+            .map(|order| prism(order.map(|c| columns[c])).map(|p| self.oriented(p, n)))
+            .map(|pieces| (worst(&pieces), pieces))
+            .reduce(|best, other| if other.0 > best.0 { other } else { best })
+            .expect("one order at least")
+            .1
     }
 
     fn edge_number(&self, v: u32, w: u32) -> u32 {

@@ -18,7 +18,7 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{MtmError, Result};
 use crate::mesh::TetMesh;
 use crate::vector::Vec3;
 use aligned_box::AlignedBox;
@@ -50,15 +50,7 @@ pub fn sample_muscles(
     options: &SamplingOptions,
     interrupt: &(dyn Fn() -> bool + Sync),
 ) -> Result<MuscleShares> {
-    if !(1..=MOST_SAMPLES).contains(&options.samples) {
-        return Err(MtmError::OutOfRange {
-            what: "samples".to_owned(),
-            index: 0,
-            value: options.samples as f64,
-            allowed: "1 to 1048576",
-            kind: ErrorKind::Material,
-        });
-    }
+    options.check()?;
     let start = Instant::now();
     let stopped = AtomicBool::new(false);
     let stop = || {
@@ -69,16 +61,7 @@ pub fn sample_muscles(
     };
     let shapes: Vec<MuscleShape<'_>> =
         muscles.par_iter().map(|m| MuscleShape::new(&m.surface, options.inside)).collect();
-    let boxes: Vec<AlignedBox> = mesh
-        .tets()
-        .par_iter()
-        .map(|tet| AlignedBox::of(&tet.map(|v| Vec3::from(mesh.nodes()[v as usize]))))
-        .collect();
-    let all = shapes.iter().fold(AlignedBox::EMPTY, |all, shape| all.joined(shape.bounds()));
-    let near: Vec<u32> =
-        (0..mesh.n_tets() as u32).filter(|&t| boxes[t as usize].meets(&all)).collect();
-    let near_boxes: Vec<AlignedBox> = near.iter().map(|&t| boxes[t as usize]).collect();
-    let tree = TetTree::new(&near, &near_boxes);
+    let (boxes, tree) = tets_near(mesh, &shapes);
     let trees = start.elapsed();
 
     let touches: Vec<Touches> = shapes
@@ -116,6 +99,21 @@ pub fn sample_muscles(
     made.counts.points += touches.iter().map(|t| t.evaluations).sum::<usize>();
     made.counts.pairs = touches.iter().map(|t| t.looked_at).sum();
     Ok(made)
+}
+
+/// The box of each tet, and the tree of those near any muscle.
+fn tets_near(mesh: &TetMesh, shapes: &[MuscleShape<'_>]) -> (Vec<AlignedBox>, TetTree) {
+    let boxes: Vec<AlignedBox> = mesh
+        .tets()
+        .par_iter()
+        .map(|tet| AlignedBox::of(&tet.map(|v| Vec3::from(mesh.nodes()[v as usize]))))
+        .collect();
+    let all = shapes.iter().fold(AlignedBox::EMPTY, |all, shape| all.joined(shape.bounds()));
+    let near: Vec<u32> =
+        (0..mesh.n_tets() as u32).filter(|&t| boxes[t as usize].meets(&all)).collect();
+    let near_boxes: Vec<AlignedBox> = near.iter().map(|&t| boxes[t as usize]).collect();
+    let tree = TetTree::new(&near, &near_boxes);
+    (boxes, tree)
 }
 
 #[cfg(test)]

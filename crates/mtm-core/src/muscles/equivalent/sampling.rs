@@ -39,6 +39,21 @@ impl Default for SamplingOptions {
     }
 }
 
+impl SamplingOptions {
+    pub(super) fn check(&self) -> Result<()> {
+        if (1..=MOST_SAMPLES).contains(&self.samples) {
+            return Ok(());
+        }
+        Err(MtmError::OutOfRange {
+            what: "samples".to_owned(),
+            index: 0,
+            value: self.samples as f64,
+            allowed: "1 to 1048576",
+            kind: ErrorKind::Material,
+        })
+    }
+}
+
 impl InsideTest {
     /// The test called `name`.
     pub fn from_name(name: &str) -> Result<Self> {

@@ -15,6 +15,7 @@ use crate::algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions};
 use crate::algebra::relaxation::{RelaxationOptions, relax};
 use crate::contact::links::Link;
 use crate::error::{MtmError, Result, Shortfall};
+use crate::mechanics::tissue::Tissue;
 use crate::statics::linear::confirmed::{Confirmed, is_doubtful};
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::projected_product::ProjectedProduct;
@@ -432,6 +433,13 @@ pub(crate) struct Extremes {
     pub lame_ratio: f64,
     /// Stiffest over softest.
     pub contrast: f64,
+}
+
+impl Extremes {
+    /// Those of `tissue`.
+    pub fn of(tissue: &Tissue) -> Self {
+        Self { lame_ratio: tissue.largest_lame_ratio(), contrast: tissue.contrast() }
+    }
 }
 
 /// Options of the cycle for such a tissue.

@@ -93,23 +93,11 @@ impl StaticSolver {
         let reduction = Arc::new(Reduction::new(&kinds));
         let is_unknown = |j: usize| reduction.row_of[j] != NO_ROW;
         let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
-        let sliding = Sliding::new(
-            &node_kinds,
-            &mesh,
-            places,
-            &reduction.row_of,
-            stiffness,
-            options.contact.mode,
-        )?;
-        let pairs = Pairs::new(&node_kinds, &mesh, places, &reduction.row_of, stiffness)?;
+        let (rows, mode) = (&reduction.row_of, options.contact.mode);
+        let sliding = Sliding::new(&node_kinds, &mesh, places, rows, stiffness, mode)?;
+        let pairs = Pairs::new(&node_kinds, &mesh, places, rows, stiffness)?;
         clock.lap("contact_setup", sliding.is_some() || pairs.is_some());
-        let normals: Vec<(u32, [f64; 3])> = sliding
-            .iter()
-            .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
-            .map(|(s, &n)| (s.node, n))
-            // The tets of a part share whole faces, so its corner nodes decide how it is constrained.
-            .filter(|(node, _)| (*node as usize) < mesh.n_nodes())
-            .collect();
+        let normals = corner_normals(sliding.as_ref(), mesh.n_nodes());
         let held = restraint::check(&mesh, |j| !is_unknown(j), &normals)?;
         clock.lap("restraint", true);
 
@@ -119,17 +107,10 @@ impl StaticSolver {
         if interrupted() {
             return Err(MtmError::Interrupted);
         }
+        let tissue = Extremes::of(tensors.tissue());
         let made = if options.kinematics == Kinematics::Linear {
-            let body = BodyRows {
-                positions: &reduction.rows(places),
-                sliding: sliding.as_ref(),
-                held,
-                tissue: Extremes {
-                    lame_ratio: tensors.tissue().largest_lame_ratio(),
-                    contrast: tensors.tissue().contrast(),
-                },
-                multigrid: None,
-            };
+            let (positions, sliding) = (&reduction.rows(places), sliding.as_ref());
+            let body = BodyRows { positions, sliding, held, tissue, multigrid: None };
             System::new(matrix, &body, &options, &mut clock, interrupted)
                 .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method))
         } else {
@@ -139,7 +120,7 @@ impl StaticSolver {
         let (mechanics, method) = made.map_err(|e| by_node(e, &reduction.unknowns))?;
         let refines = method.has_factor()
             && options.kinematics == Kinematics::Linear
-            && is_doubtful(tensors.tissue().contrast());
+            && is_doubtful(tissue.contrast);
         Ok(Self {
             tensors,
             boundary,
@@ -264,12 +245,7 @@ impl StaticSolver {
         }
         clock.lap("forces", true);
 
-        let mut timings: Timings = self.timings.clone();
-        timings.extend(clock.laps.iter().map(|&(stage, seconds)| {
-            (stage, if stage == "solve" { seconds - contact_seconds } else { seconds })
-        }));
-        timings.push(("contact", contact_seconds));
-        timings.push(("total", clock.total()));
+        let timings = self.timings_of(&clock, contact_seconds);
         let contact_iterations = contact.as_ref().map_or(0, |c| c.iterations);
         Ok(Solution {
             displacements: u,
@@ -283,6 +259,17 @@ impl StaticSolver {
             contact_iterations,
             timings,
         })
+    }
+
+    /// Times of the stages of a plan after those of setting up, s.
+    fn timings_of(&self, clock: &Clock, contact_seconds: f64) -> Timings {
+        let mut timings: Timings = self.timings.clone();
+        timings.extend(clock.laps.iter().map(|&(stage, seconds)| {
+            (stage, if stage == "solve" { seconds - contact_seconds } else { seconds })
+        }));
+        timings.push(("contact", contact_seconds));
+        timings.push(("total", clock.total()));
+        timings
     }
 
     /// Internal forces under displacements of all nodes, N.
@@ -470,6 +457,16 @@ fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc
     surface.sort_unstable();
     let on_surface = |edge: [u32; 2]| surface.binary_search(&edge).is_ok();
     Ok(Arc::new(boundary.with_mid_edges(mesh.n_nodes(), edges, on_surface)?))
+}
+
+/// Rest normals of the sliding corner nodes. The tets of a part share whole faces, so its corner nodes decide how it
+/// is constrained.
+fn corner_normals(sliding: Option<&Sliding>, n_corners: usize) -> Vec<(u32, [f64; 3])> {
+    let nodes = sliding.iter().flat_map(|s| s.nodes().iter().zip(s.rest_normals()));
+    nodes
+        .map(|(node, &normal)| (node.node, normal))
+        .filter(|(node, _)| (*node as usize) < n_corners)
+        .collect()
 }
 
 /// Mean stiffness of node `j` on its own, a third of the trace of K_jj, N/mm.
