@@ -120,7 +120,7 @@ forces would still cause with the tangent of cmfsim, or the distance from the cl
   (theory, *Elements*), although `anp` keeps only two thirds of its deflection on a beam two boxes
   thick.
 - **corotational**: a body compressed to about half its length. The energy is finite where a tet
-  inverts, so tets may be inverted at equilibrium; `hyperelastic` resists longer, or is refused.
+  inverts, so tets may be inverted at equilibrium; `hyperelastic` resists inversion, or is refused.
   `solve_scene` and `predict` warn of it (`inverted-tets`: how many, and which is worst) and
   count them in the summary. After `StaticSolver.solve`, look for
   `tensors.volume_change(u) <= -1`.

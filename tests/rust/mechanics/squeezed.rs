@@ -49,14 +49,14 @@ impl Punched {
 
 #[test]
 fn methods_and_tolerances_reach_the_same_equilibrium() {
-    for (slides, most) in [(FIXED, 9), (SLIDING, 9)] {
+    for (slides, most) in [(FIXED, 13), (SLIDING, 13)] {
         let scene = punched(slides);
         let exact = scene.solved(Method::Cholesky, 1e-8);
         assert!(exact.residual < 1e-7, "{slides}: residual {}", exact.residual);
         let by_cg = scene.solved(Method::Pcg, 1e-8);
         let apart = largest_difference(&exact.displacements, &by_cg.displacements);
         assert!(apart < 1e-6, "{slides}: {apart} mm");
-        // One more if the nodes around the punch do not move on their own.
+        // More if the nodes around the punch do not move on their own.
         assert!(by_cg.iterations <= most, "{slides}: {} steps", by_cg.iterations);
         let early = scene.solved(Method::Pcg, 0.05);
         let apart = largest_difference(&exact.displacements, &early.displacements);

@@ -10,7 +10,7 @@
 
 use nalgebra::{Cholesky, Matrix3, Matrix6, SVector, SymmetricEigen, Vector3};
 
-use crate::mechanics::hyperelastic::{HyperelasticLaw, PointResponse, Tangent, cofactor};
+use crate::mechanics::hyperelastic::{PointResponse, Tangent, cofactor};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::material::{Lame, Voigt};
 use crate::mechanics::polar::{Polar, small_tangent};
@@ -32,8 +32,8 @@ const VOIGT: [usize; 9] = [0, 5, 4, 5, 1, 3, 4, 3, 2];
 /// Energy density of one material.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Density {
-    /// The hyperelastic law of its isotropic part.
-    isotropic: Option<(HyperelasticLaw, Lame)>,
+    /// Constants of its hyperelastic part, whose law is that of the kinematics.
+    isotropic: Option<Lame>,
     stretch: Option<Stiffness>,
 }
 
@@ -61,14 +61,14 @@ impl Density {
             TetMaterial::Isotropic(lame) => Stiffness::Isotropic(*lame),
             other => Stiffness::General(other.voigt()),
         };
-        let law = match kinematics {
+        match kinematics {
             Kinematics::Linear | Kinematics::Corotational => {
                 return Self { isotropic: None, stretch: Some(stiffness) };
             }
-            Kinematics::Hyperelastic(law) => law,
-        };
+            Kinematics::Hyperelastic(_) => {}
+        }
         match stiffness {
-            Stiffness::Isotropic(lame) => Self { isotropic: Some((law, lame)), stretch: None },
+            Stiffness::Isotropic(lame) => Self { isotropic: Some(lame), stretch: None },
             Stiffness::General(c) => {
                 let lame = nearest_isotropic(&c);
                 let mut rest = c;
@@ -79,7 +79,7 @@ impl Density {
                     }
                 }
                 let stretch = Some(Stiffness::General(rest));
-                Self { isotropic: Some((law, lame)), stretch }
+                Self { isotropic: Some(lame), stretch }
             }
         }
     }
@@ -91,9 +91,9 @@ impl Density {
         kinematics: Kinematics,
         pressure: f64,
     ) -> PointResponse {
-        let mut out = match &self.isotropic {
-            Some((law, lame)) => law.response(*lame, f),
-            None => PointResponse { energy: 0.0, stress: Matrix3::zeros() },
+        let mut out = match (kinematics, &self.isotropic) {
+            (Kinematics::Hyperelastic(law), Some(lame)) => law.response(*lame, f),
+            _ => PointResponse { energy: 0.0, stress: Matrix3::zeros() },
         };
         if let Some(stiffness) = &self.stretch {
             let polar = Polar::new(f);
@@ -121,7 +121,7 @@ impl Density {
             Kinematics::Hyperelastic(_) => (pressure, 0.0),
             Kinematics::Linear | Kinematics::Corotational => (0.0, pressure),
         };
-        if let Some((law, lame)) = &self.isotropic {
+        if let (Kinematics::Hyperelastic(law), Some(lame)) = (kinematics, &self.isotropic) {
             let found = law.tangent(*lame, f);
             of_law = found.own;
             cofactor_stress += found.cofactor_stress;
@@ -487,17 +487,19 @@ mod tests {
                         };
                         let stress = density.response(&f, kinematics, pressure).stress;
                         let tangent = density.tangent(&f, kinematics, pressure);
+                        // Inverted tissue is up to 1e4 times as stiff.
+                        let allowed = TOLERANCE * tangent.amax().max(1.0);
                         for entry in 0..9 {
                             let mut step = Matrix3::zeros();
                             step[(entry / 3, entry % 3)] = STEP;
                             let slope = (total(&(f + step)) - total(&(f - step))) / (2.0 * STEP);
                             let off = slope - stress[(entry / 3, entry % 3)];
-                            assert!(off.abs() < TOLERANCE, "{kinematics:?} {f} stress {off}");
+                            assert!(off.abs() < allowed, "{kinematics:?} {f} stress {off}");
                             let ahead = density.response(&(f + step), kinematics, pressure).stress;
                             let behind = density.response(&(f - step), kinematics, pressure).stress;
                             let column = flat(&((ahead - behind) / (2.0 * STEP)));
                             let off = (column - tangent.column(entry)).amax();
-                            assert!(off < TOLERANCE, "{kinematics:?} {f} tangent {off}");
+                            assert!(off < allowed, "{kinematics:?} {f} tangent {off}");
                         }
                     }
                 }
@@ -564,10 +566,11 @@ mod tests {
                     let here = density.response(&f, kinematics, 0.3);
                     let there = density.response(&(turn * f), kinematics, 0.3);
                     assert!((here.energy - there.energy).abs() < 1e-13 * here.energy.max(1.0));
-                    assert!((turn * here.stress - there.stress).amax() < 1e-13);
+                    let allowed = 1e-13 * here.stress.amax().max(1.0);
+                    assert!((turn * here.stress - there.stress).amax() < allowed);
                     // Balance of moments: P Fᵀ is symmetric.
                     let moment = here.stress * f.transpose();
-                    assert!((moment - moment.transpose()).amax() < 1e-13);
+                    assert!((moment - moment.transpose()).amax() < allowed);
                 }
             }
         }

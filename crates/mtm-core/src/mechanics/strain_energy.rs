@@ -42,11 +42,17 @@ pub struct StrainEnergy {
     tensors: Arc<MassTensors>,
     kinematics: Kinematics,
     /// Energy density of each tet, or of all of them.
-    densities: Vec<Density>,
-    /// Memory of the last state and matrix: clearing new pages takes longer than computing forces.
-    scratch: Mutex<TetValues>,
-    /// Memory of the tangents of an earlier series.
-    freed: Mutex<PointTangents>,
+    densities: Arc<[Density]>,
+    memory: Arc<Memory>,
+}
+
+/// Memory that is used again: clearing new pages takes longer than computing forces.
+#[derive(Debug, Default)]
+struct Memory {
+    /// Of the last state and matrix.
+    values: Mutex<TetValues>,
+    /// Of the tangents of an earlier series.
+    tangents: Mutex<PointTangents>,
 }
 
 /// Values of every tet, kept for their memory only.
@@ -85,6 +91,13 @@ struct Averaged {
     energy: f64,
 }
 
+impl PointTangents {
+    /// Keeps no tangent: the energy changes.
+    pub fn forget(&mut self) {
+        self.at.clear();
+    }
+}
+
 impl StrainEnergy {
     /// The energy of the body of `tensors` under `kinematics`, which must not be linear.
     pub fn new(tensors: Arc<MassTensors>, kinematics: Kinematics) -> Self {
@@ -100,8 +113,25 @@ impl StrainEnergy {
                 }
             })
             .collect();
-        let (scratch, freed) = (Mutex::default(), Mutex::default());
-        Self { tensors, kinematics, densities, scratch, freed }
+        Self { tensors, kinematics, densities, memory: Arc::default() }
+    }
+
+    /// The energy of the same body without that by which hyperelastic tissue resists being squeezed flat.
+    pub(crate) fn without_barrier(&self) -> Self {
+        let kinematics = match self.kinematics {
+            Kinematics::Hyperelastic(law) => Kinematics::Hyperelastic(law.without_barrier()),
+            other => other,
+        };
+        let (tensors, densities) = (self.tensors.clone(), self.densities.clone());
+        Self { tensors, kinematics, densities, memory: self.memory.clone() }
+    }
+
+    /// Whether that energy is not zero anywhere under displacements of all nodes, mm.
+    pub(crate) fn is_at_barrier(&self, u: &[[f64; 3]]) -> bool {
+        let Kinematics::Hyperelastic(law) = self.kinematics else { return false };
+        (0..self.nodes().mesh().n_tets())
+            .into_par_iter()
+            .any(|t| self.gradients(t, u).any(|f| law.is_at_barrier(&f)))
     }
 
     /// The kinematics.
@@ -137,12 +167,12 @@ impl StrainEnergy {
 
     /// Takes the memory of the last state and tangent; another thread's call meanwhile starts with none.
     fn take_scratch(&self) -> TetValues {
-        std::mem::take(&mut *self.scratch.lock().unwrap_or_else(PoisonError::into_inner))
+        std::mem::take(&mut *self.memory.values.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// Keeps `scratch` for the next state and tangent.
     fn keep_scratch(&self, scratch: TetValues) {
-        *self.scratch.lock().unwrap_or_else(PoisonError::into_inner) = scratch;
+        *self.memory.values.lock().unwrap_or_else(PoisonError::into_inner) = scratch;
     }
 
     /// Energy and forces under displacements of all nodes, mm.
@@ -216,7 +246,7 @@ impl StrainEnergy {
     ///
     /// `lag`: the change of any entry of F up to which a definite tangent is kept.
     pub(crate) fn begin(&self, lag: f64) -> PointTangents {
-        let freed = &mut *self.freed.lock().unwrap_or_else(PoisonError::into_inner);
+        let freed = &mut *self.memory.tangents.lock().unwrap_or_else(PoisonError::into_inner);
         let mut tangents = std::mem::take(freed);
         tangents.at.clear();
         tangents.lag = lag;
@@ -225,7 +255,7 @@ impl StrainEnergy {
 
     /// Ends a series, whose memory the next one uses.
     pub(crate) fn end(&self, tangents: PointTangents) {
-        *self.freed.lock().unwrap_or_else(PoisonError::into_inner) = tangents;
+        *self.memory.tangents.lock().unwrap_or_else(PoisonError::into_inner) = tangents;
     }
 
     /// Tangent stiffness under displacements of all nodes, N/mm, on the pattern of the tensors.

@@ -25,6 +25,13 @@ impl RowConditions {
         Self::on_rows(sliding, state.rows.iter().map(|r| (r, 0.0)), &state.springs)
     }
 
+    /// The same conditions for steps from a state at which they hold: constraints move no further.
+    pub fn still(&self) -> Self {
+        let still = |c: &Constraint| Constraint { offset: 0.0, ..*c };
+        let constraints = self.constraints.iter().map(still).collect();
+        Self { constraints, springs: self.springs.clone() }
+    }
+
     /// `held`: rows of contact, each with its offset, mm.
     fn on_rows<'a>(
         sliding: &Sliding,

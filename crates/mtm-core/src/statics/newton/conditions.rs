@@ -74,10 +74,29 @@ impl Equilibrium {
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
         solve.effort.iterations += 1;
 
-        let still = RowConditions {
-            constraints: constraints.iter().map(|c| Constraint { offset: 0.0, ..*c }).collect(),
-            springs: target.conditions.springs.clone(),
-        };
+        self.under_conditions(pose, target, solve)
+    }
+
+    /// Equilibrium from `u`, at the boundary of `target`.
+    pub(super) fn resist(
+        &self,
+        u: Vec<[f64; 3]>,
+        target: &Target<'_>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let pose = self.pose(u, target)?;
+        let (pose, _) = self.eased(pose, target, &target.conditions.still())?;
+        self.under_conditions(pose, target, solve)
+    }
+
+    /// Equilibrium from `pose`, at whose boundary the conditions of `target` hold.
+    fn under_conditions(
+        &self,
+        pose: Iterate,
+        target: &Target<'_>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let (still, interrupted) = (target.conditions.still(), solve.interrupted);
         let mut steps = UnderConditions { equilibrium: self, target, still, interrupted };
         self.descend(pose, target, (f64::INFINITY, &[]), &mut steps, solve)
     }

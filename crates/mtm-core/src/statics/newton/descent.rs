@@ -35,6 +35,10 @@ const WINDOW: usize = 3;
 /// whole error with such parts as well: Newton's method converges quadratically, or only rounding is left.
 const QUADRATIC: f64 = 1e-3;
 
+/// Error relative to the reach below which a state is near enough to its equilibrium for tissue to resist being
+/// squeezed flat: more exact, its equilibrium without that energy is of no use.
+const NEAR_ENOUGH: f64 = 1e-3;
+
 /// Newton's steps under the conditions at the boundary.
 pub(super) trait StepRule {
     /// The step from `pose` with this tangent, and with this error, mm.
@@ -51,7 +55,8 @@ pub(super) trait StepRule {
 }
 
 impl Equilibrium {
-    /// The result of Newton's `steps` from `pose`.
+    /// The result of Newton's `steps` from `pose`; near it where the energy of `target` is one without the barrier
+    /// and tissue is at the barrier.
     ///
     /// `finest`: the error allowed in the last step, mm; `on_walls`: the rows that no step carries further than
     /// computed.
@@ -81,29 +86,18 @@ impl Equilibrium {
                 allowed = allowed.min(finest);
             }
             let first = if length <= near { Exact } else { Definite };
-            let (mut step, mut kind) =
-                by_tangent(first, |kind| steps.next(&pose, (kind, allowed)))?;
-            // Conjugate gradients do not always notice that a tangent is indefinite.
-            let is_long = !by_factor && kind == Exact && step.length() > LONGER * length;
-            if is_long && !self.descends_fully(&pose, target, &step) {
-                (step, kind) = (steps.next(&pose, (Definite, allowed))?, Definite);
-            }
+            let (step, kind) = self.safe_step((&pose, target), (first, allowed), length, steps)?;
             if kind != first {
                 near = RETRY_EXACT * length;
             }
             solve.effort.iterations += 1;
-            let before = length;
-            length = step.length();
+            let before = std::mem::replace(&mut length, step.length());
             solve.effort.history.push(length);
             let goal = self.options.tolerance * reach(&pose, target);
             let left = if self.tissue.contrast > STIFF_PARTS {
                 left_after(&solve.effort.history[start..], goal)
-            } else if length == 0.0 {
-                length
             } else {
-                // Convergence is at least linear, at the rate of the last step: with a tangent that is not that of
-                // the energy for good, with the exact one until steps are short.
-                length / (1.0 - (length / before).min(1.0))
+                left_at_rate(length, before)
             };
             let bound = left + allowed;
             let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
@@ -123,9 +117,32 @@ impl Equilibrium {
             if has_moved {
                 steps.resume(&pose);
             }
+            let is_near = bound <= NEAR_ENOUGH * reach(&pose, target);
+            if is_near && self.has_barrier_ahead(target) && self.energy.is_at_barrier(&pose.u) {
+                return Ok(pose.u);
+            }
         }
         let limit = self.options.tolerance * reach(&pose, target);
         Err(lost("the estimated error of a node", length, limit, " mm"))
+    }
+
+    /// The step from `pose` with the tangent `first` and the error `allowed`, mm, or with the definite tangent
+    /// where the exact one is indefinite; and the tangent used. `before`: length of the step before, mm.
+    fn safe_step(
+        &self,
+        (pose, target): (&Iterate, &Target<'_>),
+        (first, allowed): (TangentKind, f64),
+        before: f64,
+        steps: &mut impl StepRule,
+    ) -> Result<(NewtonStep, TangentKind)> {
+        let (step, kind) = by_tangent(first, |kind| steps.next(pose, (kind, allowed)))?;
+        // Conjugate gradients do not always notice that a tangent is indefinite.
+        let by_factor = matches!(self.solver, TangentSolver::Cholesky(_));
+        let is_long = !by_factor && kind == Exact && step.length() > LONGER * before;
+        if is_long && !self.descends_fully(pose, target, &step) {
+            return Ok((steps.next(pose, (Definite, allowed))?, Definite));
+        }
+        Ok((step, kind))
     }
 
     /// Share of the error of `pose` that is left at `end`, after a step: that of the row furthest from equilibrium
@@ -220,6 +237,16 @@ fn left_after(lengths: &[f64], goal: f64) -> f64 {
     let before = longest(&earlier[earlier.len().saturating_sub(WINDOW)..]);
     let rate = (longest(last) / before).powf(1.0 / WINDOW as f64);
     if rate < 1.0 { longest(last) / (1.0 - rate) } else { f64::INFINITY }
+}
+
+/// Error after a step of a `length` that followed one of the length `before`, mm.
+fn left_at_rate(length: f64, before: f64) -> f64 {
+    if length == 0.0 {
+        return 0.0;
+    }
+    // Convergence is at least linear, at the rate of the last step: with a tangent that is not that of the energy
+    // for good, with the exact one until steps are short.
+    length / (1.0 - (length / before).min(1.0))
 }
 
 /// Whether the merit of `pose` still falls along `rows`, without those `on_walls`, which go no further.

@@ -62,7 +62,7 @@ impl Equilibrium {
             return Ok((pose, false));
         }
         let nodes = rows.iter().map(|&row| self.reduction.unknowns[row as usize]).collect();
-        let Some(part) = Part::new(&self.energy, nodes) else { return Ok((pose, false)) };
+        let Some(part) = Part::new(target.energy, nodes) else { return Ok((pose, false)) };
         let local = Local {
             loads: target.loads.map(|l| part.nodes().iter().map(|&j| l[j as usize]).collect()),
             conditions: within(conditions, &rows),

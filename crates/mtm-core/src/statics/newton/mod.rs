@@ -57,6 +57,9 @@ enum TangentSolver {
 /// A body with its unknowns, ready for any state of its boundary.
 pub(crate) struct Equilibrium {
     energy: StrainEnergy,
+    /// The same without that by which tissue resists being squeezed flat: Newton's method reaches its equilibrium
+    /// first, because far from it tets pass through inverted states, where that energy makes steps short.
+    yielding: StrainEnergy,
     tensors: Arc<MassTensors>,
     reduction: Arc<Reduction>,
     /// Where the rows are in the tangent, once there was one.
@@ -82,7 +85,7 @@ struct Followed<'a, 'i> {
 impl Body for Followed<'_, '_> {
     fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
         self.target.conditions = RowConditions::new(self.sliding, c);
-        let u = self.equilibrium.follow(self.u.clone(), &self.target, self.solve)?;
+        let u = self.equilibrium.arrive(self.u.clone(), &mut self.target, self.solve)?;
         let forces = self.equilibrium.forces(&u)?;
         let loads = self.target.loads;
         let reaction = |j: u32| {
@@ -105,6 +108,7 @@ impl Body for Followed<'_, '_> {
 
 /// The conditions at the boundary.
 struct Target<'a> {
+    energy: &'a StrainEnergy,
     /// Displacement of every node; those of unknowns are not read.
     prescribed: &'a [[f64; 3]],
     /// Forces on every node, N.
@@ -172,11 +176,9 @@ impl Equilibrium {
         };
         clock.lap("ordering", method.has_factor());
         let energy = StrainEnergy::new(tensors.clone(), options.kinematics);
-        let tissue = Extremes {
-            lame_ratio: tensors.tissue().largest_lame_ratio(),
-            contrast: tensors.tissue().contrast(),
-        };
+        let tissue = Extremes::of(tensors.tissue());
         let made = Self {
+            yielding: energy.without_barrier(),
             energy,
             tensors,
             reduction,
@@ -230,20 +232,28 @@ impl Equilibrium {
         let scale = solve.scale;
         let shared = SharedHierarchy::starting(&self.at_rest);
         let hierarchy = &shared;
+        let energy = &self.yielding;
         let conditions = RowConditions::default;
-        let target =
-            || Target { prescribed, loads, conditions: conditions(), scale, hierarchy, tangents };
-        let mut u = vec![[0.0; 3]; prescribed.len()];
+        let mut target = Target {
+            energy,
+            prescribed,
+            loads,
+            conditions: conditions(),
+            scale,
+            hierarchy,
+            tangents,
+        };
+        let u = vec![[0.0; 3]; prescribed.len()];
         let settled = |u: &[[f64; 3]], contact: ContactState| SolvedRows {
             rows: self.reduction.rows(u),
             contact: Some(contact),
             contact_seconds: clock.total(),
         };
         let Some(slide) = slide else {
-            u = self.follow(u, &target(), solve)?;
+            let u = self.arrive(u, &mut target, solve)?;
             return Ok(self.reduction.rows(&u).into());
         };
-        match self.slide(&target(), slide, solve) {
+        match self.slide(&target, slide, solve) {
             Ok((u, state)) => return Ok(settled(&u, state)),
             // Too large a step: the plan is applied in shares, for every set of normals.
             Err(
@@ -256,11 +266,34 @@ impl Equilibrium {
         let SlidingBody { sliding, motions, .. } = slide;
         // Other constraints than those at rest.
         let own = SharedHierarchy::default();
-        let target = Target { hierarchy: &own, ..target() };
+        let target = Target { hierarchy: &own, conditions: conditions(), ..target };
         let (before, interrupted) = (u.clone(), solve.interrupted);
         let mut body = Followed { equilibrium: self, target, sliding, before, u, solve };
         let state = sliding.solve(motions, None, &self.options.contact, interrupted, &mut body)?;
         Ok(settled(&body.u, state))
+    }
+
+    /// The state of `target`, reached from the state `u`: first without the energy by which tissue resists being
+    /// squeezed flat, then with it.
+    fn arrive<'a>(
+        &'a self,
+        u: Vec<[f64; 3]>,
+        target: &mut Target<'a>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<Vec<[f64; 3]>> {
+        target.energy = &self.yielding;
+        let u = self.follow(u, target, solve)?;
+        if !self.energy.is_at_barrier(&u) {
+            return Ok(u);
+        }
+        target.energy = &self.energy;
+        target.tangents.borrow_mut().forget();
+        self.resist(u, target, solve)
+    }
+
+    /// Whether the energy of `target` is still the one without the barrier.
+    fn has_barrier_ahead(&self, target: &Target<'_>) -> bool {
+        std::ptr::eq(target.energy, &self.yielding)
     }
 
     /// The state of `target`, reached from the state `u`: in one step, or in several if Newton's method does
@@ -303,7 +336,7 @@ impl Equilibrium {
 
     /// Merit and slope at displacements `u`.
     fn pose(&self, u: Vec<[f64; 3]>, target: &Target<'_>) -> Result<Iterate> {
-        let state = self.energy.state(&u)?;
+        let state = target.energy.state(&u)?;
         let mut slope = self.reduction.rows(&state.forces);
         let (mut merit, mut size) = (state.energy, state.energy.abs());
         if let Some(loads) = target.loads {

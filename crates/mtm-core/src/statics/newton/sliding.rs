@@ -123,6 +123,20 @@ impl Equilibrium {
         let mut steps =
             InContact { equilibrium: self, wanted, contact, before: first, fine, interrupted };
         let u = self.descend(pose, target, (fine, &on_walls), &mut steps, solve)?;
+        if !self.energy.is_at_barrier(&u) {
+            return Ok((u, steps.contact));
+        }
+        let target =
+            &Target { energy: &self.energy, conditions: RowConditions::default(), ..*target };
+        target.tangents.borrow_mut().forget();
+        let wanted = &Wanted { target, slide };
+        let mut steps = InContact { wanted, ..steps };
+        let pose = self.pose(u, target)?;
+        let (pose, has_moved) = self.eased(pose, target, &steps.conditions())?;
+        if has_moved {
+            steps.resume(&pose);
+        }
+        let u = self.descend(pose, target, (fine, &on_walls), &mut steps, solve)?;
         Ok((u, steps.contact))
     }
 

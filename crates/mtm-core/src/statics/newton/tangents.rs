@@ -25,7 +25,7 @@ impl Equilibrium {
     ) -> Result<(BlockMatrix, Vec<[f64; 3]>)> {
         let mut b: Vec<[f64; 3]> = pose.slope.iter().map(|&s| scaled(s, -1.0)).collect();
         let tangents = &mut target.tangents.borrow_mut();
-        let matrix = self.energy.with_stiffness(&pose.u, kind, tangents, |full| {
+        let matrix = target.energy.with_stiffness(&pose.u, kind, tangents, |full| {
             if let Some(change) = change {
                 for (b, f) in b.iter_mut().zip(self.reduction.rows(&full.multiply(change))) {
                     *b = sub(*b, f);
