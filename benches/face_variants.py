@@ -33,6 +33,7 @@ import cmfsim
 import ct_variants as variants
 import scan_variants
 from cmfsim import ImageData
+from cmfsim.bones.cuts.procedures import UPPER_CANINE_REACH
 from marked import publish
 
 ROOT = Path(__file__).parents[1]
@@ -60,6 +61,7 @@ edge_length = {edge}
 
 [[osteotomies]]
 procedure = "le_fort_1"
+{cut}
 
 [plan.maxilla]
 translation = [{motion}]
@@ -81,12 +83,15 @@ class Variant:
     tolerance : float, mm
     causes : frozenset of str
         Codes of findings about what was changed.
+    cut : mapping of str to float, mm
+        Distances of the cut, where they are not those of the clean head.
     """
 
     make: Callable[[ImageData], ImageData]
     to_variant: Callable[[ImageData], np.ndarray] = field(default=lambda _: np.eye(4))
     tolerance: float = TOLERANCE
     causes: frozenset[str] = frozenset()
+    cut: Mapping[str, float] = field(default_factory=dict)
 
 
 def _landmarks() -> dict[str, np.ndarray]:
@@ -122,6 +127,20 @@ def _pads(image: ImageData) -> ImageData:
 def _fine(image: ImageData) -> ImageData:
     face = variants.cropped(image, 1, high=float(_landmarks()["supraglenoid_L"][1]) + 40.0)
     return variants.resampled(face, (0.3, 0.3, 0.3))
+
+
+def _smaller_cut(factor: float) -> dict[str, float]:
+    """Distances that make the cut of the clean head smaller.
+
+    By default it runs above roots of the usual length, whatever the size of the head.
+    """
+    height, posterior, width = 5.0, 12.0, 12.0
+    above = factor * (UPPER_CANINE_REACH + height)
+    return {
+        "height": above - UPPER_CANINE_REACH,
+        "posterior": factor * posterior,
+        "width": factor * width,
+    }
 
 
 def _offset(image: ImageData) -> ImageData:
@@ -162,13 +181,17 @@ VARIANTS: Mapping[str, Variant] = {
     ),
     "voxels of 0.3 mm": Variant(_fine),
     "a child's size, 0.8": Variant(
-        lambda i: variants.scaled(i, 0.8), lambda _: np.diag([0.8, 0.8, 0.8, 1.0])
+        lambda i: variants.scaled(i, 0.8),
+        lambda _: np.diag([0.8, 0.8, 0.8, 1.0]),
+        cut=_smaller_cut(0.8),
     ),
     "1024 too high": Variant(_offset, causes=frozenset({"ct-not-hu"})),
 }
 
 
-def predicted(image: ImageData, motion: np.ndarray, edge: float) -> dict[str, Any]:
+def predicted(
+    image: ImageData, motion: np.ndarray, edge: float, cut: Mapping[str, float]
+) -> dict[str, Any]:
     """Points and displacements of the face, the codes of findings, or the error."""
     import SimpleITK  # noqa: PLC0415
 
@@ -179,7 +202,9 @@ def predicted(image: ImageData, motion: np.ndarray, edge: float) -> dict[str, An
         written.SetSpacing(np.asarray(image.spacing, dtype=float).tolist())
         written.SetOrigin(np.asarray(image.lowest, dtype=float).tolist())
         SimpleITK.WriteImage(written, str(path / "ct.nii.gz"))
-        text = CASE.format(edge=edge, motion=", ".join(f"{v:.6f}" for v in motion))
+        distances = "\n".join(f"{name} = {value:.6f}" for name, value in cut.items())
+        moved = ", ".join(f"{v:.6f}" for v in motion)
+        text = CASE.format(edge=edge, motion=moved, cut=distances)
         (path / "case.toml").write_text(text, encoding="utf-8")
         try:
             found = cmfsim.predict(cmfsim.Case.load(path / "case.toml"), model="M+S")
@@ -265,7 +290,7 @@ def main() -> None:
     options = parser.parse_args()
     image = cmfsim.read_image(data_folder() / "ct_phantom" / "ct.nii.gz")
     clean = _kept(
-        options.cache, "clean", options.edge, lambda: predicted(image, FORWARDS, options.edge)
+        options.cache, "clean", options.edge, lambda: predicted(image, FORWARDS, options.edge, {})
     )
     if clean["error"]:
         raise SystemExit(f"the unmodified CT: {clean['error']}")
@@ -295,7 +320,7 @@ def main() -> None:
         def make(
             variant: Any = variant, motion: np.ndarray = motion, edge: float = edge
         ) -> dict[str, Any]:
-            return predicted(variant.make(image), motion, edge)
+            return predicted(variant.make(image), motion, edge, variant.cut)
 
         row = _kept(options.cache, name, options.edge, make)
         if not row["error"]:
