@@ -84,5 +84,17 @@ class Finding:
         return cls(**{**given, "code": FORMER_CODES.get(given["code"], given["code"])})
 
 
+def counted_findings(findings: Iterable[Finding]) -> str:
+    """How many findings there are of each severity, and the codes of errors and warnings."""
+    found = list(findings)
+    parts = []
+    for severity in SEVERITIES:
+        codes = [finding.code for finding in found if finding.severity == severity]
+        if codes:
+            named = f" ({', '.join(dict.fromkeys(codes))})" if severity != "note" else ""
+            parts.append(f"{len(codes)} {severity}{'s' if len(codes) > 1 else ''}{named}")
+    return ", ".join(parts) or "none"
+
+
 # What is called with new findings as a stage notices them.
 OnFindings = Callable[[Iterable[Finding]], None]

@@ -22,6 +22,13 @@ class Frozen:
             object.__setattr__(self, name, _read_only(value))
 
 
+def listing(title: str, rows: Mapping[str, str]) -> str:
+    """What a value shows of itself: a title, and a line for each row that has a text."""
+    shown = {name: text for name, text in rows.items() if text}
+    width = max((len(name) for name in shown), default=0)
+    return "\n".join([title, *(f"  {name:<{width}}  {text}" for name, text in shown.items())])
+
+
 def frozen_mapping(items: Mapping[Any, Any]) -> Mapping[Any, Any]:
     """A read-only mapping of these items, arrays among them read-only too."""
     return MappingProxyType({key: _read_only(value) for key, value in items.items()})

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, Indices
-from cmfsim.values.finding import Finding
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.finding import Finding, counted_findings
+from cmfsim.values.frozen import Frozen, listing
 from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NodeKinds
@@ -85,6 +85,20 @@ class PatientModel(Frozen):
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
     detailed_skin: Callable[[], SurfaceData | None] | None = None
+
+    def __repr__(self) -> str:
+        """Name, mesh, anatomy, plan and what was found."""
+        places = [f"{len(sites)} of the {part}" for part, sites in self.landmarks.items() if sites]
+        how = " (found automatically)" if places and self.landmarks_are_found else ""
+        rows = {
+            "mesh": f"{self.scene.n_nodes} nodes, {self.scene.n_tets} tets",
+            "segments": ", ".join(segment.name for segment in self.segments),
+            "muscles": f"{len(self.muscles)}" if self.muscles is not None else "none",
+            "landmarks": f"{', '.join(places) or 'none'}{how}",
+            "plan": self.scene.plan_text(),
+            "findings": counted_findings(self.findings),
+        }
+        return listing(f"PatientModel {self.name!r}", rows)
 
     @property
     def landmarks_are_found(self) -> bool:

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, check_one_of
-from cmfsim.values.finding import Finding
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.finding import Finding, counted_findings
+from cmfsim.values.frozen import Frozen, listing
 from cmfsim.values.model_names import MODELS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene, SceneResult
@@ -60,6 +60,22 @@ class Prediction(Frozen):
     def __post_init__(self) -> None:
         check_one_of("model", self.model, MODELS)
         object.__setattr__(self, "summary", MappingProxyType(dict(self.summary)))
+
+    def __repr__(self) -> str:
+        """Patient, plan, how far the skin moves, how it was solved and what was found."""
+        solved = self.result.summary
+        moved = np.linalg.norm(self.skin_displacements, axis=1)
+        error = solved.get("error_estimate")
+        rows = {
+            "plan": self.scene.plan_text(),
+            "skin": f"moves up to {moved.max(initial=0.0):.1f} mm",
+            "mesh": f"{self.scene.n_nodes} nodes, {self.scene.n_tets} tets",
+            "solution": str(solved.get("method", ""))
+            + (f", estimated error {error:.1g} mm" if error is not None else ""),
+            "band": "yes" if self.band is not None else "",
+            "findings": counted_findings(self.findings),
+        }
+        return listing(f"Prediction of {self.model} for {self.name!r}", rows)
 
     @property
     def name(self) -> str:

@@ -29,8 +29,8 @@ from cmfsim.values.checks import (
     check_one_of,
     frozen,
 )
-from cmfsim.values.frozen import Frozen
-from cmfsim.values.motion import rigid_matrix
+from cmfsim.values.frozen import Frozen, listing
+from cmfsim.values.motion import carried, rigid_matrix
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TissueData
@@ -260,6 +260,44 @@ class Scene(Frozen):
             checked[name] = frozen(array)
         return checked
 
+    def __repr__(self) -> str:
+        """Sizes, segments and how far each moves."""
+        segments = [
+            f"{name} ({len(s.joined)} joined, {len(s.sliding)} sliding)"
+            for name, s in self.segments.items()
+        ]
+        options, law = self.options, self.tissue.preset or self.tissue.kind
+        rows = {
+            "mesh": f"{self.n_nodes} nodes, {self.n_tets} tets",
+            "tissue": f"{law}, {'one for all tets' if self._is_uniform else 'one for each tet'}",
+            "segments": ", ".join(segments),
+            "fixed": f"{len(self.fixed)} nodes",
+            "plan": self.plan_text(),
+            "solver": f"{options.method}, {options.kinematics}, element {options.element}",
+        }
+        return listing("Scene", rows)
+
+    @property
+    def _is_uniform(self) -> bool:
+        return all(len(array) == 1 for array in self.tissue.arrays().values())
+
+    def plan_text(self) -> str:
+        """How far each segment moves at most, in words."""
+        return ", ".join(f"{name} {self._moved(name)}" for name in self.segments)
+
+    def _moved(self, name: str) -> str:
+        """How far the nodes on a segment move with it, in words."""
+        motion, segment = self.plan[name], self.segments[name]
+        if isinstance(motion, MovedSurface):
+            steps = motion.moved_vertices - motion.surface.vertices
+        elif motion.shape == (4, 4):
+            steps = carried(motion, self.nodes) - self.nodes
+            steps = steps[np.concatenate([segment.joined, segment.sliding])]
+        else:
+            steps = motion
+        far = float(np.linalg.norm(steps, axis=1).max(initial=0.0))
+        return f"moves up to {far:.1f} mm" if far else "stays"
+
     @property
     def n_nodes(self) -> int:
         """Number of nodes."""
@@ -393,6 +431,19 @@ class SceneResult(Frozen):
     contact_forces: Floats
     contact_gaps: Floats
     summary: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        """Size, how far nodes move, how it was solved."""
+        far = float(np.linalg.norm(self.displacements, axis=1).max(initial=0.0))
+        error = self.summary.get("error_estimate")
+        rows = {
+            "mesh": f"{len(self.nodes)} nodes, {len(self.tets)} tets",
+            "nodes": f"move up to {far:.1f} mm",
+            "method": str(self.summary.get("method", "")),
+            "error": "" if error is None else f"estimated at {error:.1g} mm",
+            "contact": f"{len(self.contact_nodes)} nodes" if len(self.contact_nodes) else "",
+        }
+        return listing("SceneResult", rows)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Every array of the result by its name."""

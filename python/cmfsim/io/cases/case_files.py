@@ -44,6 +44,7 @@ from cmfsim.values.case_parts import (
 )
 from cmfsim.values.case_region import Region
 from cmfsim.values.checks import as_text
+from cmfsim.values.frozen import listing
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import TissueData
 
@@ -147,6 +148,22 @@ class Case:
             raise CaseInputError("a plan is either given or achieved, not both")
         for name in ("plan", "node_kinds", "places"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    def __repr__(self) -> str:
+        """File, inputs, cuts, plan and muscles."""
+        bones = () if self.surfaces is None else self.surfaces.bones
+        cuts = [cut.procedure or f"plane for {cut.name}" for cut in self.osteotomies]
+        muscles = self.muscles
+        rows = {
+            "file": str(self.file),
+            "image": "" if self.image is None else self.image.file.name,
+            "surfaces": ", ".join(["skin", *bones]) if self.surfaces is not None else "",
+            "cuts": ", ".join(cuts),
+            "plan": "achieved" if self.achieved else ", ".join(self.plan) or "nothing moves",
+            "muscles": "none" if muscles is None else f"{muscles.template}, {muscles.preset}",
+            "output": str(self.output),
+        }
+        return listing(f"Case {self.name!r}", rows)
 
     @property
     def fat(self) -> TissueData:

@@ -1,0 +1,56 @@
+"""What the large values show of themselves at a prompt: a few lines, never their arrays."""
+
+import pytest
+
+import cmfsim
+import phantom_case
+from shared_values import coarse_demo_patient, drawn_levels
+
+
+@pytest.fixture(scope="module")
+def patient(tmp_path_factory):
+    return coarse_demo_patient(tmp_path_factory)
+
+
+def lines_of(value):
+    lines = repr(value).splitlines()
+    assert 2 <= len(lines) <= 8
+    assert max(map(len, lines)) < 250
+    return lines
+
+
+def test_a_patient_shows_its_size_anatomy_and_findings(patient):
+    title, *rows = lines_of(patient)
+    assert title == f"PatientModel {patient.name!r}"
+    text = "\n".join(rows)
+    assert f"{patient.scene.n_nodes} nodes, {patient.scene.n_tets} tets" in text
+    assert f"{len(patient.muscles)}" in text
+    notes = sum(f.severity == "note" for f in patient.findings)
+    assert f"{notes} notes" in text
+
+
+def test_a_scene_shows_how_far_each_segment_moves(patient):
+    scene = patient.with_plan({"maxilla": cmfsim.rigid_motion((0.0, -3.0, 4.0))}).scene
+    (plan,) = [line for line in lines_of(scene) if line.strip().startswith("plan")]
+    assert "maxilla moves up to 5.0 mm" in plan
+    assert "mandible_body stays" in plan
+
+
+def test_a_prediction_shows_its_skin_and_its_solution(patient):
+    prediction = cmfsim.predict_patient(patient, "H")
+    title, *rows = lines_of(prediction)
+    assert title == f"Prediction of H for {patient.name!r}"
+    assert any("moves up to" in row and row.strip().startswith("skin") for row in rows)
+    assert any("estimated error" in row for row in rows)
+    assert "estimated at" in repr(prediction.result)
+    lines_of(prediction.result)
+
+
+def test_a_case_shows_its_file_inputs_and_plan(tmp_path, tmp_path_factory):
+    anatomy = drawn_levels(tmp_path_factory, 3.0)
+    path = phantom_case.surface_case(tmp_path, cmfsim.make_head(), anatomy)
+    case = cmfsim.Case.load(path)
+    text = "\n".join(lines_of(case))
+    assert str(path) in text
+    assert "skin" in text
+    assert all(name in text for name in case.plan)
