@@ -449,6 +449,6 @@ def _write_after(draft: Draft) -> None:
     if anatomy.after_bones or questions:
         text.table("postoperative.bones")
     for name, find in anatomy.after_bones.items():
-        text.value(name, quoted(surface_path(draft, find, f"{name}place_after", place)))
+        text.value(name, quoted(surface_path(draft, find, f"{name}_after", place)))
     for question in questions:
         text.ask(question.key.rpartition(".")[2], question.text, choices_of(draft, question, place))
