@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 
 import numpy as np
@@ -473,4 +473,12 @@ def make_head(parameters: HeadParameters | None = None) -> PhantomHead:
     >>> len(head.skull_landmarks), len(head.skin_landmarks)
     (32, 14)
     """
-    return PhantomHead(HeadParameters() if parameters is None else parameters)
+    parameters = HeadParameters() if parameters is None else parameters
+    check_instance("parameters", parameters, HeadParameters)
+    return _kept_head(parameters)
+
+
+@lru_cache(maxsize=8)
+def _kept_head(parameters: HeadParameters) -> PhantomHead:
+    """One head for equal parameters: its landmarks and muscles take seconds to find."""
+    return PhantomHead(parameters)
