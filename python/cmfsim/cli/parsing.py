@@ -22,6 +22,7 @@ from cmfsim.io import result_suffixes
 from cmfsim.lab.frontier import EDGES, FACTORS
 from cmfsim.muscles.template import WHERE
 from cmfsim.planning.replanning import CORRECTIONS
+from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
 
@@ -128,6 +129,23 @@ def _add_init(commands: Any, common: argparse.ArgumentParser) -> None:
         "folder", metavar="FOLDER", type=Path, help="folder, or 3D Slicer scene (.mrml, .mrb)"
     )
     init.add_argument("--force", action="store_true", help="replace an existing case.toml")
+    init.add_argument(
+        "--cut",
+        action="append",
+        default=[],
+        choices=tuple(PROCEDURES),
+        help="cut by this procedure; again for another",
+    )
+    init.add_argument(
+        "--move",
+        action="append",
+        default=[],
+        nargs="+",
+        metavar=("SEGMENT", "WORD=NUMBER"),
+        help="move a segment, such as: --move maxilla forwards=4 up=1 pitch=2. Words: forwards, "
+        "backwards, up, down, left, right in mm; pitch (front up), yaw (front to the left), roll "
+        "(left side up) in degrees, about the teeth or the chin. Again for another segment",
+    )
     init.set_defaults(run=init_command.init)
 
 

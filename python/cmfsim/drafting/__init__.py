@@ -1,24 +1,26 @@
 """A first case file from what lies in a folder: `cmfsim init`.
 
 `finds` reads and measures files, `scene_finds` what a scene of 3D Slicer holds, `gathering` both;
-`roles` knows what names say; `surfaces`, `choices` and `motions` decide what each thing is for, and
+`roles` knows what names say; `surfaces`, `choices` and `plans` decide what each thing is for, and
 turn what they cannot decide into questions; `draft` writes the case file.
 """
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from cmfsim.drafting.case_lines import Taken
 from cmfsim.drafting.draft import CaseDraft, draft_case
 from cmfsim.drafting.finds import CASE_FILE, EXTRACTED
 from cmfsim.drafting.gathering import gather
+from cmfsim.drafting.plans.typed_plan import TypedPlan, read_moves
 from cmfsim.drafting.written import check_written
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing
 
-__all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case"]
+__all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case", "read_moves"]
 
 SCENES = (".mrml", ".mrb")
 
@@ -27,6 +29,8 @@ def init_case(
     path: str | os.PathLike[str],
     *,
     force: bool = False,
+    cuts: Sequence[str] = (),
+    moves: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
     progress: Callable[[str], None] = lambda _: None,
 ) -> CaseDraft:
     """Writes a `case.toml` for the files in a folder, and states what each file was taken for.
@@ -37,6 +41,11 @@ def init_case(
         A folder, or a scene of 3D Slicer (`.mrml`, `.mrb`): its folder becomes the case's.
     force : bool
         Whether an existing case file is replaced.
+    cuts : sequence of str
+        Procedures, such as "le_fort_1", besides those that the plan needs.
+    moves : mapping of str to mapping of str to float
+        How segments move: forwards, backwards, up, down, left, right in mm; pitch (front up), yaw
+        (front to the left) and roll (left side up) in degrees, about the teeth or the chin.
     progress : callable
         Called with the name of each stage.
 
@@ -50,7 +59,8 @@ def init_case(
         The path does not exist.
     CaseError
         (also `ValueError`) A case file exists already; the folder has no usable files; several
-        scenes; a scene that is damaged, or whose transforms are not rigid. Not `ValueError`: the
+        scenes; a scene that is damaged, or whose transforms are not rigid; cuts or moves that do
+        not suit the head. Not `ValueError`: the
         case that was written reads as something else than was found; it is removed again.
 
     Examples
@@ -60,6 +70,7 @@ def init_case(
     >>> for taken in draft.taken:  # doctest: +SKIP
     ...     print(taken.label, taken.taken_for, taken.why)
     """
+    typed = TypedPlan(tuple(dict.fromkeys(cuts)), moves)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder or scene")
@@ -73,7 +84,7 @@ def init_case(
     if case_file.exists() and not force:
         raise CaseInputError(f"{case_file}: already exists; --force replaces it")
     with tempfile.TemporaryDirectory(prefix="cmfsim-init-") as unpacked:
-        draft = _drafted(folder, path if is_scene else None, Path(unpacked), progress)
+        draft = _drafted(folder, path if is_scene else None, Path(unpacked), typed, progress)
     if draft.files:
         (folder / EXTRACTED).mkdir(exist_ok=True)
     for name, write in draft.files.items():
@@ -101,7 +112,11 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _drafted(
-    folder: Path, scene: Path | None, unpacked: Path, progress: Callable[[str], None]
+    folder: Path,
+    scene: Path | None,
+    unpacked: Path,
+    typed: TypedPlan,
+    progress: Callable[[str], None],
 ) -> CaseDraft:
     found = gather(folder, scene, unpacked, progress)
     if not found.surfaces and not any(not image.error for image in found.images):
@@ -113,4 +128,4 @@ def _drafted(
             "DICOM, NRRD, NIfTI, MetaImage, STL, PLY, OBJ, VTP, VTK, .seg.nrrd, .mrml and .mrb"
         )
     progress("identifying the files")
-    return draft_case(found, unpacked, folder.resolve().name or "case")
+    return draft_case(found, unpacked, folder.resolve().name or "case", typed)

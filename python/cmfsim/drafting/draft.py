@@ -1,6 +1,6 @@
 """A case file drafted from what lies in a folder: what each thing was taken for, and why."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,8 @@ from cmfsim.drafting.case_lines import Taken, Text, legible, quoted
 from cmfsim.drafting.choices import choose_images, choose_landmarks
 from cmfsim.drafting.finds import ImageFind, LandmarkFind
 from cmfsim.drafting.gathering import Gathered
-from cmfsim.drafting.motions import DraftMotion, Plan, file_motions, scene_motions
+from cmfsim.drafting.plans.motions import DraftMotion, Plan, file_motions, scene_motions
+from cmfsim.drafting.plans.typed_plan import TypedPlan, add_typed
 from cmfsim.drafting.roles import MOVING
 from cmfsim.drafting.surfaces import Anatomy, choose_surfaces
 from cmfsim.drafting.written import (
@@ -37,6 +38,15 @@ CUT = ("[[osteotomies]]", 'procedure = "le_fort_1"', "")
 EXAMPLE = """[plan.{name}]
 translation = [0, -5, 0]  # mm, LPS: -y is forwards
 # or, as 3D Slicer saves it: transform = {{file = "{name}.h5", direction = "from-parent"}}"""
+
+
+# What the numbers of a typed motion are.
+TYPED_UNITS = {
+    "translation": "mm, LPS: +x is left, -y forwards, +z up",
+    "angle": "degrees",
+    "axis": "right-hand rule",
+    "centre": "mm: the point that the translation moves",
+}
 
 
 @dataclass
@@ -72,7 +82,9 @@ class CaseDraft:
         }
 
 
-def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
+def draft_case(
+    found: Gathered, unpacked: Path, name: str, typed: TypedPlan | None = None
+) -> CaseDraft:
     """The case file of what was gathered.
 
     Parameters
@@ -82,13 +94,19 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
         Where the files of a bundle lie for now.
     name : str
         Of the case.
+    typed : TypedPlan, optional
+        Cuts and motions besides those that files state.
 
     Raises
     ------
     CaseError
-        (also `ValueError`) What is there makes no case: neither a CT, nor a skin with a bone.
+        (also `ValueError`) What is there makes no case: neither a CT, nor a skin with a bone; cuts
+        or motions that do not suit it.
     """
+    typed = typed or TypedPlan()
     draft = _decide(found, unpacked)
+    is_turned = not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
+    add_typed(draft.plan, typed, _bones_of(draft), is_turned=is_turned)
     taken = _taken(draft)
     text = draft.text
     text.comment("Written by cmfsim init. Read every line: each states what a file was taken for.")
@@ -108,8 +126,9 @@ def draft_case(found: Gathered, unpacked: Path, name: str) -> CaseDraft:
         )
     _write_head(draft)
     _write_landmarks(draft)
+    _write_cuts(draft, typed.cuts)
     if not achieved:
-        _write_plan(draft)
+        _write_plan(draft, typed.cuts)
     _write_muscles(draft)
     _write_after(draft)
     text.table("output")
@@ -328,24 +347,34 @@ def _shows_skull(draft: Draft) -> bool:
     return draft.by_image or "cranium" in draft.anatomy.bones
 
 
-def _write_plan(draft: Draft) -> None:
+def _bones_of(draft: Draft) -> set[str]:
+    """The bones of the case before it is cut."""
+    return set(draft.anatomy.bones) if not draft.by_image else {"cranium", "mandible"}
+
+
+def _write_cuts(draft: Draft, cuts: Sequence[str]) -> None:
+    """Adds the cuts that were asked for, and those that make what the plan moves."""
     text, plan = draft.text, draft.plan
-    bones = set(draft.anatomy.bones) if not draft.by_image else {"cranium", "mandible"}
+    bones = _bones_of(draft)
     asked = {q.key.partition(".")[2] for q in draft.anatomy.questions if not draft.by_image}
-    needed: dict[str, str] = {}
+    needed = {cut: f"it makes {', '.join(PROCEDURES[cut])}" for cut in cuts}
     for name in plan.motions:
         if name in bones | asked:
             continue
         for procedure, segments in PROCEDURES.items():
             if name in segments:
-                needed.setdefault(procedure, name)
-    for procedure, name in needed.items():
+                needed.setdefault(procedure, f"the plan moves {name}, which it cuts")
+    for procedure, why in needed.items():
         text.table("[osteotomies]")
-        text.value("procedure", quoted(procedure), f"the plan moves {name}, which it cuts")
+        text.value("procedure", quoted(procedure), why)
         if draft.found.scene:
             text.comment("It cuts by landmarks, not where the scene's pieces were cut.")
+
+
+def _write_plan(draft: Draft, cuts: Sequence[str]) -> None:
+    text, plan = draft.text, draft.plan
     if not plan.motions:
-        _propose_plan(text, bones)
+        _propose_plan(text, _bones_of(draft).union(*(PROCEDURES[cut] for cut in cuts)))
     for name, motion in plan.motions.items():
         _write_motion(text, name, motion)
 
@@ -369,7 +398,10 @@ def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
         key, value = ("transform", motion.transform) if motion.transform else ("matrix", '"?"')
         text.ask(key, motion.question, motion.choices, value)
     lead = "# " if motion.question else ""
-    if motion.matrix is not None:
+    if motion.typed:
+        for key, value in motion.typed.items():
+            text.value(key, value, TYPED_UNITS[key])
+    elif motion.matrix is not None:
         text.matrix(motion.matrix.tolist(), lead)
     elif motion.transform and not motion.question:
         text.value("transform", motion.transform)

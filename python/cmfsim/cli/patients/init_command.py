@@ -6,13 +6,19 @@ import sys
 
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.text.terminal import StageProgress, escaped
-from cmfsim.drafting import CASE_FILE, init_case
+from cmfsim.drafting import CASE_FILE, init_case, read_moves
 
 
 def init(options: argparse.Namespace) -> int:
     """Writes the case file, and reports the role assumed for each file."""
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        draft = init_case(options.folder, force=options.force, progress=progress.stage)
+        draft = init_case(
+            options.folder,
+            force=options.force,
+            cuts=options.cut,
+            moves=read_moves(options.move),
+            progress=progress.stage,
+        )
     folder = options.folder if options.folder.is_dir() else options.folder.parent
     case = folder / CASE_FILE
     if options.json:

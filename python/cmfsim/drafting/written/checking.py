@@ -9,13 +9,14 @@ import numpy as np
 
 from cmfsim.drafting.case_lines import Taken
 from cmfsim.drafting.gathering import Gathered
-from cmfsim.drafting.motions import Plan
+from cmfsim.drafting.plans.motions import Plan
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError
 from cmfsim.io import Case, read_surface
 from cmfsim.io.files.reading_writing import toml_module
 from cmfsim.io.landmarks.landmark_files import read_landmarks
 from cmfsim.io.slicer.transforms import read_transform
 from cmfsim.values.checks import Floats
+from cmfsim.values.motion import rigid_motion
 
 # What single precision leaves of coordinates of a head, mm, and what a rotation may differ by.
 SAME_PLACE, SAME_MOTION = 1e-3, 1e-9
@@ -141,7 +142,10 @@ def _motions(plan: Any, folder: Path, shown: Shown) -> Iterator[str]:
         if isinstance(given, dict):
             options = {key: value for key, value in given.items() if key != "file"}
             here = read_transform(folder / given["file"], **options)
+        elif "matrix" in table:
+            here = np.array(table["matrix"], dtype=np.float64)
         else:
-            here = np.array(table.get("matrix", np.eye(4)), dtype=np.float64)
+            numbers = ("translation", "angle", "axis", "centre")
+            here = rigid_motion(**{key: table[key] for key in numbers if key in table})
         if np.abs(here - matrix).max() > SAME_MOTION:
             yield f"the motion of {name} is another"

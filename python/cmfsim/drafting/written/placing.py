@@ -10,7 +10,7 @@ from cmfsim.drafting.case_lines import Text, quoted
 from cmfsim.drafting.choices import Images, Marks
 from cmfsim.drafting.finds import EXTRACTED, ImageFind, LandmarkFind, SurfaceFind
 from cmfsim.drafting.gathering import Gathered
-from cmfsim.drafting.motions import Plan
+from cmfsim.drafting.plans.motions import Plan
 from cmfsim.drafting.roles import safe_key
 from cmfsim.drafting.surfaces import Anatomy, Question
 from cmfsim.drafting.written.checking import Shown

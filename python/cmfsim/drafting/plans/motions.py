@@ -38,6 +38,8 @@ class DraftMotion:
     choices : tuple of str
     shown : (4, 4) float64, mm, LPS, or None
         The motion that `words` describes.
+    typed : mapping of str to str
+        Keys of the table and their TOML, instead of a matrix.
     """
 
     words: str
@@ -47,6 +49,7 @@ class DraftMotion:
     question: str = ""
     choices: tuple[str, ...] = ()
     shown: Floats | None = None
+    typed: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
