@@ -33,8 +33,20 @@ SKULL_PAIRS = {
     "occlusal_line": ("mandible", (38, -115, 1455)),
     "sub_m2": ("mandible", (34, -142, 1450)),
 }
-SKIN = {"pronasale": (0, -210, 1500), "pogonion": (0, -175, 1430), "nasion": (0, -198, 1530)}
-SKIN_PAIRS = {"exocanthion": (43, -175, 1525), "cheilion": (24, -185, 1465)}
+SKIN = {
+    "nasion": (0, -198, 1530),
+    "pronasale": (0, -210, 1500),
+    "subnasale": (0, -200, 1488),
+    "labiale_superius": (0, -197, 1474),
+    "labiale_inferius": (0, -192, 1458),
+    "pogonion": (0, -175, 1430),
+}
+SKIN_PAIRS = {
+    "endocanthion": (16, -194, 1526),
+    "exocanthion": (43, -175, 1525),
+    "alare": (17, -197, 1493),
+    "cheilion": (24, -185, 1465),
+}
 
 TOML = """format = "cmfsim-case"
 version = 1
@@ -156,6 +168,11 @@ class HeadCase:
         """Changes the text of the case file."""
         assert old in self.toml
         self.toml = self.toml.replace(old, new)
+
+    def without_mouth(self):
+        """The case without the landmarks of the lips, which many cases lack."""
+        self.skin = {n: p for n, p in self.skin.items() if not n.startswith(("labiale", "cheil"))}
+        return self
 
     def write_parts(self, folder: Path):
         """The surfaces and landmarks, without a case file."""
