@@ -149,7 +149,11 @@ def test_a_bone_that_was_left_alone_keeps_what_changed_without_the_slip():
     assert measure_pair(before, after).is_rigid
 
 
-BONES = [("ct_phantom", "mandible"), ("atlas_head", "mandible"), ("atlas_head", "maxilla_lefort1")]
+BONES = [
+    pytest.param("ct_phantom", "mandible", marks=pytest.mark.slow),
+    ("atlas_head", "mandible"),
+    ("atlas_head", "maxilla_lefort1"),
+]
 
 
 @pytest.mark.parametrize(("head", "name"), BONES)

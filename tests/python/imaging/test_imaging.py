@@ -435,7 +435,13 @@ VARIANTS = {
 
 
 @needs_phantom
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        name if name in {"pillow", "slices of 4 mm"} else pytest.param(name, marks=pytest.mark.slow)
+        for name in VARIANTS
+    ],
+)
 def test_a_hard_variant_of_the_real_ct_keeps_its_face(
     name, coarse_phantom, phantom_landmarks, reference
 ):

@@ -148,6 +148,7 @@ def test_nothing_is_reported_on_a_real_scan(real_scan):
     assert attachments(real_scan) == []
 
 
+@pytest.mark.slow
 def test_nothing_is_reported_at_the_size_of_a_child(real_scan):
     spacing = 0.75 * np.asarray(real_scan.spacing)
     assert attachments(cmfsim.ImageData(real_scan.values, spacing, real_scan.origin)) == []
@@ -156,7 +157,7 @@ def test_nothing_is_reported_at_the_size_of_a_child(real_scan):
 @pytest.mark.parametrize(
     ("place", "width", "thickness"),
     [
-        ((60.0, -272.0, 372.0), 40.0, 5.0),
+        pytest.param((60.0, -272.0, 372.0), 40.0, 5.0, marks=pytest.mark.slow),
         # Rims that meet the fold below the lip or the one between jaw and neck.
         ((0.0, -304.0, 340.0), 40.0, 3.0),
         pytest.param((0.0, -304.0, 340.0), 60.0, 5.0, marks=pytest.mark.slow),

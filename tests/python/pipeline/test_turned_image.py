@@ -22,7 +22,10 @@ translation = [0, -4, 0]
 
 @pytest.mark.parametrize(
     ("axis", "said"),
-    [(1, "the face points backwards"), (2, "the head is upside down")],
+    [
+        (1, "the face points backwards"),
+        pytest.param(2, "the head is upside down", marks=pytest.mark.slow),
+    ],
     ids=["backwards", "upside down"],
 )
 def test_a_turned_image_ends_the_run(tmp_path, axis, said, capsys):

@@ -107,6 +107,7 @@ def test_the_block_is_in_balance(ran):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_the_evaluation_finds_the_model_that_made_the_face(ran):
     text, pictures = ran("evaluation")
     means = dict(re.findall(rf"^(no change|H|M) +mean {NUMBER}", text, re.MULTILINE))
@@ -114,7 +115,15 @@ def test_the_evaluation_finds_the_model_that_made_the_face(ran):
     assert pictures == 2
 
 
-@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+# Half of the time of all tutorials.
+LONG = "evaluation"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=pytest.mark.slow) if p.stem == LONG else p for p in TUTORIALS],
+    ids=lambda path: path.stem,
+)
 def test_saved_outputs_are_those_of_this_version(ran, path):
     """Words are the same, and numbers as far as processors agree."""
     fresh, pictures = ran(path.stem)
