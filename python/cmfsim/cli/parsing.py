@@ -214,6 +214,18 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     )
     study.add_argument("--fresh", action="store_true", help="repeat finished cases")
     study.add_argument(
+        "--model",
+        **MODEL_CHOICES,
+        help="H, M, H+S, M+S or all; may be repeated (default: those of the cohort)",
+    )
+    study.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        type=Path,
+        help="output folder (default: that of the cohort)",
+    )
+    study.add_argument(
         "--variants",
         metavar="FILE",
         type=Path,

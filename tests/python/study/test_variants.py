@@ -11,6 +11,7 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.cli import main
+from cmfsim.errors import CaseInputError
 from cmfsim.report.variants import variants_text
 from shared_values import drawn_levels, without_pictures
 
@@ -223,3 +224,23 @@ def test_patients_without_a_change_do_not_count_for_the_test():
     found = cmfsim.paired_change(first, second)
     assert (found.n, found.n_better, found.test) == (7, 5, None)
     assert cmfsim.paired_change([1.0], [2.0]).interval is None
+
+
+def test_models_and_output_of_a_cohort_change_for_one_run(tmp_path, monkeypatch, capsys):
+    """What the command line states wins over the file, which keeps what it has."""
+    (tmp_path / "cohort.toml").write_text(COHORT, encoding="utf-8")
+    asked = []
+
+    def run(cohort, **_):
+        asked.append(cohort)
+        raise CaseInputError("far enough")
+
+    monkeypatch.setattr("cmfsim.cli.research.study_commands.run_study", run)
+    words = ["study", str(tmp_path), "-q"]
+    assert main([*words, "--model", "M+S", "--model", "M", "-o", str(tmp_path / "x")]) == 2
+    assert main(words) == 2
+    capsys.readouterr()
+    assert asked[0].models == ("M", "M+S")
+    assert asked[0].output == tmp_path / "x"
+    assert asked[1].models == ("H",)
+    assert asked[1].output == tmp_path / "study"

@@ -240,6 +240,10 @@ def _mean(values: Sequence[float]) -> float:
 def study(options: argparse.Namespace) -> int:
     """Predicts and compares every case of a cohort; failed if a case failed."""
     cohort = Cohort.load(options.cohort)
+    if options.model:
+        cohort = replace(cohort, models=models_of(options.model, ()))
+    if options.output is not None:
+        cohort = replace(cohort, output=options.output.absolute())
     if options.variants is not None:
         return _study_variants(cohort, options)
 
