@@ -45,7 +45,7 @@ def test_a_jaw_that_moves_within_its_skull_is_followed(head, move):
     assert removed == ()
 
 
-@pytest.mark.parametrize("bone", ["skull", "mandible"])
+@pytest.mark.parametrize("bone", [pytest.param("skull", marks=pytest.mark.slow), "mandible"])
 def test_slip_noise_and_bending_at_once_leave_the_motion(head, bone):
     """Slip alone puts vertices 0.8 mm off; what is found is nearer than what the vertices say."""
     move = "setback 3, impaction 2"

@@ -465,7 +465,10 @@ def test_the_real_jaws_are_parted_without_landmarks(coarse_phantom, reference):
 
 
 @needs_phantom
-@pytest.mark.parametrize(("axis", "code"), [(1, "ct-flipped"), (2, "ct-flipped")])
+@pytest.mark.parametrize(
+    ("axis", "code"),
+    [pytest.param(1, "ct-flipped", marks=pytest.mark.slow), (2, "ct-flipped")],
+)
 def test_a_flipped_real_ct_is_found(coarse_phantom, axis, code):
     flipped = coarse_phantom.with_values(np.flip(coarse_phantom.values, axis))
     anatomy = segment_head(flipped, SegmentOptions(part_jaws=False))

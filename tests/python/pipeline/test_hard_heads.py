@@ -151,7 +151,7 @@ def built(folder):
 
 
 # The others take as long again, and are near to one of these.
-OFTEN = ("metal", "chin off", "nose off")
+OFTEN = ("metal", "chin off")
 
 
 @pytest.fixture(

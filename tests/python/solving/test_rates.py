@@ -38,7 +38,9 @@ def with_tissue(solver, tissue):
     return cmfsim.StaticSolver(tensors, solver.boundary, **OPTIONS)
 
 
-@pytest.mark.parametrize("model", ["H", "H+S", "M", "M+S"])
+@pytest.mark.parametrize(
+    "model", [*(pytest.param(m, marks=pytest.mark.slow) for m in ("H", "H+S", "M")), "M+S"]
+)
 def test_derivatives_equal_central_differences_to_one_percent(patient, model):
     scene, solver, solution = solved(patient, model)
     found = skin_rates(patient, scene, solver, solution)
