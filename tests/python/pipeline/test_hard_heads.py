@@ -174,16 +174,9 @@ def test_a_hard_ct_builds_and_says_what_was_hard(hard):
     assert least < summary["mesh"]["volume"] / ORDINARY < most
 
 
-# Noise changes most; the other images differ from the plain one where there is no face.
-@pytest.mark.parametrize(
-    "hard",
-    [
-        name if name == "noise" else pytest.param(name, marks=pytest.mark.slow)
-        for name in HARD
-        if HARD[name][-1]
-    ],
-    indirect=True,
-)
+# test_imaging.py compares faces of changed images in the ordinary run.
+@pytest.mark.slow
+@pytest.mark.parametrize("hard", [name for name in HARD if HARD[name][-1]], indirect=True)
 def test_a_hard_ct_keeps_its_face(hard):
     name, _, anatomy = hard
     phantom_reference.check_face(anatomy, phantom_reference.reference(), *HARD[name][-1])

@@ -91,6 +91,7 @@ def test_the_first_prediction_moves_lip_and_chin_apart(ran):
     assert pictures == 1
 
 
+@pytest.mark.slow
 def test_the_plan_operator_is_the_solver(ran):
     text, pictures = ran("plans")
     apart = float(re.search(rf"none of them solved\n\n?(?:np\.float64\()?{NUMBER}", text)[1])
@@ -107,7 +108,6 @@ def test_the_block_is_in_balance(ran):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_the_evaluation_finds_the_model_that_made_the_face(ran):
     text, pictures = ran("evaluation")
     means = dict(re.findall(rf"^(no change|H|M) +mean {NUMBER}", text, re.MULTILINE))
@@ -115,13 +115,13 @@ def test_the_evaluation_finds_the_model_that_made_the_face(ran):
     assert pictures == 2
 
 
-# Half of the time of all tutorials.
-LONG = "evaluation"
+# Most of the time of all tutorials.
+LONG = {"evaluation", "plans"}
 
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(p, marks=pytest.mark.slow) if p.stem == LONG else p for p in TUTORIALS],
+    [pytest.param(p, marks=pytest.mark.slow) if p.stem in LONG else p for p in TUTORIALS],
     ids=lambda path: path.stem,
 )
 def test_saved_outputs_are_those_of_this_version(ran, path):

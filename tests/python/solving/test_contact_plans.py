@@ -98,6 +98,8 @@ def seen_in_mirror(motion):
     return mirror @ motion @ mirror
 
 
+# test_mirror.py mirrors a case in the ordinary run.
+@pytest.mark.slow
 def test_a_mirrored_head_has_the_mirrored_face(scene, solver, plans):
     there = cmfsim.scene_solver(mirrored(scene))
     for plan in plans[:2]:
