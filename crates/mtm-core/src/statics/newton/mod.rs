@@ -264,6 +264,7 @@ impl Equilibrium {
             Err(error) => return Err(error),
         }
         let SlidingBody { sliding, motions, .. } = slide;
+        tangents.borrow_mut().forget();
         // Other constraints than those at rest.
         let own = SharedHierarchy::default();
         let target = Target { hierarchy: &own, conditions: conditions(), ..target };
@@ -281,7 +282,10 @@ impl Equilibrium {
         target: &mut Target<'a>,
         solve: &mut PlanSolve<'_>,
     ) -> Result<Vec<[f64; 3]>> {
-        target.energy = &self.yielding;
+        if !self.has_barrier_ahead(target) {
+            target.energy = &self.yielding;
+            target.tangents.borrow_mut().forget();
+        }
         let u = self.follow(u, target, solve)?;
         if !self.energy.is_at_barrier(&u) {
             return Ok(u);
