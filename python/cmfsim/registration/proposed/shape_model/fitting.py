@@ -148,9 +148,10 @@ def _stepped(
             / state.scale,
         )
         shape = _Surface(part, moved[part], normals[part], derivatives)
-        rows += [*_pairs(model, shape, target, seen, noise)]
-        gaps[part] = _gaps(shape, target)
-        there, _ = Finder(shape.points, shape.normals).nearest(target.points, target.normals)
+        there, to_model = Finder(shape.points, shape.normals).nearest(target.points, target.normals)
+        _, back = target.nearest(shape.points, shape.normals)
+        rows += [*_pairs(model, shape, target, (to_model, back), seen, noise)]
+        gaps[part] = _gaps(shape, target, back)
         scores.append(float(np.minimum(there, MOST_GAP).mean()))
     if seen.any():
         scores.append(
@@ -170,9 +171,8 @@ class _Surface:
     derivatives: NDArray[np.float32]
 
 
-def _gaps(surface: _Surface, target: Finder) -> Floats:
+def _gaps(surface: _Surface, target: Finder, back: NDArray[np.int64]) -> Floats:
     """How far the model's points lie from the nearest points of the patient, along normals."""
-    _, back = target.nearest(surface.points, surface.normals)
     away = target.points[back] - surface.points
     along = np.abs((target.normals[back] * away).sum(axis=1))
     # The patient's points are some mm apart: what lies beside them is no distance.
@@ -189,11 +189,15 @@ SAMPLE_STEP, LEAST_FACING = 9.0, 0.7
 
 
 def _pairs(
-    model: HeadModel, surface: _Surface, target: Finder, seen: NDArray[np.bool_], noise: float
+    model: HeadModel,
+    surface: _Surface,
+    target: Finder,
+    nearest: tuple[NDArray[np.int64], NDArray[np.int64]],
+    seen: NDArray[np.bool_],
+    noise: float,
 ) -> Iterator[_Rows]:
     """The equations of the pairs from the patient to the model, and back where it is seen."""
-    _, index = Finder(surface.points, surface.normals).nearest(target.points, target.normals)
-    _, back = target.nearest(surface.points, surface.normals)
+    index, back = nearest
     share = model.weight_of(surface.rows)
     everything = np.arange(len(surface.rows))
     for at, goal, normals, facing, weight in (

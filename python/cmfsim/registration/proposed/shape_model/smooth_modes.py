@@ -61,8 +61,8 @@ class SmoothModes:
     def of(cls, kernel: Kernel, places: Floats) -> "SmoothModes":
         """The modes of a kernel by the covariance among places (Nyström)."""
         halves = []
-        for sign in (1.0, -1.0):
-            values, vectors = np.linalg.eigh(_folded(kernel, places, places, sign))
+        for covariance in _folded(kernel, places, places):
+            values, vectors = np.linalg.eigh(covariance)
             order = np.argsort(-values)[: kernel.modes]
             order = order[values[order] > ROUNDING * values.max()]
             halves.append(vectors[:, order] / np.sqrt(values[order]))
@@ -70,8 +70,8 @@ class SmoothModes:
 
     def at(self, points: Floats) -> Floats:
         """The displacements at points by unit coefficients, (n, 3, modes) mm."""
-        even = _folded(self.kernel, points, self.places, 1.0) @ self.even
-        odd = _folded(self.kernel, points, self.places, -1.0) @ self.odd
+        of_even, of_odd = _folded(self.kernel, points, self.places)
+        even, odd = of_even @ self.even, of_odd @ self.odd
         blocks = []
         # Even: across odd, back and up even. What differs between the sides is the reverse.
         for across, along, share in ((odd, even, 1.0), (even, odd, self.kernel.asymmetry)):
@@ -82,6 +82,7 @@ class SmoothModes:
         return np.concatenate(blocks, axis=2)
 
 
-def _folded(kernel: Kernel, a: Floats, b: Floats, sign: float) -> Floats:
-    """The covariance of a displacement that is even (1) or odd (−1) about x = 0."""
-    return kernel.covariance(a, b) + sign * kernel.covariance(a, b * MIRROR)
+def _folded(kernel: Kernel, a: Floats, b: Floats) -> tuple[Floats, Floats]:
+    """The covariances of displacements that are even and odd about x = 0."""
+    same, mirrored = kernel.covariance(a, b), kernel.covariance(a, b * MIRROR)
+    return same + mirrored, same - mirrored
