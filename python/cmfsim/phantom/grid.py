@@ -21,7 +21,7 @@ DIFFERENCE = 1e-3
 # A smaller gradient than this is a crease, where Newton's step would be too long.
 LEAST_SLOPE = 0.2
 # Vertices are projected cell by cell of this size, mm, so that few shapes matter to each.
-CELL = 24.0
+CELL = 72.0
 # Marching cubes keep vertices this far from grid points, as a share of the spacing.
 NEAREST = 0.05
 # A projected point counts as on the surface below this level, mm.
