@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.imaging.morphology import Mask, Volume, label, ndimage, smoothed
+from cmfsim.imaging.morphology import Mask, Volume, label, ndimage, smoothed, widened_by
 from cmfsim.values.checks import Floats
 
 # Voxels that steps are looked for on, mm.
@@ -54,7 +54,6 @@ EDGE = 1.0
 LEAST_RIM = 0.62
 # Gaussian by which a piece's border gets a direction, voxels.
 BORDER = 2.0
-CUBE = np.ones((3, 3, 3), dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +133,7 @@ def _surrounded(
     skin: _Skin, steps: Mask, widened: int, slope: NDArray[np.float32], least_rim: float
 ) -> list[NDArray[np.intp]]:
     """The voxels, with those of its rim, of each piece of the shell that a rim surrounds."""
-    wall = ndimage().binary_dilation(steps, CUBE, iterations=widened)
+    wall = widened_by(steps, widened)
     labels, sizes = label(np.asfortranarray(skin.shell & ~wall), corners=True)
     areas = sizes * float(np.prod(skin.spacing)) ** (2.0 / 3.0)
     blocks = ndimage().find_objects(labels)
@@ -146,14 +145,14 @@ def _surrounded(
         box = tuple(slice(max(b.start - reach - 1, 0), b.stop + reach + 1) for b in block)
         within = labels[box] == number
         shell = skin.shell[box]
-        beside = ndimage().binary_dilation(within, CUBE, iterations=reach) & shell & ~within
-        ends = ndimage().binary_dilation(skin.cut_off[box], CUBE)
-        border = within & (ends | ndimage().binary_dilation(beside, CUBE))
+        beside = widened_by(within, reach) & shell & ~within
+        ends = widened_by(skin.cut_off[box], 1)
+        border = within & (ends | widened_by(beside, 1))
         outwards = _outwards(within, beside | border, slope[box], skin.spacing)
         if not border.any() or outwards[border].mean() > np.sin(np.radians(EDGE)):
             continue
         rim = beside & (outwards > np.sin(np.radians(OUTWARDS)))
-        near = ndimage().binary_dilation(rim, CUBE, iterations=reach)
+        near = widened_by(rim, reach)
         # Where the face ends, what lies beyond is not known to be lower.
         if (near & ~ends)[border].mean() > least_rim:
             pieces.append(np.argwhere(within | rim) + np.array([b.start for b in box]))
