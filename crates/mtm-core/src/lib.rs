@@ -95,6 +95,7 @@ pub use error::{ErrorKind, MtmError, Result, Shortfall};
 pub use geometry::motion::{RigidMotion, SurfaceMotion, rigid_matrix};
 pub use geometry::surface::{Closest, Surface};
 pub use geometry::triangle::{DEGENERATE_AREA, Feature};
+pub use geometry::tube::{TubeEnd, tube_levels};
 pub use geometry::winding::{WindingOptions, WindingTree, winding_number_exact};
 pub use mechanics::element::{Element, ElementNodes};
 pub use mechanics::hyperelastic::HyperelasticLaw;

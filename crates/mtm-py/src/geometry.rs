@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use mtm_core::{
-    ErrorKind, MeshQuality, Surface, SurfaceMotion, TetMesh, WindingTree,
-    rigid_matrix as core_rigid_matrix,
+    ErrorKind, MeshQuality, Surface, SurfaceMotion, TetMesh, TubeEnd, WindingTree,
+    rigid_matrix as core_rigid_matrix, tube_levels as core_tube_levels,
 };
-use numpy::{IntoPyArray, PyArray1, PyArray2};
+use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
 use pyo3::sync::PyOnceLock;
 use pyo3::types::PyDict;
@@ -372,6 +372,28 @@ pub fn rigid_matrix<'py>(
     let matrix = arrays::square4(matrix, name)?;
     let rigid = core_rigid_matrix(name.0, &matrix, name.1).map_err(Failure)?;
     Ok(arrays::table(py, rigid.to_vec()))
+}
+
+/// Level of the nearest segment of a tube at points, (m,) float64, mm, no less than `outside`: positive inside.
+///
+/// A row of `segments`, (s, 2, 8) float64, is an end: place, unit normal, half axes along and across the normal.
+#[pyfunction]
+pub fn tube_levels<'py>(
+    py: Python<'py>,
+    points: PyReadonlyArray2<'py, f64>,
+    segments: PyReadonlyArray3<'py, f64>,
+    outside: f64,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let (points, ends) = (points.as_slice()?, segments.as_slice()?);
+    let ends = ends.as_chunks::<8>().0.iter().map(|&[x, y, z, u, v, w, thick, wide]| TubeEnd {
+        place: [x, y, z],
+        normal: [u, v, w],
+        thick,
+        wide,
+    });
+    let ends: Vec<TubeEnd> = ends.collect();
+    let (segments, points) = (ends.as_chunks::<2>().0, points.as_chunks::<3>().0);
+    Ok(py.detach(|| core_tube_levels(segments, points, outside)).into_pyarray(py))
 }
 
 /// Motion of a bone surface vertex by vertex: joined nodes and contact surfaces follow it.

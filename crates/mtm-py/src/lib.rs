@@ -31,7 +31,9 @@ mod _core {
     #[pymodule_export]
     use crate::fibres::PyMuscleFibres;
     #[pymodule_export]
-    use crate::geometry::{PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh, rigid_matrix};
+    use crate::geometry::{
+        PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh, rigid_matrix, tube_levels,
+    };
     #[pymodule_export]
     use crate::materials::{PyMassTensors, PyTissue};
     #[pymodule_export]

@@ -12,7 +12,6 @@ from cmfsim.phantom.geometry.shapes import (
     Box,
     Egg,
     Engraving,
-    FlatTube,
     Loft,
     Plane,
     Step,
@@ -26,7 +25,7 @@ HEAD_BOX = Box((0.0, -140.0, NECK_CUT), (100.0, 115.0, 145.0))
 
 
 def _tube(points: list[list[float]], steps: int = 4) -> Tube:
-    return Tube(smooth_curve(points, steps))
+    return Tube.round(smooth_curve(points, steps))
 
 
 def _engrave(points: list[list[float]], width: float, behind: float = -40.0) -> Engraving:
@@ -229,7 +228,7 @@ def _mouth(p: HeadParameters) -> list[Step | Engraving]:
         _engrave([[0, -60, 2.6], [10, -59.5, 2.2], [19, -57, 0.8], [24, -54, 0.1]], 7.0),
     ]
     if gap > 0.0:
-        slit = FlatTube(
+        slit = Tube(
             np.array([[0, -98, -44.4], [12, -96, -44.0], [25.0, -89, -44.5]], dtype=np.float64),
             np.array([[0, 0, 1]] * 3, dtype=np.float64),
             np.array([gap, 0.8 * gap, 0.2]),

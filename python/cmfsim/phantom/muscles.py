@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim.phantom.geometry.courses import COURSES, Course, Row
 from cmfsim.phantom.geometry.curves import Level, smooth_curve, smooth_max
-from cmfsim.phantom.geometry.shapes import REACH, Box, FlatTube
+from cmfsim.phantom.geometry.shapes import REACH, Box, Tube
 from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
 from cmfsim.values.checks import Floats, as_rows, frozen
@@ -61,7 +61,7 @@ class Muscle:
     side: str
     kind: str
     course: tuple[Floats, ...]
-    tubes: tuple[FlatTube, ...] = field(repr=False)
+    tubes: tuple[Tube, ...] = field(repr=False)
     tissue: Tissue = field(repr=False)
 
     @property
@@ -211,7 +211,7 @@ def _dense(line: tuple[Row, ...], course: Course) -> Floats:
     return dense[:-1] if course.closed else dense
 
 
-def _line(tissue: Tissue, tube: FlatTube, side: str, course: Course) -> Floats:
+def _line(tissue: Tissue, tube: Tube, side: str, course: Course) -> Floats:
     """A fibre line in the person's space."""
     points = tube.points
     mirror = points * np.array([-1.0, 1.0, 1.0])
@@ -223,7 +223,7 @@ def _line(tissue: Tissue, tube: FlatTube, side: str, course: Course) -> Floats:
     return frozen(tissue.warp.forward(points))
 
 
-def _strap(tissue: Tissue, rows: Floats, course: Course) -> FlatTube:
+def _strap(tissue: Tissue, rows: Floats, course: Course) -> Tube:
     """The tube along one line, flat towards the skin."""
     curve = smooth_curve(np.delete(rows, 3, axis=1), STEPS, closed=course.closed)
     points = curve[:, :3]
@@ -233,7 +233,7 @@ def _strap(tissue: Tissue, rows: Floats, course: Course) -> FlatTube:
     along /= np.linalg.norm(along, axis=1)[:, None]
     normals -= (normals * along).sum(axis=1)[:, None] * along
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    return FlatTube(points, normals, curve[:, 3], curve[:, 4])
+    return Tube(points, normals, curve[:, 3], curve[:, 4])
 
 
 def _skin(tissue: Tissue) -> Field:

@@ -8,7 +8,7 @@ encloses count as bone, as `Anatomy.bones` wants it; `brain_shape` and the like 
 import numpy as np
 
 from cmfsim.phantom.geometry.curves import smooth_curve, turn_about
-from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, FlatTube, Step, Tube
+from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, Step, Tube
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.values.checks import Floats
 
@@ -46,14 +46,14 @@ ROOT = 8.0
 
 
 def _tube(points: list[list[float]], steps: int = 3) -> Tube:
-    return Tube(smooth_curve(points, steps))
+    return Tube.round(smooth_curve(points, steps))
 
 
-def _plate(rows: list[list[float]], normal: tuple[float, float, float], steps: int = 3) -> FlatTube:
+def _plate(rows: list[list[float]], normal: tuple[float, float, float], steps: int = 3) -> Tube:
     """A blade through rows of x, y, z, half thickness, half width."""
     curve = smooth_curve(rows, steps)
     unit = np.asarray(normal) / np.linalg.norm(normal)
-    return FlatTube(curve[:, :3], np.tile(unit, (len(curve), 1)), curve[:, 3], curve[:, 4])
+    return Tube(curve[:, :3], np.tile(unit, (len(curve), 1)), curve[:, 3], curve[:, 4])
 
 
 def cranium_shape() -> Blend:
@@ -220,7 +220,7 @@ def _nasal_opening() -> Blend:
             Step("join", Egg((0, -94, 0), (6.5, 16, 10.5)), 4.0),
             Step(
                 "join",
-                Tube(np.array([[3.5, -88, -8, 7.5], [4, -60, -8, 9.0], [5, -36, -8, 8.0]])),
+                Tube.round(np.array([[3.5, -88, -8, 7.5], [4, -60, -8, 9.0], [5, -36, -8, 8.0]])),
                 5.0,
             ),
         ),
@@ -228,14 +228,14 @@ def _nasal_opening() -> Blend:
     )
 
 
-def _arch(curve: tuple[tuple[float, float], ...], z: float, thick: float, high: float) -> FlatTube:
+def _arch(curve: tuple[tuple[float, float], ...], z: float, thick: float, high: float) -> Tube:
     """The alveolar process: a wall that stands on the arch."""
     rows = smooth_curve(curve, 4)
     along = np.gradient(rows, axis=0)
     across = np.column_stack([along[:, 1], -along[:, 0], np.zeros(len(rows))])
     across /= np.linalg.norm(across, axis=1)[:, None]
     points = np.column_stack([rows, np.full(len(rows), z)])
-    return FlatTube(points, across, np.full(len(rows), thick), np.full(len(rows), high))
+    return Tube(points, across, np.full(len(rows), thick), np.full(len(rows), high))
 
 
 def mandible_shape(p: HeadParameters) -> Blend:
@@ -279,7 +279,7 @@ def mandible_shape(p: HeadParameters) -> Blend:
     return Blend(steps, Box((0, -98, -92), (64, -4, 6)))
 
 
-def _body() -> FlatTube:
+def _body() -> Tube:
     rows = smooth_curve(
         [
             [0, -82.5, -70.0, 5.0, 12.0],
@@ -294,7 +294,7 @@ def _body() -> FlatTube:
     along = np.gradient(rows[:, :2], axis=0)
     across = np.column_stack([along[:, 1], -along[:, 0], np.zeros(len(rows))])
     across /= np.linalg.norm(across, axis=1)[:, None]
-    return FlatTube(rows[:, :3], across, rows[:, 3], rows[:, 4])
+    return Tube(rows[:, :3], across, rows[:, 3], rows[:, 4])
 
 
 def teeth_shape(*, upper: bool) -> Blend:
@@ -337,10 +337,13 @@ def brain_shape() -> Egg:
 def airway_shape() -> Blend:
     """Air of the nasal cavity and the throat: the only hollows that no bone encloses."""
     steps = (
-        Step("join", Tube(np.array([[4.6, -84, -8, 2.4], [5, -60, -7, 4.6], [5, -38, -8, 5.5]]))),
         Step(
             "join",
-            Tube(
+            Tube.round(np.array([[4.6, -84, -8, 2.4], [5, -60, -7, 4.6], [5, -38, -8, 5.5]])),
+        ),
+        Step(
+            "join",
+            Tube.round(
                 np.array(
                     [[4, -34, -8, 6.0], [3, -27, -20, 7.0], [3, -22, -60, 7.0], [0, -18, -150, 8.0]]
                 )

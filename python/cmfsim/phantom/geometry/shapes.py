@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
+from cmfsim import _core
 from cmfsim.phantom.geometry.curves import Level, Table, clipped, smooth_max, smooth_step
 from cmfsim.values.checks import Floats
 
@@ -150,54 +151,13 @@ class Reaches:
 
 @dataclass(frozen=True, eq=False)
 class Tube:
-    """A round tube of changing radius along a polyline.
-
-    Attributes
-    ----------
-    points : (n, 4)
-        Place and radius, mm.
-    """
-
-    points: Floats
-
-    @cached_property
-    def segments(self) -> Reaches:
-        """Where each segment matters."""
-        return Reaches.of_line(self.points[:, :3], self.points[:, 3])
-
-    @property
-    def box(self) -> Box:
-        """Where the level can be above 0."""
-        place, radius = self.points[:, :3], self.points[:, 3:]
-        return Box(
-            tuple((place - radius).min(axis=0).tolist()),
-            tuple((place + radius).max(axis=0).tolist()),
-        )
-
-    def level(self, x: Level, y: Level, z: Level) -> Level:
-        """Radius less distance, of the best segment."""
-        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), FAR, dtype=x.dtype)
-        rows = self.points.tolist()
-        for i in self.segments.near(x, y, z):
-            (ax, ay, az, ar), (bx, by, bz, br) = rows[i], rows[i + 1]
-            ux, uy, uz = bx - ax, by - ay, bz - az
-            size = max(ux * ux + uy * uy + uz * uz, TINY)
-            px, py, pz = x - ax, y - ay, z - az
-            t = clipped((px * ux + py * uy + pz * uz) / size)
-            d = np.sqrt((px - t * ux) ** 2 + (py - t * uy) ** 2 + (pz - t * uz) ** 2)
-            best = np.maximum(best, ar + t * (br - ar) - d)
-        return best
-
-
-@dataclass(frozen=True, eq=False)
-class FlatTube:
-    """A tube of elliptic section along a polyline: a strap.
+    """A tube of elliptic or round section along a polyline.
 
     Attributes
     ----------
     points : (n, 3) mm
     normals : (n, 3)
-        Unit vectors along which the strap is thin.
+        Unit vectors along which the section is thin.
     thick, wide : (n,) mm
         Half axes of the section, along the normal and across it.
     """
@@ -207,43 +167,39 @@ class FlatTube:
     thick: Floats
     wide: Floats
 
+    @classmethod
+    def round(cls, rows: Floats) -> "Tube":
+        """A tube of changing radius: (n, 4) place and radius, mm."""
+        upwards = np.tile([0.0, 0.0, 1.0], (len(rows), 1))
+        return cls(rows[:, :3], upwards, rows[:, 3], rows[:, 3])
+
     @cached_property
-    def segments(self) -> Reaches:
-        """Where each segment matters."""
-        return Reaches.of_line(self.points, np.maximum(self.thick, self.wide))
+    def _reach(self) -> Floats:
+        return np.maximum(self.thick, self.wide)
+
+    @cached_property
+    def _segments(self) -> tuple[Reaches, Floats]:
+        """Where each segment matters, and its ends as the core takes them, (n − 1, 2, 8)."""
+        ends = np.column_stack([self.points, self.normals, self.thick, self.wide])
+        pairs = np.stack([ends[:-1], ends[1:]], axis=1)
+        return Reaches.of_line(self.points, self._reach), pairs
 
     @property
     def box(self) -> Box:
         """Where the level can be above 0."""
-        reach = np.maximum(self.thick, self.wide)[:, None]
+        reach = self._reach[:, None]
         return Box(
             tuple((self.points - reach).min(axis=0).tolist()),
             tuple((self.points + reach).max(axis=0).tolist()),
         )
 
     def level(self, x: Level, y: Level, z: Level) -> Level:
-        """The level of the ellipse in the section through the closest point of the polyline."""
-        best = np.full(np.broadcast_shapes(x.shape, y.shape, z.shape), FAR, dtype=x.dtype)
-        for i in self.segments.near(x, y, z):
-            ax, ay, az = self.points[i].tolist()
-            ux, uy, uz = (self.points[i + 1] - self.points[i]).tolist()
-            size = max(ux * ux + uy * uy + uz * uz, TINY)
-            px, py, pz = x - ax, y - ay, z - az
-            t = clipped((px * ux + py * uy + pz * uz) / size)
-            qx, qy, qz = px - t * ux, py - t * uy, pz - t * uz
-            d2 = qx * qx + qy * qy + qz * qz
-            n, dn = self.normals[i].tolist(), (self.normals[i + 1] - self.normals[i]).tolist()
-            off = qx * (n[0] + t * dn[0]) + qy * (n[1] + t * dn[1]) + qz * (n[2] + t * dn[2])
-            thick = self.thick[i] + t * (self.thick[i + 1] - self.thick[i])
-            wide = self.wide[i] + t * (self.wide[i + 1] - self.wide[i])
-            u2 = off * off
-            v2 = np.maximum(d2 - u2, 0.0)
-            # iq's bound of the distance to an ellipse: k₀(1 − k₀)/k₁.
-            k0 = np.sqrt(u2 / thick**2 + v2 / wide**2)
-            k1 = np.sqrt(u2 / thick**4 + v2 / wide**4)
-            value = np.where(k0 < 0.05, thick, k0 * (1.0 - k0) / np.maximum(k1, TINY))
-            best = np.maximum(best, value)
-        return best.astype(x.dtype)
+        """The level of the section through the closest point of the polyline."""
+        reaches, ends = self._segments
+        places = np.stack(np.broadcast_arrays(x, y, z), axis=-1, dtype=np.float64)
+        near = ends[reaches.near(x, y, z)]
+        levels = _core.tube_levels(places.reshape(-1, 3), near, FAR)
+        return levels.reshape(places.shape[:-1]).astype(x.dtype, copy=False)
 
 
 @dataclass(frozen=True, eq=False)

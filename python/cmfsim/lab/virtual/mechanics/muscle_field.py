@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.phantom import Muscle, PhantomHead
 from cmfsim.phantom.geometry.curves import smooth_max
-from cmfsim.phantom.geometry.shapes import FlatTube
+from cmfsim.phantom.geometry.shapes import Tube
 from cmfsim.phantom.muscles import MELT
 from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows, check_one_of
 
@@ -176,7 +176,7 @@ def _level(muscle: Muscle, asked: Floats, room: float) -> Floats:
             near = np.flatnonzero(((middles >= low) & (middles <= high)).all(axis=1))
             if not len(near):
                 continue
-            piece = FlatTube(ends, tube.normals[part], tube.thick[part], tube.wide[part])
+            piece = Tube(ends, tube.normals[part], tube.thick[part], tube.wide[part])
             there = piece.level(*asked[near].reshape(-1, 3).T).reshape(len(near), -1)
             best[near] = np.maximum(best[near], there)
         levels.append(best)

@@ -147,12 +147,13 @@ def _stepped(
             @ state.linear.T
             / state.scale,
         )
-        shape = _Surface(part, moved[part], normals[part], derivatives)
-        there, to_model = Finder(shape.points, shape.normals).nearest(target.points, target.normals)
-        _, back = target.nearest(shape.points, shape.normals)
-        rows += [*_pairs(model, shape, target, (to_model, back), seen, noise)]
-        gaps[part] = _gaps(shape, target, back)
-        scores.append(float(np.minimum(there, MOST_GAP).mean()))
+        places, facing = moved[part], normals[part]
+        away, there = Finder(places, facing).nearest(target.points, target.normals)
+        _, back = target.nearest(places, facing)
+        shape = _Surface(part, places, facing, derivatives, there, back)
+        rows += [*_pairs(model, shape, target, seen, noise)]
+        gaps[part] = _gaps(shape, target)
+        scores.append(float(np.minimum(away, MOST_GAP).mean()))
     if seen.any():
         scores.append(
             float(np.average(np.minimum(gaps, MOST_GAP)[seen], weights=model.areas[seen]))
@@ -163,16 +164,22 @@ def _stepped(
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """Points of the model on bone or on skin: their rows, where they are, and all derivatives."""
+    """Points of the model on bone or on skin: their rows, where they are, and all derivatives.
+
+    `there` is the nearest of them to each point of the patient, `back` the patient's to each.
+    """
 
     rows: NDArray[np.int64]
     points: Floats
     normals: Floats
     derivatives: NDArray[np.float32]
+    there: NDArray[np.int64]
+    back: NDArray[np.int64]
 
 
-def _gaps(surface: _Surface, target: Finder, back: NDArray[np.int64]) -> Floats:
+def _gaps(surface: _Surface, target: Finder) -> Floats:
     """How far the model's points lie from the nearest points of the patient, along normals."""
+    back = surface.back
     away = target.points[back] - surface.points
     along = np.abs((target.normals[back] * away).sum(axis=1))
     # The patient's points are some mm apart: what lies beside them is no distance.
@@ -189,15 +196,10 @@ SAMPLE_STEP, LEAST_FACING = 9.0, 0.7
 
 
 def _pairs(
-    model: HeadModel,
-    surface: _Surface,
-    target: Finder,
-    nearest: tuple[NDArray[np.int64], NDArray[np.int64]],
-    seen: NDArray[np.bool_],
-    noise: float,
+    model: HeadModel, surface: _Surface, target: Finder, seen: NDArray[np.bool_], noise: float
 ) -> Iterator[_Rows]:
     """The equations of the pairs from the patient to the model, and back where it is seen."""
-    index, back = nearest
+    index, back = surface.there, surface.back
     share = model.weight_of(surface.rows)
     everything = np.arange(len(surface.rows))
     for at, goal, normals, facing, weight in (
