@@ -14,7 +14,7 @@ from types import TracebackType
 
 from cmfsim.errors import CaseError, CaseInputError
 from cmfsim.pictures.canvas import NO_OPENGL, Picture, pyvista_module, without_probe
-from cmfsim.processes.parallel import Worker
+from cmfsim.processes.worker import Worker, WorkerEndedError
 
 
 class Painter:
@@ -44,7 +44,7 @@ class Painter:
         """Starts the process, which loads its libraries: ahead of a picture that is to come."""
         # Where this Python cannot start another, pictures are drawn in turn.
         if self._worker is None and sys.executable:
-            self._worker = Worker()
+            self._worker = Worker(threads=1)
             self._queue.submit(self._load, self._worker)
 
     def begin(self, picture: Picture, path: Path) -> "Future[None]":
@@ -61,19 +61,17 @@ class Painter:
     def _load(worker: Worker) -> None:
         # What is wrong is raised for the first picture.
         with contextlib.suppress(CaseError):
-            worker.answer("cmfsim.pipeline.painting:load", {})
+            worker.ask("cmfsim.pipeline.painting:load", {})
 
     @staticmethod
     def _draw(worker: Worker, picture: Picture, path: Path) -> None:
         packed = base64.b64encode(pickle.dumps(picture)).decode()
         try:
-            worker.answer(
+            worker.ask(
                 "cmfsim.pipeline.painting:draw_packed",
                 {"path": str(path.absolute()), "packed": packed},
             )
-        except CaseError as error:
-            if not worker.has_ended:
-                raise
+        except WorkerEndedError as error:
             raise CaseInputError(
                 f"{path.name}: the picture cannot be drawn (OpenGL does not work); {NO_OPENGL}"
             ) from error

@@ -1,33 +1,14 @@
-"""Jobs in processes of their own, with one thread each, which end with what started them.
+"""Jobs in processes of their own, with one thread each, or on a cluster."""
 
-A process of this package's own making needs no `if __name__ == "__main__"` in the user's script, as
-those of `multiprocessing` do, and a killed command leaves none behind that goes on writing.
-"""
-
-import json
-import os
 import queue
-import subprocess
-import sys
-import threading
-import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from importlib import import_module
-from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from cmfsim import errors
 from cmfsim.errors import CaseError
 from cmfsim.processes.cluster import on_cluster
-
-# The child's program: it finds the same modules as its parent, and nothing else is run.
-PROGRAM = (
-    "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.readline());"
-    "from cmfsim.processes.parallel import serve; serve()"
-)
-# Read when numpy and the extension are loaded; with one thread sums have one order everywhere.
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+from cmfsim.processes.worker import Worker
 
 
 def answers(
@@ -62,14 +43,14 @@ def answers(
     def ask(job: Mapping[str, Any]) -> Any:
         worker = idle.get()
         try:
-            return worker.answer(function, job)
+            return worker.ask(function, job).values
         finally:
             idle.put(worker)
 
     pool = ThreadPoolExecutor(workers)
     try:
         for _ in range(min(workers, len(jobs))):
-            started.append(Worker())
+            started.append(Worker(threads=1))
             idle.put(started[-1])
         running = {pool.submit(ask, job): index for index, job in enumerate(jobs)}
         for future in as_completed(running):
@@ -97,94 +78,5 @@ def _on_cluster(
 
 def answer_alone(function: str, job: Mapping[str, Any]) -> Any:
     """The answer to one job from a process of its own, which has one thread wherever it runs."""
-    worker = Worker()
-    try:
-        return worker.answer(function, job)
-    finally:
-        worker.end()
-
-
-class Worker:
-    """A process that takes jobs one after the other, a line of JSON each."""
-
-    def __init__(self) -> None:
-        environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
-        self._process = subprocess.Popen(  # noqa: S603 (this very Python, and no shell)
-            [sys.executable, "-I", "-c", PROGRAM],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=environment,
-        )
-        self._send([str(Path(path).absolute()) for path in sys.path])
-
-    def _send(self, value: object) -> None:
-        stream = _open(self._process.stdin)
-        stream.write(json.dumps(value).encode() + b"\n")
-        stream.flush()
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether the process is gone, as after a crash of a library."""
-        return self._process.poll() is not None
-
-    def answer(self, function: str, job: Mapping[str, Any]) -> Any:
-        """What the function answers to a job; see `answers`."""
-        line = b""
-        try:
-            self._send({"function": function, "job": dict(job)})
-            line = _open(self._process.stdout).readline()
-        except OSError:
-            pass
-        if not line:
-            raise CaseError(
-                f"a worker process died (exit code {self._process.wait()}), perhaps out of memory: "
-                "run the command again, with fewer workers; what is complete is kept"
-            )
-        found = json.loads(line)
-        if "error" in found:
-            kind = getattr(errors, found["error"], None)
-            if isinstance(kind, type) and issubclass(kind, errors.CmfsimError):
-                raise kind(found["text"])
-            raise CaseError(f"{found['error']} in a worker process:\n{found['text']}")
-        return found["answer"]
-
-    def end(self) -> None:
-        """Ends the process, whatever it is doing."""
-        self._process.kill()
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            _open(stream).close()
-
-
-def _open(stream: IO[bytes] | None) -> IO[bytes]:
-    assert stream is not None  # noqa: S101 (both were asked for)
-    return stream
-
-
-def serve() -> None:
-    """Works on jobs until standard input ends; then the process ends, whatever it is doing."""
-    # What a library prints must not become an answer.
-    results = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
-    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-
-    def read() -> None:
-        for line in sys.stdin.buffer:
-            lines.put(line)
-        os._exit(0)
-
-    threading.Thread(target=read, daemon=True).start()
-    while True:
-        results.write(json.dumps(_done(json.loads(lines.get()))).encode() + b"\n")
-        results.flush()
-
-
-def _done(request: Mapping[str, Any]) -> dict[str, Any]:
-    """The answer to one job, or its error."""
-    module, name = request["function"].split(":")
-    try:
-        return {"answer": getattr(import_module(module), name)(**request["job"])}
-    except errors.CmfsimError as error:
-        return {"error": type(error).__name__, "text": str(error)}
-    except Exception as error:  # noqa: BLE001 (told to the one who asked)
-        return {"error": type(error).__name__, "text": traceback.format_exc()}
+    with Worker(threads=1) as worker:
+        return worker.ask(function, job).values
