@@ -9,7 +9,7 @@ import time
 import numpy as np
 
 from cmfsim import errors
-from cmfsim.processes.child import Answer
+from cmfsim.processes.worker import Answer
 
 
 def arrays(count):

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.processes import child
-from cmfsim.processes.child import Answer, ReaderError, ReadLimits, read_in_child
+from cmfsim.processes import child, worker
+from cmfsim.processes.child import ReaderError, read_in_child
+from cmfsim.processes.worker import Answer, ReadLimits
 
 HERE = "child_tasks"
 FOLDER = Path(__file__).parents[1]
@@ -60,7 +61,7 @@ def test_a_reader_that_never_ends_is_stopped():
 def test_a_reader_that_gets_no_turn_is_waited_for(monkeypatch):
     """On a busy machine a valid file would be refused; what it may use is processor time."""
     read_in_child(f"{HERE}:arrays", count=1)
-    monkeypatch.setattr(child, "WALL_PER_CPU", 0.05)
+    monkeypatch.setattr(worker, "WALL_PER_CPU", 0.05)
     limits = ReadLimits(seconds=4.0)
     assert read_in_child(f"{HERE}:compute", limits, seconds=1.0).values == {"done": True}
     with pytest.raises(ReaderError, match="took longer than a file"):
@@ -70,8 +71,7 @@ def test_a_reader_that_gets_no_turn_is_waited_for(monkeypatch):
 def test_the_start_of_libraries_is_no_part_of_the_time_of_a_file(monkeypatch):
     """Neither is one that is missing an error of its own: the task reports it."""
     monkeypatch.setenv("CMFSIM_SLOW_LIBRARY", "1")
-    while child._children:
-        child._children.pop().end()
+    child._end()
     limits = ReadLimits(seconds=0.5)
     assert read_in_child(f"{HERE}:with_library", limits).values == {"read": True}
 
@@ -108,12 +108,12 @@ def test_ctrl_c_ends_a_reader_that_hangs():
 
 def test_one_process_serves_many_files():
     read_in_child(f"{HERE}:arrays", count=1)
-    process = child._children[0].process.pid
+    process = child._children[0].pid
     assert isinstance(read_in_child(f"{HERE}:arrays", count=1), Answer)
     with pytest.raises(cmfsim.ImageError):
         read_in_child(f"{HERE}:fail", kind="ImageError")
     assert isinstance(read_in_child(f"{HERE}:arrays", count=1), Answer)
-    assert child._children[0].process.pid == process
+    assert child._children[0].pid == process
 
 
 LIMITED = """

@@ -22,7 +22,8 @@ from cmfsim.io.images.image_headers import KNOWN, ImageHeader, apart
 from cmfsim.io.images.metaimage import is_meta, meta_header
 from cmfsim.io.images.nifti import GZIP, is_nifti, read_nifti
 from cmfsim.io.images.nrrd import nrrd_header
-from cmfsim.processes.child import ReaderError, ReadLimits, read_in_child
+from cmfsim.processes.child import ReaderError, read_in_child
+from cmfsim.processes.worker import ReadLimits
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.errors import ImageInputError
-from cmfsim.processes.child import Answer
+from cmfsim.processes.worker import Answer
 
 # What the child process imports before the time of a file begins.
 LIBRARIES = ("SimpleITK",)

@@ -23,7 +23,8 @@ from cmfsim.io.meshes.stated_frames import stated_frame
 from cmfsim.io.meshes.stl import read_stl
 from cmfsim.io.meshes.vtk.legacy import read_vtk_legacy
 from cmfsim.io.meshes.vtk.xml import read_vtk_xml
-from cmfsim.processes.child import Answer, ReaderError, ReadLimits, read_in_child
+from cmfsim.processes.child import ReaderError, read_in_child
+from cmfsim.processes.worker import Answer, ReadLimits
 from cmfsim.values.finding import Finding
 
 # Formats of meshio whose files name other files, which may lie anywhere, or hold no mesh.

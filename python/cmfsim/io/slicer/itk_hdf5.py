@@ -12,7 +12,8 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import utf8_path
-from cmfsim.processes.child import Answer, ReaderError, ReadLimits, read_in_child
+from cmfsim.processes.child import ReaderError, read_in_child
+from cmfsim.processes.worker import Answer, ReadLimits
 from cmfsim.values.checks import Floats
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"

@@ -23,7 +23,8 @@ from cmfsim.io.images.dicom.headers import SHOWN_INVERTED, DicomHeader, numbers_
 from cmfsim.io.images.dicom.slices import Slice, Stack, counted, is_localizer, listed
 from cmfsim.io.images.image_grids import aligned, of_slices, turn_of, upright
 from cmfsim.io.images.image_headers import check_shape
-from cmfsim.processes.child import ReaderError, ReadLimits, read_in_child
+from cmfsim.processes.child import ReaderError, read_in_child
+from cmfsim.processes.worker import ReadLimits
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 

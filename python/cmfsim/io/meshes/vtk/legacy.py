@@ -19,7 +19,8 @@ from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
 from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
 from cmfsim.io.meshes.stated_frames import stated_frame
 from cmfsim.io.meshes.vtk.cells import cells_by_type
-from cmfsim.processes.child import Answer, ReaderError, ReadLimits, read_in_child
+from cmfsim.processes.child import ReaderError, read_in_child
+from cmfsim.processes.worker import Answer, ReadLimits
 
 # What the child process imports before the time of a file begins.
 LIBRARIES = ("vtkmodules.vtkIOLegacy", "vtkmodules.util.numpy_support")
