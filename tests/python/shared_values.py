@@ -8,6 +8,7 @@ import contextlib
 import os
 import pickle
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +89,12 @@ def phantom_model(temporary: pytest.TempPathFactory) -> cmfsim.PatientModel:
     return shared(temporary, "phantom-model", make)
 
 
-def without_pictures(folder: Path) -> str:
-    """A PYTHONPATH for processes without PyVista, made in a folder: pictures take most time."""
+def without_pictures(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Has processes be without PyVista, by a folder: pictures take most time."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "pyvista.py").write_text("raise ImportError('left out')", encoding="utf-8")
-    return os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    # This process draws, and has loaded it before.
+    with contextlib.suppress(ImportError):
+        import_module("pyvista")
+    patch.syspath_prepend(folder)
+    patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)

@@ -1,14 +1,18 @@
 """Jobs in processes of their own, with one thread each, or on a cluster."""
 
 import queue
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import Any
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
+from typing import Any, TypeVar
 
 from cmfsim import errors
 from cmfsim.errors import CaseError
 from cmfsim.processes.cluster import on_cluster
 from cmfsim.processes.worker import Worker
+
+Job = TypeVar("Job")
+Made = TypeVar("Made")
 
 
 def answers(
@@ -38,27 +42,51 @@ def answers(
         yield from _on_cluster(function, jobs, scheduler)
         return
     idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
-    started: list[Worker] = []
 
-    def ask(job: Mapping[str, Any]) -> Any:
-        worker = idle.get()
+    def ask(job: Mapping[str, Any], start: Callable[..., Worker]) -> Any:
+        worker = start(threads=1) if idle.empty() else idle.get()
         try:
             return worker.ask(function, job).values
         finally:
             idle.put(worker)
 
-    pool = ThreadPoolExecutor(workers)
-    try:
-        for _ in range(min(workers, len(jobs))):
-            started.append(Worker(threads=1))
-            idle.put(started[-1])
-        running = {pool.submit(ask, job): index for index, job in enumerate(jobs)}
-        for future in as_completed(running):
-            yield running[future], future.result()
-    finally:
-        for worker in started:
-            worker.end()
-        pool.shutdown(cancel_futures=True)
+    yield from as_they_end(ask, jobs, workers)
+
+
+def as_they_end(
+    run: Callable[[Job, Callable[..., Worker]], Made], jobs: Sequence[Job], workers: int
+) -> Iterator[tuple[int, Made]]:
+    """What a function here makes of each job, in threads, with the job's index, as they end.
+
+    Parameters
+    ----------
+    run : callable
+        Takes a job, and what starts a `Worker`. All workers end when the caller stops listening.
+    jobs : sequence
+    workers : int
+        Threads.
+    """
+    lock, ended = threading.Lock(), threading.Event()
+    started: list[Worker] = []
+
+    def start(**options: Any) -> Worker:
+        with lock:
+            if ended.is_set():
+                raise CancelledError
+            started.append(Worker(**options))
+            return started[-1]
+
+    with ThreadPoolExecutor(workers) as pool:
+        running = {pool.submit(run, job, start): index for index, job in enumerate(jobs)}
+        try:
+            for future in as_completed(running):
+                yield running[future], future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            with lock:
+                ended.set()
+            for worker in started:
+                worker.end()
 
 
 def _on_cluster(

@@ -3,18 +3,15 @@
 import contextlib
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, BinaryIO
+from typing import Any
 
-from cmfsim.errors import CaseInputError, CmfsimError
+from cmfsim.errors import CaseError, CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseChanges, Cohort, finish_writing
 from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.files.summaries import checked_file
@@ -22,6 +19,8 @@ from cmfsim.io.results.metrics import AGAIN, read_evaluation
 from cmfsim.io.results.skin_errors import skin_errors_file
 from cmfsim.pipeline.evaluating import evaluation_key
 from cmfsim.processes.cluster import on_cluster
+from cmfsim.processes.parallel import as_they_end
+from cmfsim.processes.worker import Worker, WorkerEndedError, WorkerFailedError
 
 # Lines of a failed case's log that are shown.
 SHOWN_LINES = 12
@@ -260,58 +259,9 @@ def _outcome(name: str, status: str, seconds: float, written: Mapping[str, Any])
     return CaseOutcome(name, "failed" if failed else status, seconds, error, written)
 
 
-class _Workers:
-    """The processes that work on cases, so that they can be ended."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._running: set[subprocess.Popen[bytes]] = set()
-        self._ended = False
-
-    def run(self, words: list[str], environment: Mapping[str, str], log: BinaryIO) -> int:
-        """The exit code of a command, which ends when this process does."""
-        with self._lock:
-            if self._ended:
-                return -signal.SIGTERM
-            # Its input is a pipe that nothing is written to: the system closes it with us, however
-            # we end, and the child then ends itself.
-            process = subprocess.Popen(  # noqa: S603 (this interpreter and our own words)
-                words, env=environment, stdin=subprocess.PIPE, stdout=log, stderr=log
-            )
-            self._running.add(process)
-        try:
-            return process.wait()
-        finally:
-            with self._lock:
-                self._running.discard(process)
-            process.kill()
-            process.wait()
-            if process.stdin is not None:
-                process.stdin.close()
-
-    def end(self) -> None:
-        """Ends those that run, and starts no more."""
-        with self._lock:
-            self._ended = True
-            for process in self._running:
-                process.kill()
-
-
 def _on_this_machine(jobs: list[CaseJob], workers: int) -> Iterator[tuple[int, CaseOutcome]]:
-    # Threads that wait for processes: what a case does, happens in its own.
-    processes = _Workers()
-    with ThreadPoolExecutor(workers) as pool, _ended_by_signal():
-        running: dict[Future[CaseOutcome], int] = {
-            pool.submit(run_job, job, processes): index for index, job in enumerate(jobs)
-        }
-        try:
-            for future in as_completed(running):
-                yield running[future], future.result()
-        except BaseException:
-            for future in running:
-                future.cancel()
-            processes.end()
-            raise
+    with _ended_by_signal():
+        yield from as_they_end(run_job, jobs, workers)
 
 
 @contextlib.contextmanager
@@ -341,32 +291,34 @@ def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[tuple[int, CaseOut
             yield index, CaseOutcome(jobs[index].name, "failed", error=reason)
 
 
-def run_job(job: CaseJob, processes: _Workers | None = None) -> CaseOutcome:
+def run_job(job: CaseJob, start: Callable[..., Worker] = Worker) -> CaseOutcome:
     """The outcome of one case, worked on by another process."""
-    output = Path(job.output)
     begun = time.perf_counter()
-    words = [job.file, job.output, job.changes, *job.models]
-    command = [sys.executable, "-m", "cmfsim.study.worker", *words]
-    threads = str(job.threads)
-    environment = {**os.environ, "RAYON_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
     try:
-        output.mkdir(parents=True, exist_ok=True)
-        # Made again, so that a link of that name leads nowhere.
-        (output / LOG_FILE).unlink(missing_ok=True)
-        with (output / LOG_FILE).open("xb") as log:
-            code = (processes or _Workers()).run(command, environment, log)
-        seconds = time.perf_counter() - begun
-        if code != 0:
-            return CaseOutcome(job.name, "failed", seconds, _reason(code, output))
-        evaluation = read_evaluation(output)
-    except (OSError, ValueError) as error:
-        seconds = time.perf_counter() - begun
-        return CaseOutcome(job.name, "failed", seconds, f"{type(error).__name__}: {error}")
-    return _outcome(job.name, "done", seconds, evaluation)
+        evaluation = _evaluated(job, start)
+    except (CmfsimError, OSError, ValueError) as error:
+        text = str(error) if isinstance(error, CmfsimError) else f"{type(error).__name__}: {error}"
+        return CaseOutcome(job.name, "failed", time.perf_counter() - begun, text)
+    return _outcome(job.name, "done", time.perf_counter() - begun, evaluation)
 
 
-def _reason(code: int, output: Path) -> str:
-    """Why a process ended: a signal, or the last lines that it wrote."""
-    lines = (output / LOG_FILE).read_text(encoding="utf-8", errors="replace").splitlines()
-    ended = f"killed by signal {-code}" if code < 0 else f"exit code {code}"
-    return "\n".join([ended, *lines[-SHOWN_LINES:]])
+def _evaluated(job: CaseJob, start: Callable[..., Worker]) -> Mapping[str, Any]:
+    """What another process writes about a case; the error has the last lines of its log."""
+    output = Path(job.output)
+    case = {key: getattr(job, key) for key in ("file", "output", "changes", "models")}
+    why = []
+    output.mkdir(parents=True, exist_ok=True)
+    log_file = output / LOG_FILE
+    # Made again, so that a link of that name leads nowhere.
+    log_file.unlink(missing_ok=True)
+    with log_file.open("xb") as log, start(threads=job.threads, log=log) as worker:
+        try:
+            if worker.ask("cmfsim.study.worker:evaluate_case", case).values:
+                return read_evaluation(output)
+        except WorkerEndedError as ended:
+            code = ended.code
+            why = [f"killed by signal {-code}" if code < 0 else f"exit code {code}"]
+        except WorkerFailedError as failed:
+            log.write(failed.trace.encode())
+    lines = log_file.read_text(encoding="utf-8", errors="replace").splitlines()
+    raise CaseError("\n".join([*why, *lines[-SHOWN_LINES:]]))

@@ -1,5 +1,6 @@
 """How commands end: messages, exit codes and JSON of errors, closed outputs, killed parents."""
 
+import contextlib
 import importlib.util
 import io
 import json
@@ -308,14 +309,10 @@ STUDY = "import sys, cmfsim; cmfsim.run_study(cmfsim.Cohort.load(sys.argv[1]), w
 def workers_of(output):
     """The processes that work on a case of a study."""
     found = []
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = entry.read_bytes().split(b"\0")
-            state = (entry.parent / "stat").read_text().rpartition(")")[2].split()[0]
-        except OSError:
-            continue
-        if str(output).encode() in words and b"cmfsim.study.worker" in words and state != "Z":
-            found.append(int(entry.parent.name))
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if (entry / "fd" / "2").readlink() == output / "log.txt":
+                found.append(int(entry.name))
     return found
 
 

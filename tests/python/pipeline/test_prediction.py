@@ -262,7 +262,7 @@ def test_a_study_keeps_what_is_finished_and_reports_what_fails(
 ):
     """Its processes are without PyVista: pictures take most of the time."""
     pytest.importorskip("jinja2")
-    monkeypatch.setenv("PYTHONPATH", without_pictures(tmp_path / "absent"))
+    without_pictures(monkeypatch, tmp_path / "absent")
     cohort = tmp_path / "cohort.toml"
     cohort.write_text(
         'format = "cmfsim-cohort"\nversion = 1\nname = "two"\nnote = "in silico"\nmodels = ["H"]\n'

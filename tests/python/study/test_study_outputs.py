@@ -72,7 +72,7 @@ def folder(tmp_path_factory):
         encoding="utf-8",
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", without_pictures(tmp_path_factory.mktemp("absent")))
+        without_pictures(patch, tmp_path_factory.mktemp("absent"))
         assert main(["study", str(folder), "-q", "--workers", "1"]) == 1
     return folder
 
@@ -229,7 +229,7 @@ def test_figures_show_every_patient_and_model(folder):
 
 def test_a_study_is_drawn_from_what_it_left_and_nothing_else(folder, tmp_path, monkeypatch):
     """Errors that were changed after the study are refused; a run again works on that case."""
-    monkeypatch.setenv("PYTHONPATH", without_pictures(tmp_path / "absent"))
+    without_pictures(monkeypatch, tmp_path / "absent")
     copied = tmp_path / "copy"
     shutil.copytree(folder, copied)
     cohort = replace(cmfsim.Cohort.load(copied), cases={"P1": copied / "P1" / "case.toml"})

@@ -71,7 +71,7 @@ def study(folder, tmp_path_factory):
     """The values of the study, its exit code being 1 for cases that failed."""
     words = ["study", str(folder), "--variants", str(folder / "variants.toml"), "-q"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", without_pictures(tmp_path_factory.mktemp("absent")))
+        without_pictures(patch, tmp_path_factory.mktemp("absent"))
         assert main([*words, "--workers", "1"]) == 1
     text = (folder / "study-variants" / "variants.json").read_text(encoding="utf-8")
     return json.loads(text)
@@ -161,7 +161,7 @@ def test_tables_name_patients_variants_and_regions(folder, study):
 
 def test_what_is_finished_is_kept_until_its_variant_changes(folder, study, monkeypatch, tmp_path):
     del study
-    monkeypatch.setenv("PYTHONPATH", without_pictures(tmp_path))
+    without_pictures(monkeypatch, tmp_path)
     text = (folder / "variants.toml").read_text(encoding="utf-8")
     other = tmp_path / "variants.toml"
     other.write_text(text.partition("[variants.named")[0].replace("0.1", "0.2"), encoding="utf-8")
