@@ -9,12 +9,13 @@ from cmfsim.pictures.anatomy import (
     picture_segments,
     segment_colours,
 )
-from cmfsim.pictures.bands import band_picture, picture_band
 from cmfsim.pictures.canvas import Picture
 from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import (
     DISTANCE_LIMIT,
+    band_picture,
     distance_colour,
+    picture_band,
     picture_distance_grid,
     picture_distances,
 )
