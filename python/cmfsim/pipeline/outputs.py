@@ -47,9 +47,9 @@ from cmfsim.pictures import (
     plan_picture,
     prediction_picture,
 )
+from cmfsim.pictures.painting import Painter
 from cmfsim.pipeline.building.stages import OnMuscles
 from cmfsim.pipeline.evaluating import CaseEvaluation
-from cmfsim.pipeline.painting import Painter
 from cmfsim.pipeline.planning_page import PAGE_FILE, page_state
 from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.anatomy import BoneSegment

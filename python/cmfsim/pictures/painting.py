@@ -61,14 +61,14 @@ class Painter:
     def _load(worker: Worker) -> None:
         # What is wrong is raised for the first picture.
         with contextlib.suppress(CaseError):
-            worker.ask("cmfsim.pipeline.painting:load", {})
+            worker.ask("cmfsim.pictures.painting:load", {})
 
     @staticmethod
     def _draw(worker: Worker, picture: Picture, path: Path) -> None:
         packed = base64.b64encode(pickle.dumps(picture)).decode()
         try:
             worker.ask(
-                "cmfsim.pipeline.painting:draw_packed",
+                "cmfsim.pictures.painting:draw_packed",
                 {"path": str(path.absolute()), "packed": packed},
             )
         except WorkerEndedError as error:
