@@ -7,7 +7,6 @@ plans lie on top of each other.
 import contextlib
 import os
 import struct
-import subprocess
 import sys
 import textwrap
 import warnings
@@ -24,7 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseError, CaseInputError
+from cmfsim.processes.worker import SILENT, Worker
 from cmfsim.values.checks import Floats, as_positive
 
 # What draws a picture at a path: a function of this package with all else that it takes, which can
@@ -48,16 +48,6 @@ LEGEND_ROW = 26  # pixels
 PNG_LEVEL = 4
 # Mean width of a letter of this size, pixels, as VTK draws them: the widest of many lines.
 LETTER = 9.5
-# What draws nothing into a small window. Where OpenGL is missing VTK ends the process instead of
-# raising, so this is tried in a process of its own, once.
-PROBE = """
-import vtkmodules.vtkRenderingOpenGL2
-from vtkmodules.vtkRenderingCore import vtkRenderWindow
-window = vtkRenderWindow()
-window.SetOffScreenRendering(True)
-window.SetSize(8, 8)
-window.Render()
-"""
 # Time after which the probe counts as failed, s; it takes half a second.
 PROBE_TIME = 60.0
 NO_OPENGL = (
@@ -341,22 +331,24 @@ def without_probe() -> Iterator[None]:
 
 @cache
 def _candraw() -> bool:
-    """Whether VTK can draw here, asked of another process: it may crash."""
+    """Whether VTK can draw here: where OpenGL is missing it ends its process instead of raising."""
     if not sys.executable:
         return True
     try:
-        probe = subprocess.run(  # noqa: S603 (this interpreter, and a text of this file)
-            [sys.executable, "-c", PROBE],
-            env={**os.environ, "PYTHONSAFEPATH": "1"},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            timeout=PROBE_TIME,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired):
+        with Worker(log=SILENT) as worker:
+            worker.ask("cmfsim.pictures.canvas:draw_nothing", {}, seconds=PROBE_TIME)
+    except (CaseError, OSError):
         return False
-    return probe.returncode == 0
+    return True
+
+
+def draw_nothing() -> None:
+    """Draws into a small window."""
+    import_module("vtkmodules.vtkRenderingOpenGL2")
+    window = import_module("vtkmodules.vtkRenderingCore").vtkRenderWindow()
+    window.SetOffScreenRendering(True)  # noqa: FBT003 (VTK's)
+    window.SetSize(8, 8)
+    window.Render()
 
 
 @contextlib.contextmanager
