@@ -1,11 +1,5 @@
-"""One build or one solve in a process of its own, so that its time and memory are its own.
+"""One build or one solve in a process of its own, so that its time and memory are its own."""
 
-`python -m cmfsim.lab.frontier.timing.worker JOB.json` does what the job says and writes what it
-measured. What a stage refuses is an answer too: its error.
-"""
-
-import json
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from cmfsim.errors import CmfsimError
-from cmfsim.io import Case, read_scene, replacing, write_scene
+from cmfsim.io import Case, read_scene, write_scene
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
 from cmfsim.lab.frontier.skin_points import read_points, skin_points, write_points
@@ -30,17 +24,13 @@ SKIN_FORMAT = "cmfsim-bench-skin"
 MOVED_FORMAT = "cmfsim-bench-moved"
 
 
-def main(arguments: list[str]) -> int:
-    """Exit code of one job: 0, also where its answer is an error."""
-    job = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
+def measured(job: Mapping[str, Any]) -> dict[str, Any]:
+    """What was measured of a job; what a stage refuses is an answer too: its error."""
     task = {"build": _build, "solve": _solve}[job["task"]]
     try:
-        answer = {**task(job), "run": job.get("run")}
+        return {**task(job), "run": job.get("run")}
     except (CmfsimError, MemoryError, OSError) as error:
-        answer = {"error": f"{type(error).__name__}: {error}", "peak_mb": peak_memory()}
-    with replacing(Path(job["answer"])) as file:
-        file.write(json.dumps(answer, allow_nan=False).encode())
-    return 0
+        return {"error": f"{type(error).__name__}: {error}", "peak_mb": peak_memory()}
 
 
 def _build(job: Mapping[str, Any]) -> dict[str, Any]:
@@ -94,7 +84,3 @@ def _solve(job: Mapping[str, Any]) -> dict[str, Any]:
     moved = carried_points(skin, end.continued(result.displacements[nodes]), points)
     write_archive(Path(job["moved"]), MOVED_FORMAT, "moved", {}, {"displacements": moved})
     return answer
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
