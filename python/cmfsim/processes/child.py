@@ -6,11 +6,13 @@ when it is first needed, kept for the next file, and replaced after a crash.
 """
 
 import atexit
+import contextlib
 import os
 import signal
 import sys
 import threading
 from collections.abc import Mapping
+from importlib import import_module
 from typing import Any
 
 from cmfsim.processes.worker import (
@@ -22,6 +24,8 @@ from cmfsim.processes.worker import (
     WorkerFailedError,
 )
 
+# Imports the libraries of a task, in this processor time, s.
+LOADED, START = "cmfsim.processes.child:load", 60.0
 # A child that holds more than this between two files is replaced, bytes.
 MOST_HELD = 2**30
 # Python's own errors that mean the same in the parent; those of the package do as well.
@@ -41,7 +45,8 @@ def read_in_child(task: str, limits: ReadLimits | None = None, /, **arguments: A
     Parameters
     ----------
     task : str
-        "module:function" within cmfsim; see `Worker.ask`.
+        "module:function" within cmfsim; the `LIBRARIES` of the module are imported before its
+        time begins.
     limits : ReadLimits, optional
     **arguments
         Plain values that JSON holds; paths as text, absolute.
@@ -60,7 +65,9 @@ def read_in_child(task: str, limits: ReadLimits | None = None, /, **arguments: A
     with _LOCK:
         child = _the_child()
         try:
-            return child.ask(task, arguments, limits or ReadLimits())
+            limits = limits or ReadLimits()
+            child.ask(LOADED, {"task": task}, ReadLimits(START, limits.memory))
+            return child.ask(task, arguments, limits)
         except WorkerEndedError as error:
             raise ReaderError(_reason(error)) from error
         except WorkerFailedError as error:
@@ -69,6 +76,15 @@ def read_in_child(task: str, limits: ReadLimits | None = None, /, **arguments: A
             # Libraries that do not give memory back, as GDCM after damaged files.
             if _held_by(child.pid) > MOST_HELD:
                 child.end()
+
+
+def load(task: str) -> None:
+    """Imports the module of a task and its `LIBRARIES`."""
+    module = task.partition(":")[0]
+    # One that is missing is the task's to report.
+    with contextlib.suppress(ImportError):
+        for name in (module, *getattr(import_module(module), "LIBRARIES", ())):
+            import_module(name)
 
 
 def _reason(ended: WorkerEndedError) -> str:

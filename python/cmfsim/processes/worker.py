@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -43,9 +43,6 @@ SILENT = subprocess.DEVNULL
 # Wall time that a request may take, in units of its processor time: on a busy machine a process
 # waits, and one that sleeps for ever is found as well.
 WALL_PER_CPU = 6.0
-# Processor time in which a function's libraries start, s, and the sign that they have.
-START = 60.0
-READY = b"+"
 # Looks at a process that is late, and the time between them, s: it may wait for the disk just then.
 LOOKS, LOOK_EVERY = 5, 0.02
 # Time in which a process that has closed its pipes ends by itself, s.
@@ -178,7 +175,6 @@ class Worker:
         ----------
         function : str
             "module:name"; it takes the arguments by name and returns an `Answer` or plain values.
-            The module's `LIBRARIES` are imported before the time of the limits begins.
         arguments : mapping
             Plain values that JSON holds.
         limits : ReadLimits, optional
@@ -197,17 +193,18 @@ class Worker:
         most = None if limits is None else [limits.seconds, limits.memory]
         request = {"function": function, "arguments": dict(arguments), "limits": most}
         line = json.dumps(request).encode() + b"\n"
+        answered = threading.Event()
+        if limits is not None:
+            seconds = WALL_PER_CPU * limits.seconds
+        if seconds is not None:
+            watch = (answered, seconds, limits is not None)
+            threading.Thread(target=self._watch, args=watch, daemon=True).start()
         try:
             if not self.alive:
                 raise EOFError  # noqa: TRY301 (as if it had ended just now)
-            with self._watched(seconds, patient=False):
-                # What the libraries take to start is no part of what the function may use.
-                with self._watched(None if limits is None else WALL_PER_CPU * START):
-                    self._requests.write(line)
-                    self._requests.flush()
-                    _bytes(self._answers, len(READY))
-                with self._watched(None if limits is None else WALL_PER_CPU * limits.seconds):
-                    answer = self._received()
+            self._requests.write(line)
+            self._requests.flush()
+            answer = self._received()
         except (OSError, EOFError) as error:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(ENDING)
@@ -219,6 +216,8 @@ class Worker:
             # Ctrl-C: what is left of the answer must not become the next one.
             self.end()
             raise
+        finally:
+            answered.set()
         # An error of the function is a whole answer: the process goes on.
         if isinstance(answer, Exception):
             raise answer
@@ -234,27 +233,16 @@ class Worker:
             with contextlib.suppress(OSError):
                 stream.close()
 
-    @contextlib.contextmanager
-    def _watched(self, seconds: float | None, *, patient: bool = True) -> Iterator[None]:
-        """Ends the process when it is late; one that is ready to run and gets no turn is not.
+    def _watch(self, answered: threading.Event, seconds: float, patient: bool) -> None:  # noqa: FBT001
+        """Ends the process when it is late; to the patient, one that gets no turn is not.
 
         The system limits the processor time of those that are waited for so patiently.
         """
-        done = threading.Event()
-
-        def watch() -> None:
-            while not done.wait(seconds):
-                if not (patient and _is_running(self.pid)) and not done.is_set():
-                    self._late = True
-                    self._process.kill()
-                    return
-
-        if seconds is not None:
-            threading.Thread(target=watch, daemon=True).start()
-        try:
-            yield
-        finally:
-            done.set()
+        while not answered.wait(seconds):
+            if not (patient and _is_running(self.pid)) and not answered.is_set():
+                self._late = True
+                self._process.kill()
+                return
 
     def _received(self) -> Answer | Exception:
         stream = self._answers
@@ -321,55 +309,45 @@ def _work(request: Mapping[str, Any], answers: BinaryIO) -> None:
     """Calls one function, and writes its answer or error."""
     module, name = request["function"].split(":")
     if request["limits"] is not None:
-        _limit(START, request["limits"][1])
-        # One that is missing is the function's to report.
-        with contextlib.suppress(ImportError):
-            for library in (module, *getattr(import_module(module), "LIBRARIES", ())):
-                import_module(library)
         _limit(*request["limits"])
-    answers.write(READY)
-    answers.flush()
+    arrays = {}
     try:
         answer = getattr(import_module(module), name)(**request["arguments"])
+        if not isinstance(answer, Answer):
+            answer = Answer(answer)
+        arrays = {name: np.ascontiguousarray(a) for name, a in answer.arrays.items()}
+        shapes = {name: (a.dtype.str, a.shape) for name, a in arrays.items()}
+        text = json.dumps({"values": answer.values, "arrays": shapes})
     except (Exception, SystemExit) as error:  # noqa: BLE001 (told to the one who asked)
         kinds = [kind.__name__ for kind in type(error).__mro__]
-        _write(answers, {"kinds": kinds, "text": str(error), "trace": traceback.format_exc()}, ())
-        return
-    if not isinstance(answer, Answer):
-        answer = Answer(answer)
-    arrays = {name: np.ascontiguousarray(a) for name, a in answer.arrays.items()}
-    shapes = {name: (a.dtype.str, a.shape) for name, a in arrays.items()}
-    _write(answers, {"values": answer.values, "arrays": shapes}, arrays.values())
-
-
-def _write(stream: BinaryIO, header: Any, arrays: Collection[NDArray[Any]]) -> None:
+        arrays = {}
+        text = json.dumps({"kinds": kinds, "text": str(error), "trace": traceback.format_exc()})
     sys.stdout.flush()
-    text = json.dumps(header).encode()
-    stream.write(LENGTH.pack(len(text)))
-    stream.write(text)
-    for array in arrays:
+    answers.write(LENGTH.pack(len(text)) + text.encode())
+    for array in arrays.values():
         if array.nbytes:
-            stream.write(array.data.cast("B"))
-    stream.flush()
+            answers.write(array.data.cast("B"))
+    answers.flush()
 
 
 def _limit(seconds: float, memory: int) -> None:
-    """Sets the limits of one request; the system ends a process that passes them."""
+    """Sets the limits of one request; the system ends a process that passes them.
+
+    They are set as far as the user's own (ulimit) allow: below theirs, theirs hold.
+    """
     try:
         resource: Any = import_module("resource")
     except ModuleNotFoundError:  # Windows: the clock alone
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
     spent = used.ru_utime + used.ru_stime
-    _set_limit(resource, resource.RLIMIT_CPU, int(spent + seconds) + 1)
+    limits = {resource.RLIMIT_CPU: int(spent + seconds) + 1}
     if sys.platform == "linux":
         with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
             held = int(file.read().split()[0]) * resource.getpagesize()
         # Libraries that a request loads first count as well: room for them.
-        _set_limit(resource, resource.RLIMIT_AS, held + memory + 2 * 2**30)
-
-
-def _set_limit(resource: Any, which: int, limit: int) -> None:
-    """Sets a limit as far as the user's own (ulimit) allows: below theirs, theirs holds."""
-    _, hard = resource.getrlimit(which)
-    resource.setrlimit(which, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+        limits[resource.RLIMIT_AS] = held + memory + 2 * 2**30
+    for which, limit in limits.items():
+        _, hard = resource.getrlimit(which)
+        most = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+        resource.setrlimit(which, (most, hard))
