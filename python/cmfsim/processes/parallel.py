@@ -44,7 +44,10 @@ def answers(
     idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
 
     def ask(job: Mapping[str, Any], start: Callable[..., Worker]) -> Any:
-        worker = start(threads=1) if idle.empty() else idle.get()
+        try:
+            worker = idle.get_nowait()
+        except queue.Empty:
+            worker = start(threads=1)
         try:
             return worker.ask(function, job).values
         finally:
