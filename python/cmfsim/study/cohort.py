@@ -1,14 +1,10 @@
 """Many cases by several models: each in a process of its own, kept when it was done before."""
 
-import contextlib
 import os
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError
@@ -219,7 +215,7 @@ def run_studies(
                 outcomes[number][name] = kept
                 progress(cohort, kept)
     scheduler = options.scheduler
-    run = _on_this_machine(jobs, workers) if scheduler is None else _on_dask(jobs, scheduler)
+    run = as_they_end(run_job, jobs, workers) if scheduler is None else _on_dask(jobs, scheduler)
     for index, outcome in run:
         outcomes[of[index]][outcome.name] = outcome
         progress(cohorts[of[index]], outcome)
@@ -257,29 +253,6 @@ def _outcome(name: str, status: str, seconds: float, written: Mapping[str, Any])
     failed = written.get("failed") or {}
     error = "\n".join(f"model {model}: {reason}" for model, reason in failed.items())
     return CaseOutcome(name, "failed" if failed else status, seconds, error, written)
-
-
-def _on_this_machine(jobs: list[CaseJob], workers: int) -> Iterator[tuple[int, CaseOutcome]]:
-    with _ended_by_signal():
-        yield from as_they_end(run_job, jobs, workers)
-
-
-@contextlib.contextmanager
-def _ended_by_signal() -> Iterator[None]:
-    """Has SIGTERM end this process as Ctrl-C does: with all that it started."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _on_dask(jobs: list[CaseJob], scheduler: str) -> Iterator[tuple[int, CaseOutcome]]:
