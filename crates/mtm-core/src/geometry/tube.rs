@@ -1,7 +1,5 @@
 //! Levels of tubes of round or elliptic section along a polyline, positive inside.
 
-use crate::algebra::simd::{Kernel, widest};
-
 /// Points whose levels are computed together, so that they stay in the cache.
 const TOGETHER: usize = 256;
 /// Nearer to the axis than this share of the section, k₁ says too little, and the level falls from the half thickness.
@@ -28,35 +26,20 @@ pub struct TubeEnd {
 /// the half axes and over their squares; where both axes are equal it is the distance. No less than `outside`.
 pub fn tube_levels(segments: &[[TubeEnd; 2]], points: &[[f64; 3]], outside: f64) -> Vec<f64> {
     let mut levels = vec![outside; points.len()];
-    widest(TubeLevels { segments, points, levels: &mut levels });
-    levels
-}
-
-struct TubeLevels<'a> {
-    segments: &'a [[TubeEnd; 2]],
-    points: &'a [[f64; 3]],
-    levels: &'a mut [f64],
-}
-
-impl Kernel for TubeLevels<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run(self) {
-        let (mut x, mut y, mut z) = ([0.0; TOGETHER], [0.0; TOGETHER], [0.0; TOGETHER]);
-        for (points, levels) in self.points.chunks(TOGETHER).zip(self.levels.chunks_mut(TOGETHER)) {
-            for (i, &[a, b, c]) in points.iter().enumerate() {
-                (x[i], y[i], z[i]) = (a, b, c);
-            }
-            for segment in self.segments {
-                let section = Section::of(segment);
-                for (i, best) in levels.iter_mut().enumerate() {
-                    let level = section.level(x[i], y[i], z[i]);
-                    *best = if level > *best { level } else { *best };
-                }
+    let (mut x, mut y, mut z) = ([0.0; TOGETHER], [0.0; TOGETHER], [0.0; TOGETHER]);
+    for (points, levels) in points.chunks(TOGETHER).zip(levels.chunks_mut(TOGETHER)) {
+        for (i, &[a, b, c]) in points.iter().enumerate() {
+            (x[i], y[i], z[i]) = (a, b, c);
+        }
+        for segment in segments {
+            let section = Section::of(segment);
+            for (i, best) in levels.iter_mut().enumerate() {
+                let level = section.level(x[i], y[i], z[i]);
+                *best = if level > *best { level } else { *best };
             }
         }
     }
+    levels
 }
 
 /// A segment as what its level needs: values at its start, and how they change along it.
