@@ -15,7 +15,7 @@ from types import MappingProxyType
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.lips import check_lips
 from cmfsim.doctor.report import findings_text
-from cmfsim.doctor.sites.automatic_landmarks import check_automatic
+from cmfsim.doctor.sites.landmarks import check_automatic
 from cmfsim.doctor.sites.placement import check_placement
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
 from cmfsim.doctor.surgery.moved_bones import check_moved

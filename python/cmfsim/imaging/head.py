@@ -13,9 +13,8 @@ from cmfsim.imaging.bones.bone import Bone, bone_level, find_bone, teeth_level
 from cmfsim.imaging.bones.jaw import Jaws, part_jaws
 from cmfsim.imaging.bones.metal import find_metal, metal_within
 from cmfsim.imaging.coverage import view_findings
-from cmfsim.imaging.intensities.cupping import without_cupping
+from cmfsim.imaging.intensities.cupping import without_cupping, without_noise
 from cmfsim.imaging.intensities.intensity import weak_bone
-from cmfsim.imaging.intensities.noise import without_noise
 from cmfsim.imaging.morphology import Mask, Volume
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skins.air import air_level

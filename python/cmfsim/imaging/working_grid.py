@@ -9,8 +9,13 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.field_of_view import RoundField, round_field
-from cmfsim.imaging.intensities.intensity import AIR, Calibration, calibration, saturation_of
-from cmfsim.imaging.intensities.modality import check_is_ct
+from cmfsim.imaging.intensities.intensity import (
+    AIR,
+    Calibration,
+    calibration,
+    check_is_ct,
+    saturation_of,
+)
 from cmfsim.imaging.morphology import (
     Block,
     Mask,

@@ -3,17 +3,17 @@
 The splines and fits themselves are `cmfsim.ThinPlateSpline` and `cmfsim.rigid_fit` of the core.
 """
 
-from cmfsim.registration.agreement import LandmarkAgreement, leave_one_out
 from cmfsim.registration.closest import icp
 from cmfsim.registration.consistency import (
     CommonShift,
+    LandmarkAgreement,
     common_shift,
+    leave_one_out,
     mirror_agreement,
     swapped_names,
 )
 from cmfsim.registration.folds import FoldReport, fold_report
-from cmfsim.registration.landmarks import LandmarkMatch, match_landmarks
-from cmfsim.registration.sides import side_vectors, wrong_sides
+from cmfsim.registration.landmarks import LandmarkMatch, match_landmarks, side_vectors, wrong_sides
 
 __all__ = [
     "CommonShift",

@@ -8,10 +8,10 @@ import pytest
 import cmfsim
 import head_case
 import label_images
-from cmfsim.drafting import init_case
+from cmfsim.drafting import init_case, written
 from cmfsim.drafting.case_lines import Text
 from cmfsim.drafting.roles import name_role
-from cmfsim.drafting.written import UNDECIDED, placing
+from cmfsim.drafting.written import UNDECIDED
 from scene_text import model, pack, shift, transform, write_scene
 
 pytest.importorskip("SimpleITK")
@@ -318,12 +318,12 @@ def test_landmarks_of_a_scene_lie_where_slicer_shows_them(tmp_path):
 def test_a_case_that_reads_as_something_else_than_was_shown_is_an_error(tmp_path, monkeypatch):
     """The writer of surfaces is made to turn them: no case is left."""
     label_images.write_seg(tmp_path / "s.seg.nrrd", label_images.masks())
-    write = placing.write_surface
+    write = written.write_surface
 
     def turned(path, surface):
         write(path, cmfsim.SurfaceData(np.asarray(surface.vertices) * FLIP, surface.triangles))
 
-    monkeypatch.setattr(placing, "write_surface", turned)
+    monkeypatch.setattr(written, "write_surface", turned)
     with pytest.raises(cmfsim.CaseError, match=r"skin \(from_scene/skin.ply\) lies up to"):
         init_case(tmp_path)
     assert not (tmp_path / "case.toml").exists()

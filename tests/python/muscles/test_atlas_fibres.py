@@ -6,7 +6,7 @@ import pytest
 import cmfsim
 import real_heads
 from angles import angle_of_lines
-from cmfsim.muscles.template.bodyparts3d_courses import atlas_course
+from cmfsim.muscles.template.bodyparts3d import atlas_course
 from cmfsim.muscles.template.bodyparts3d_parts import PAIRED_MUSCLES
 
 pytest.importorskip("meshio")

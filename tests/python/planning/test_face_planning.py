@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 import cmfsim
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.planning.face_planning.search import bounded_least_squares
+from cmfsim.planning.face_planning.planning import bounded_least_squares
 from head_case import HeadCase
 
 pytest.importorskip("skimage")

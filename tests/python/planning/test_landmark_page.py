@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import cmfsim.planning.landmark_page.content
+import cmfsim.planning.landmark_page.page
 from cmfsim.io import read_landmark_file
 from cmfsim.pipeline.filling import filled_landmarks, head_distribution
 from cmfsim.pipeline.landmark_page import head_content, write_landmark_page
@@ -53,7 +53,7 @@ def content(head):
     """Drawn with few triangles: browsers here draw by software."""
     few = {"cranium": 8_000, "mandible": 5_000, "skin": 6_000}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cmfsim.planning.landmark_page.content, "MOST_TRIANGLES", few)
+        patch.setattr(cmfsim.planning.landmark_page.page, "MOST_TRIANGLES", few)
         return head_content("average </script> head", head)
 
 

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 import cmfsim
 from cmfsim.solving.models import model_scene
-from cmfsim.solving.rates import skin_rates
+from cmfsim.solving.rates import skin_rates, tissue_parts
 from cmfsim.solving.simulation import scene_plan, scene_solver, solved_scene
-from cmfsim.solving.tissue_changes import tissue_parts
 from cmfsim.values.uncertainty import PLAN
 from shared_values import coarse_demo_patient
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.solving.skin_tears import tear_finding
+from cmfsim.solving.models import tear_finding
 from shared_values import coarse_demo_patient
 
 # Two triangles with a common edge, 4 mm wide.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.solving.slip import slip_finding
+from cmfsim.solving.simulation import slip_finding
 from meshes import box, plane
 
 MOTION = cmfsim.rigid_motion((5.0, 0.0, 0.0))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.surfaces.capping import cap_loop
 from cmfsim.surfaces.crossings import crossing_pairs
+from cmfsim.surfaces.repair import cap_loop
 from cmfsim.surfaces.topology import connected_labels
 from head_case import icosphere
 

@@ -10,6 +10,7 @@ from importlib import import_module
 import numpy as np
 
 from cmfsim._core import Surface
+from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.sites.places import direction_text, place_text, shift_text
 from cmfsim.errors import LandmarkError, RegistrationError
 from cmfsim.registration import (
@@ -286,3 +287,22 @@ def _disagreeing(key: str, landmarks: Mapping[str, Floats], where: str) -> Itera
             why=f"{PLACED_FROM[key]}; heads differ by up to 10 mm there",
             fix=AGAIN,
         )
+
+
+def check_automatic(evidence: Evidence) -> Iterator[Finding]:
+    """A note for a case without landmarks, with the checks that are left to the build."""
+    case = evidence.case
+    count = len(evidence.skull_landmarks)
+    if not (case.landmarks.proposed or case.landmarks.is_completed(count)):
+        return
+    left = [
+        *(f"the cut {cut.procedure}" for cut in case.osteotomies if cut.procedure),
+        *(["the muscles"] if case.muscles is not None else []),
+        "the region that is meshed",
+    ]
+    yield Finding(
+        "landmarks-automatic",
+        "the build will find the landmarks that the case does not give; the doctor does not check "
+        + ", ".join(left),
+        where=case.where("landmarks"),
+    )

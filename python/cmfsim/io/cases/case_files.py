@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.cases.case_changes import CaseChanges
 from cmfsim.io.cases.case_plans import is_achieved, osteotomies_of, plan_of
 from cmfsim.io.cases.case_tables import (
     band_of,
@@ -28,7 +27,7 @@ from cmfsim.io.cases.case_tables import (
     surfaces_of,
     tissue_of,
 )
-from cmfsim.io.cases.tables import read_tables
+from cmfsim.io.cases.tables import CaseChanges, read_tables
 from cmfsim.io.files.reading_writing import FORMAT_VERSION, is_there
 from cmfsim.values.case_parts import (
     CaseBand,

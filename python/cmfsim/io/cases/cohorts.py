@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.cases.case_changes import CaseChanges
 from cmfsim.io.cases.case_files import CASE_FILE
-from cmfsim.io.cases.tables import read_tables
+from cmfsim.io.cases.tables import CaseChanges, read_tables
 from cmfsim.io.files.reading_writing import FORMAT_VERSION, is_there
 from cmfsim.values.checks import as_text, check_one_of
 from cmfsim.values.prediction import MODELS

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cmfsim.io.cases.case_changes import CaseChanges
-from cmfsim.io.cases.tables import Table, read_tables
+from cmfsim.io.cases.tables import CaseChanges, Table, read_tables
 from cmfsim.values.prediction import MODELS
 
 # The variant without changes, with which all others are compared.

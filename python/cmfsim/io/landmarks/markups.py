@@ -1,7 +1,8 @@
-"""Markups of 3D Slicer (`.mrk.json`): lists of points with labels, by kind, frame and unit."""
+"""Markups of 3D Slicer (`.mrk.json`): points with labels, by kind, frame and unit; curves."""
 
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,14 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cmfsim.errors import LandmarkInputError
 from cmfsim.io.files.reading_writing import MAX_WHOLE, check_readable, parsed_json, replacing
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, as_rows
+
+# What Slicer calls markups whose points follow one another along a line.
+CURVE_KINDS = ("Curve", "ClosedCurve", "Line")
 
 # A landmark file above this size is not what it says it is, bytes.
 MAX_LANDMARK_TEXT = 16 * 2**20
@@ -174,3 +179,55 @@ def _unit_length(value: object) -> float:
         known = ", ".join(UNIT_LENGTHS)
         raise LandmarkInputError(f"has coordinateUnits {value!r}: {known} are read")
     return UNIT_LENGTHS[name]
+
+
+def read_curves(path: str | os.PathLike[str]) -> tuple[Floats, ...]:
+    """The curves of a `.mrk.json` file as polylines through their points, (n, 3) each, LPS mm.
+
+    A closed curve ends where it starts. A file that states no frame is read as LPS, as Slicer's
+    schema says.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    tuple of (n, 3) float64, mm
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    LandmarkError
+        (also `ValueError`) Not such a file, another markup, a curve of one point.
+    """
+    path = Path(path)
+    text = markup_text(path)
+    try:
+        markups = markups_of(text, "LPS")
+        return tuple(_line(markup, number) for number, markup in enumerate(markups, start=1))
+    except LandmarkInputError as error:
+        raise LandmarkInputError(f"{path.name}: {error}") from error
+
+
+def write_curves(path: str | os.PathLike[str], lines: Sequence[ArrayLike]) -> None:
+    """Writes polylines as open curves of 3D Slicer, LPS mm; `read_curves` gives them back."""
+    path = Path(path)
+    markups = []
+    for number, line in enumerate(lines, start=1):
+        points = as_rows(f"line {number}", line, 3)
+        markups.append(markup_of("Curve", ((str(i), p) for i, p in enumerate(points, start=1))))
+    write_markups(path, markups)
+
+
+def _line(markup: Markup, number: int) -> Floats:
+    if markup.kind not in CURVE_KINDS:
+        known = ", ".join(CURVE_KINDS)
+        raise LandmarkInputError(f"markup {number} is a {markup.kind!r}: one of {known} is needed")
+    points = [entry.position for entry in markup.entries if entry.position is not None]
+    if len(points) < 2:
+        raise LandmarkInputError(f"curve {number} has {len(points)} placed points: two are needed")
+    if markup.kind == "ClosedCurve":
+        points.append(points[0])
+    return np.array(points)

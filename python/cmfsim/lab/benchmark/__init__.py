@@ -6,7 +6,7 @@ from cmfsim.lab.benchmark.skin_predictions import (
     read_skin_prediction,
     write_skin_prediction,
 )
-from cmfsim.lab.benchmark.tables.benchmark_table import BenchmarkTable
+from cmfsim.lab.benchmark.tables import BenchmarkTable
 
 __all__ = [
     "Benchmark",

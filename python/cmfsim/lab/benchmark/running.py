@@ -33,7 +33,7 @@ from cmfsim.lab.benchmark.patients import BenchmarkPatient, far_from_models, pat
 from cmfsim.lab.benchmark.results import MethodResult
 from cmfsim.lab.benchmark.scores import score
 from cmfsim.lab.benchmark.skin_predictions import read_skin_prediction
-from cmfsim.lab.benchmark.tables.benchmark_table import BenchmarkTable
+from cmfsim.lab.benchmark.tables import BenchmarkTable
 from cmfsim.processes.parallel import answers
 from cmfsim.values.checks import as_number, check_one_of
 from cmfsim.values.model_names import MODELS

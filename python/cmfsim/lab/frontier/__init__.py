@@ -2,8 +2,7 @@
 
 from cmfsim.lab.frontier.choice import Choice, case_choice
 from cmfsim.lab.frontier.frontier_run import frontier
-from cmfsim.lab.frontier.pareto import pareto_front
-from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread
+from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread, pareto_front
 from cmfsim.lab.frontier.skin_points import SKIN, WHOLE, skin_errors
 from cmfsim.lab.frontier.sweep import EDGES, FACTORS, reference_choice, sweep_choices
 from cmfsim.lab.frontier.table import frontier_page

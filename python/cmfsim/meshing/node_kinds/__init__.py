@@ -6,9 +6,8 @@ and those of the nasal septum.
 
 from cmfsim.meshing.node_kinds.arches import DentalArches, dental_arches
 from cmfsim.meshing.node_kinds.classification import ClassifiedNodes, classify_nodes, segment_data
-from cmfsim.meshing.node_kinds.lifted import lifted_tissue
 from cmfsim.meshing.node_kinds.options import KindOptions, SlidingBox, SlidingSphere, kind_options
-from cmfsim.meshing.node_kinds.septum import septum
+from cmfsim.meshing.node_kinds.septum import lifted_tissue, septum
 
 __all__ = [
     "ClassifiedNodes",

@@ -13,8 +13,7 @@ from cmfsim._core import Surface
 from cmfsim.errors import MeshError, MeshInputError
 from cmfsim.muscles.fitting.lattice import Lattice
 from cmfsim.muscles.fitting.room import Room
-from cmfsim.muscles.fitting.solving import Problem, Targets
-from cmfsim.muscles.fitting.volumes import Volumes
+from cmfsim.muscles.fitting.solving import Problem, Targets, Volumes
 from cmfsim.muscles.template.morphing import MorphedMusculature
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats

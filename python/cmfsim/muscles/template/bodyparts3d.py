@@ -2,6 +2,11 @@
 
 BodyParts3D (Mitsuhashi et al. 2009) is licensed under CC BY-SA 2.1 JP. Its files are not part of
 this package; `WHERE` states where to download them.
+
+Fibre lines of its flat muscles, whose outline does not determine them, have the origins and
+insertions of anatomy textbooks: temporalis converges on the coronoid process, buccinator runs
+forwards to the corner of the mouth, platysma up from the clavicle to the jaw, frontalis down from
+the vertex to the brow. Frame LPS.
 """
 
 import hashlib
@@ -16,7 +21,6 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io.landmarks.landmark_files import read_landmarks
 from cmfsim.io.surfaces import read_surface
-from cmfsim.muscles.template.bodyparts3d_courses import atlas_course
 from cmfsim.muscles.template.bodyparts3d_parts import (
     BONES,
     HASHES,
@@ -25,6 +29,7 @@ from cmfsim.muscles.template.bodyparts3d_parts import (
     TEETH,
     MusclePair,
 )
+from cmfsim.muscles.template.fibre_lines import fan_lines, lane_lines
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.registration import side_vectors
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
@@ -36,6 +41,15 @@ from cmfsim.values.musculature import MuscleSurface
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 from cmfsim.values.template import as_landmarks
+
+# Vertices that the tip of temporalis is the mean of; its tendon ends broadly.
+TIP_VERTICES = 20
+# Share of buccinator's vertices that its hind and its front end are the means of.
+END_SHARE = 0.1
+SAGITTAL = (1.0, 0.0, 0.0)
+# Directions that platysma and frontalis face, on the left.
+PLATYSMA_FACES, FRONTALIS_FACES = (0.7, -0.7, 0.0), (0.3, -1.0, 0.0)
+UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
 
 WHERE = (
     "https://github.com/LuisLuisLuisLuisLuisLuisLuisLuis/AnatomyExplorer3D at 53e1aebb, folder "
@@ -274,3 +288,35 @@ def _mirrored(surface: SurfaceData, landmarks: Mapping[str, Floats]) -> SurfaceD
 def _renamed(findings: tuple[Finding, ...], name: str) -> list[Finding]:
     """Findings about a file as findings about a muscle."""
     return [replace(f, where=f"{name} ({f.where})") for f in findings]
+
+
+def atlas_course(name: str, side: str, surface: SurfaceData) -> tuple[Floats, ...]:
+    """The fibre lines of a muscle of the atlas, from origin to insertion; none where boxes do.
+
+    Parameters
+    ----------
+    name : str
+        Without side.
+    side : str
+        "L" or "R".
+    surface : SurfaceData
+
+    Returns
+    -------
+    tuple of (n, 3) float64, mm
+    """
+    vertices = surface.vertices
+    mirror = np.array([-1.0 if side == "R" else 1.0, 1.0, 1.0])
+    if name == "temporalis":
+        tip = vertices[np.argsort(vertices[:, 2])[:TIP_VERTICES]].mean(axis=0)
+        return fan_lines(surface, tip, SAGITTAL)
+    if name == "buccinator":
+        order = np.argsort(vertices[:, 1])
+        count = max(1, int(END_SHARE * len(order)))
+        front, back = (vertices[rows].mean(axis=0) for rows in (order[:count], order[-count:]))
+        return lane_lines(surface, front - back, SAGITTAL)
+    if name == "platysma":
+        return lane_lines(surface, UP, mirror * PLATYSMA_FACES)
+    if name == "frontalis":
+        return lane_lines(surface, DOWN, mirror * FRONTALIS_FACES)
+    return ()

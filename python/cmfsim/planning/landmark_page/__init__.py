@@ -1,6 +1,10 @@
 """The page of landmarks: one HTML file in which they are checked, placed and saved."""
 
-from cmfsim.planning.landmark_page.content import LandmarkContent, PageSite, landmark_content
-from cmfsim.planning.landmark_page.page import landmark_page_text
+from cmfsim.planning.landmark_page.page import (
+    LandmarkContent,
+    PageSite,
+    landmark_content,
+    landmark_page_text,
+)
 
 __all__ = ["LandmarkContent", "PageSite", "landmark_content", "landmark_page_text"]

@@ -1,7 +1,242 @@
-"""The text of the page of landmarks."""
+"""The page of landmarks: its surfaces, sites and views, and its text."""
 
-from cmfsim.planning.landmark_page.content import LandmarkContent
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim._core import Surface, __version__
 from cmfsim.planning.page.document import Document, document_text
+from cmfsim.surfaces.levels import simplified_surface
+from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import (
+    SKIN_SITES,
+    SKULL_LANDMARKS,
+    short_name,
+    site_labels,
+    site_part,
+)
+from cmfsim.values.site_states import CLEARED_SHARE, GOOD_ERROR, SURFACE_REACH, SiteState
+from cmfsim.values.surface_data import SurfaceData
+
+# Degrees as in camera.js (azimuth 0 from the front, 90 from the patient's left; elevation 90 from
+# above), and the height of the picture, mm. Of pairs, the view of the left one.
+MIDLINE = (35.0, 5.0, 110.0)
+VIEWS: dict[str, tuple[float, float, float]] = {
+    "menton": (20.0, -35.0, 110.0),
+    "subnasale": (35.0, -15.0, 90.0),
+    "labiale_superius": (25.0, 0.0, 90.0),
+    "labiale_inferius": (25.0, 0.0, 90.0),
+    "frontal_eminence": (25.0, 10.0, 150.0),
+    "supraorbital": (15.0, -5.0, 110.0),
+    "suborbital": (15.0, 15.0, 110.0),
+    "inferior_malar": (30.0, -15.0, 110.0),
+    "lateral_orbit": (60.0, 5.0, 110.0),
+    "zygomatic_arch": (65.0, -15.0, 120.0),
+    "supraglenoid": (80.0, -10.0, 120.0),
+    "gonion": (75.0, -10.0, 130.0),
+    "supra_m2": (55.0, -5.0, 110.0),
+    "occlusal_line": (60.0, 0.0, 120.0),
+    "sub_m2": (60.0, -5.0, 110.0),
+    "exocanthion": (25.0, 0.0, 90.0),
+    "endocanthion": (15.0, 0.0, 90.0),
+    "alare": (25.0, -10.0, 90.0),
+    "cheilion": (25.0, 0.0, 90.0),
+}
+
+# Triangles that the page draws of the skull, of a jaw and of the skin: about 2 MB together.
+MOST_TRIANGLES: Mapping[str, int] = {"cranium": 60_000, "mandible": 24_000, "skin": 40_000}
+# And of the average head that shows where a site is.
+SMALL_TRIANGLES: Mapping[str, int] = {"cranium": 5_000, "mandible": 2_500, "skin": 3_500}
+# How much of the height of the head a picture shows.
+SPAN_SHARE = 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class PageSite:
+    """A landmark of the page.
+
+    Attributes
+    ----------
+    kind, name : str
+        "skull" or "skin", and the label.
+    point : (3,) float64, mm
+        Where it is, or for a missing site where the others place it.
+    state : SiteState
+        "filled" if it is missing.
+    why : str
+        Why it is missing; empty otherwise.
+    placed : (3,) float64, mm, or None
+        Where a person has placed or accepted it already.
+    placed_origin : str
+        "placed" or "accepted".
+    """
+
+    kind: str
+    name: str
+    point: Floats
+    state: SiteState
+    why: str = ""
+    placed: Floats | None = None
+    placed_origin: str = "placed"
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkContent:
+    """The data from which a page of landmarks is written.
+
+    Attributes
+    ----------
+    values : mapping
+        Plain values, ready for JSON.
+    arrays : mapping of str to array
+        float32 and uint32.
+    """
+
+    values: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+def landmark_content(
+    case: str,
+    surfaces: Mapping[str, SurfaceData],
+    sites: Sequence[PageSite],
+    covariance: Floats,
+    average: tuple[Mapping[str, SurfaceData], Mapping[str, Mapping[str, Floats]]],
+    *,
+    placed_std: float,
+    built_for: str = "",
+) -> LandmarkContent:
+    """The content of the page of a head.
+
+    Parameters
+    ----------
+    case : str
+        Its name.
+    surfaces : mapping of str to SurfaceData
+        Bones, and "skin" where there is one; LPS mm.
+    sites : sequence of PageSite
+    covariance : (3 n, 3 n) float64, mm²
+        Of the errors of their points: it says how sites follow one that is placed.
+    average : surfaces by part, landmarks by kind and label
+        The head in which the page shows where each site is.
+    placed_std : float, mm
+        How far a person's own point lies from the site, along each axis.
+    built_for : str
+        The state of the case.
+
+    Returns
+    -------
+    LandmarkContent
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) fast-simplification is missing and a surface has to be simplified.
+    """
+    arrays: dict[str, NDArray[Any]] = {
+        "site_points": _singles([site.point for site in sites]),
+        "site_covariance": _singles(covariance),
+    }
+    average_surfaces, average_points = average
+    values = {
+        "case": case,
+        "version": __version__,
+        "built_for": built_for or "a head without a case file",
+        "surfaces": _packed(surfaces, MOST_TRIANGLES, "surface", arrays),
+        "average": {
+            "surfaces": _packed(average_surfaces, SMALL_TRIANGLES, "average", arrays),
+            "points": {
+                kind: {name: np.asarray(p).round(2).tolist() for name, p in points.items()}
+                for kind, points in average_points.items()
+            },
+        },
+        "sites": [_values(site) for site in sites],
+        "placed_std": placed_std,
+        "good_error": GOOD_ERROR,
+        "cleared_share": CLEARED_SHARE,
+        "surface_reach": SURFACE_REACH,
+        **_framing(surfaces),
+    }
+    return LandmarkContent(values, arrays)
+
+
+def _values(site: PageSite) -> dict[str, Any]:
+    state = site.state
+    definitions = SKULL_LANDMARKS if site.kind == "skull" else SKIN_SITES
+    short = short_name(site.kind, site.name)
+    return {
+        "kind": site.kind,
+        "name": site.name,
+        "part": site_part(site.kind, site.name),
+        "where": definitions[site.name],
+        "short": "" if short == site.name else short,
+        "labels": list(site_labels(site.kind, site.name)),
+        "origin": state.origin,
+        "error": round(state.error, 2),
+        "doubt": state.doubt,
+        "why": site.why,
+        "placed": None if site.placed is None else np.asarray(site.placed).tolist(),
+        "placed_origin": site.placed_origin,
+        "view": site_view(site.name),
+    }
+
+
+def _part_of(name: str) -> str:
+    """The part that a surface shows: every bone but the mandible carries sites of the cranium."""
+    return name if name in {"mandible", "skin"} else "cranium"
+
+
+def _packed(
+    surfaces: Mapping[str, SurfaceData],
+    most: Mapping[str, int],
+    prefix: str,
+    arrays: dict[str, NDArray[Any]],
+) -> list[dict[str, Any]]:
+    """The surfaces of parts, simplified into arrays, with how far the drawn ones are off."""
+    counts = {
+        part: sum(len(s.triangles) for name, s in surfaces.items() if _part_of(name) == part)
+        for part in most
+    }
+    found = []
+    for number, (name, surface) in enumerate(surfaces.items()):
+        part = _part_of(name)
+        allowed = max(500, most[part] * len(surface.triangles) // counts[part])
+        drawn = simplified_surface(name, surface, allowed)
+        there = Surface(surface.vertices, surface.triangles)
+        away = np.linalg.norm(there.closest(drawn.vertices)[0] - drawn.vertices, axis=1)
+        arrays[f"{prefix}_{number}"] = _singles(drawn.vertices)
+        arrays[f"{prefix}_{number}_triangles"] = np.asarray(drawn.triangles, dtype=np.uint32)
+        found.append({"name": name, "part": part, "away": round(float(away.max()), 3)})
+    return found
+
+
+def _singles(rows: Any) -> NDArray[np.float32]:
+    return np.asarray(rows, dtype=np.float32)
+
+
+def _framing(surfaces: Mapping[str, SurfaceData]) -> dict[str, Any]:
+    """Where the picture looks, and how much it shows, mm: all bones."""
+    bones = [s.vertices for name, s in surfaces.items() if name != "skin"]
+    vertices = np.concatenate(bones)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return {
+        "target": (0.5 * (low + high)).tolist(),
+        "span": SPAN_SHARE * float((high - low).max()),
+    }
+
+
+def site_view(name: str) -> dict[str, float]:
+    """The azimuth, elevation (degrees) and height (mm) of the picture that shows a site."""
+    side = name[-2:] if name.endswith(("_L", "_R")) else ""
+    azimuth, elevation, span = VIEWS.get(name.removesuffix(side), MIDLINE)
+    return {
+        "azimuth": -azimuth if side == "_R" else azimuth,
+        "elevation": elevation,
+        "span": span,
+    }
 
 
 def landmark_page_text(content: LandmarkContent) -> str:

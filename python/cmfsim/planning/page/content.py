@@ -1,4 +1,4 @@
-"""The content of a planning page: surfaces, operator, sites and errors, as plain values."""
+"""The content of a planning page: surfaces, operator, sites, errors and band, as plain values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, __version__
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, midline_profile
-from cmfsim.planning.page.band_content import band_content
 from cmfsim.planning.page.segment_points import segment_points
 from cmfsim.planning.page.tooth_rows import tooth_rows
 from cmfsim.planning.replanning import (
@@ -376,3 +375,39 @@ def _framing(skin: SurfaceData, active: NDArray[Any]) -> dict[str, Any]:
         "target": (0.5 * (low + high)).tolist(),
         "span": max(LEAST_SPAN, SPAN_SHARE * float((high - low).max())),
     }
+
+
+def band_content(band: PlanBand | None) -> tuple[dict[str, Any] | None, dict[str, NDArray[Any]]]:
+    """Values and arrays of a band; none where the page has no band.
+
+    Rates in half precision change a half-width by 0.01 mm at most.
+    """
+    if band is None:
+        return None, {}
+    known = band.at_reference
+    factor = band.factor
+    regions = [
+        {
+            "name": name,
+            "factor": known.factors[name].factor if name in known.factors else known.plain_factor,
+            "cases": known.factors[name].n if name in known.factors else None,
+        }
+        for name in known.regions
+    ]
+    arrays: dict[str, NDArray[Any]] = {
+        "band_still": band.still.astype(np.float32),
+        "band_shift": band.shift.astype(np.float32),
+        "band_rates": band.rates.astype(np.float16),
+        # 0 outside of the face, where no band is stated.
+        "band_factor": np.nan_to_num(factor, nan=0.0).astype(np.float32),
+    }
+    for index, part in enumerate(known.regions.values()):
+        arrays[f"band_region_{index}"] = np.flatnonzero(part).astype(np.uint32)
+    calibration = known.about.get("calibration") or {}
+    values = {
+        "state": known.state,
+        "coverage": known.coverage,
+        "regions": regions,
+        "note": str(calibration.get("note") or ""),
+    }
+    return values, arrays

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from cmfsim._core import Surface
 from cmfsim.errors import LandmarkInputError
-from cmfsim.registration.proposed.by_model import SitesOfKind, with_model
 from cmfsim.registration.proposed.definitions.detection import (
     Detected,
     HeadSurfaces,
@@ -23,7 +23,7 @@ from cmfsim.registration.proposed.jaw_evidence import (
     separation_points,
     weakened,
 )
-from cmfsim.registration.proposed.judgement import judged, missing_sites
+from cmfsim.registration.proposed.judgement import IMAGE_ENDS, judged, missing_sites
 from cmfsim.registration.proposed.limits import cut_planes
 from cmfsim.registration.proposed.pose import (
     Pose,
@@ -37,8 +37,15 @@ from cmfsim.registration.proposed.shape_model.samples import samples_of
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
-from cmfsim.values.proposed_landmarks import ProposedLandmarks
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.surface_data import SurfaceData, joined_surface
+
+# Deviations from which a site is doubtful, and from which it is the model's: of normal errors along
+# three axes 3 % and 0.03 % are larger.
+DOUBTFUL, REPLACED = 1.75, 2.5
+# Error of a site that is not doubtful, and how far from its surface
+# a site of the model may lie, mm of the average head.
+KNOWN, FARTHEST = 2.5, 8.0
 
 # Distance of a head from a template at which the template's bias counts half, average-head mm.
 LIKENESS = 0.8
@@ -46,6 +53,71 @@ LIKENESS = 0.8
 MIRRORED = 0.3
 # Rounds of finding sites and levelling the head by them.
 LEVEL_ROUNDS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class SitesOfKind:
+    """Sites of skull or skin, those that are missing, and the surface of each site."""
+
+    kind: str
+    sites: Mapping[str, ProposedSite]
+    missing: Mapping[str, str]
+    surfaces: Mapping[bool, SurfaceData]
+
+    def surface_of(self, name: str) -> SurfaceData | None:
+        """The surface a site lies on; True is that of the lower jaw."""
+        return self.surfaces.get(self.kind == "skull" and name.startswith(JAW_SITES))
+
+
+def with_model(
+    found: SitesOfKind, head: FittedHead, size: float
+) -> tuple[dict[str, ProposedSite], dict[str, str]]:
+    """Sites and missing ones after the model has its say.
+
+    A site far from the model's is replaced by it, and one that was not found is the model's, where
+    the image goes on and a surface is near. Both are doubtful, with the model's expected error.
+    """
+    kind = found.kind
+    sound = {(kind, n): s.point for n, s in found.sites.items() if not s.doubt}
+    places, errors = head.given(sound, KNOWN * size)
+    sites: dict[str, ProposedSite] = {}
+    missing = dict(found.missing)
+    for name, site in found.sites.items():
+        model, error = head.sites[kind, name], head.errors[kind, name]
+        gap = float(np.linalg.norm(site.point - model))
+        deviations = gap / float(np.hypot(error, site.error))
+        if deviations < DOUBTFUL:
+            sites[name] = site
+            continue
+        doubt = f"the shape of the whole head places it {gap:.1f} mm away"
+        doubt = "; ".join(filter(None, (site.doubt, doubt)))
+        sites[name] = replace(site, error=max(site.error, 0.5 * gap), doubt=doubt)
+        if deviations > REPLACED:
+            # Others follow it no longer: the model's own place.
+            moved = _surface_place(found, name, model, size)
+            if moved is not None:
+                doubt = f"{doubt}; placed by that shape"
+                sites[name] = ProposedSite(moved, max(site.error, error, 0.5 * gap), doubt)
+    for name, reason in found.missing.items():
+        if IMAGE_ENDS in reason or found.surface_of(name) is None:
+            continue
+        place = places[kind, name]
+        moved = _surface_place(found, name, place, size) if head.shows(place) else None
+        if moved is not None:
+            doubt = f"{reason}; placed by the shape of the head"
+            sites[name] = ProposedSite(moved, errors[kind, name], doubt)
+            del missing[name]
+    order = [name for of, name in head.sites if of == kind and name in sites]
+    return {name: sites[name] for name in order}, missing
+
+
+def _surface_place(found: SitesOfKind, name: str, place: Floats, size: float) -> Floats | None:
+    surface = found.surface_of(name)
+    if surface is None:
+        return None
+    near, _, _ = Surface(surface.vertices, surface.triangles).closest(place[None])
+    point: Floats = near[0]
+    return point if float(np.linalg.norm(point - place)) < FARTHEST * size else None
 
 
 def landmarks_from(

@@ -15,10 +15,9 @@ import cmfsim
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError
 from cmfsim.io.results.populations import part_of
-from cmfsim.lab.benchmark.entries import EntryFolder, learned_entries
+from cmfsim.lab.benchmark.entries import RATIOS, EntryFolder, learned_entries, predict_by_ratios
 from cmfsim.lab.benchmark.least_squares import PartialLeastSquares
 from cmfsim.lab.benchmark.patients import BenchmarkPatient, patients_of
-from cmfsim.lab.benchmark.ratios import RATIOS, predict_by_ratios
 from cmfsim.lab.virtual import Relocation, VirtualPatient
 from cmfsim.lab.virtual.patient_folder import case_text
 

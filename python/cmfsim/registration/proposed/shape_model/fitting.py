@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.registration.proposed.shape_model.model import SKIN, HeadModel
-from cmfsim.registration.proposed.shape_model.pairing import Finder, pose_columns
 from cmfsim.registration.proposed.shape_model.samples import HeadSamples
-from cmfsim.registration.proposed.shape_model.search import SIZE_DEVIATION
+from cmfsim.registration.proposed.shape_model.search import SIZE_DEVIATION, Finder, pose_columns
 from cmfsim.registration.proposed.shape_model.state import (
     N_JAW,
     N_POSE,

@@ -3,11 +3,13 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cmfsim.errors import third_party
 from cmfsim.registration.proposed.shape_model.model import SKIN, HeadModel
-from cmfsim.registration.proposed.shape_model.pairing import Finder, pose_columns
 from cmfsim.registration.proposed.shape_model.samples import HeadSamples
 from cmfsim.registration.proposed.shape_model.state import (
     N_JAW,
@@ -18,6 +20,9 @@ from cmfsim.registration.proposed.shape_model.state import (
     similarity_step,
 )
 from cmfsim.values.checks import Floats
+
+# Normals at a right angle count as this far apart times √2, mm of the average head.
+NORMAL_REACH = 14.0
 
 # Heads are offered nodding, leaning and turned by this much, degrees, in these sizes, and, where
 # the image ends above, with so much missing there, mm.
@@ -33,6 +38,36 @@ FIRST_CAP, SHRINK, LAST_CAP = 25.0, 0.8, 8.0
 STAGES = ((150, 5, 30), (300, 14, 3))
 # Damping of a step, and weight of a usual size, as shares of the points.
 DAMPING, SIZE_WEIGHT = 0.02, 0.01
+
+
+class Finder:
+    """Looks up the nearest of a set of points with normals."""
+
+    def __init__(self, points: Floats, normals: Floats) -> None:
+        spatial = third_party("scipy.spatial", "landmarks are found", "imaging")
+        self.points, self.normals = points, normals
+        self._tree: Any = spatial.cKDTree(_joined(points, normals))
+
+    def nearest(self, points: Floats, normals: Floats) -> tuple[Floats, NDArray[np.int64]]:
+        """Distance, with that of the normals, and index, both of the leading shape of points."""
+        gaps, index = self._tree.query(_joined(points, normals).reshape(-1, 6))
+        return gaps.reshape(points.shape[:-1]), index.reshape(points.shape[:-1])
+
+
+def _joined(points: Floats, normals: Floats) -> Floats:
+    return np.concatenate([points, NORMAL_REACH * normals], axis=-1)
+
+
+def pose_columns(goal: Floats, moved: Floats, normals: Floats) -> Floats:
+    """Derivatives of n·(x − goal), over the scale, by a small similarity of x, in lengths.
+
+    Divided by the scale, distances count in the patient's mm: else a patient who shrinks to a point
+    would lie near everything.
+    """
+    grow = (normals * goal).sum(axis=-1, keepdims=True)
+    columns = np.concatenate([grow, np.cross(moved, normals), normals], axis=-1)
+    lengths: Floats = columns / POSE_UNITS
+    return lengths
 
 
 @dataclass(frozen=True, eq=False)

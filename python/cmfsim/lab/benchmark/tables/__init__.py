@@ -1,1 +1,0 @@
-"""The benchmark's tables, as values and as Markdown."""
