@@ -16,7 +16,6 @@ from cmfsim.evaluation.models import (
 )
 from cmfsim.evaluation.regions import (
     REGIONS,
-    SKIN_LANDMARKS,
     UNMOVED_REGIONS,
     skin_regions,
     unmoved_regions,
@@ -31,6 +30,7 @@ from cmfsim.evaluation.significance import (
 from cmfsim.evaluation.statistics import LIMITS, DistanceStatistics, distance_statistics
 from cmfsim.evaluation.tables import ErrorTable, error_table
 from cmfsim.evaluation.unmoved import ThicknessChange, compare_unmoved, fitted_thickness
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 
 __all__ = [
     "LEAST_PAIRS",

@@ -16,7 +16,7 @@ from cmfsim.errors import (
     RegistrationInputError,
 )
 from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
-from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
+from cmfsim.evaluation.regions import skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
 from cmfsim.values.checks import (
@@ -28,6 +28,7 @@ from cmfsim.values.checks import (
     frozen,
 )
 from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
 MATCHINGS = ("landmarks", "closest")

@@ -16,11 +16,12 @@ from cmfsim.evaluation.comparison import (
     SkinComparison,
     compare_skins,
 )
-from cmfsim.evaluation.regions import SKIN_LANDMARKS, skin_regions
+from cmfsim.evaluation.regions import skin_regions
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.surfaces.depth import moved_outward
 from cmfsim.values.checks import Floats, as_rows, as_text, check_one_of, frozen
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
 # The pre-operative skin taken as a prediction: what any model must beat.

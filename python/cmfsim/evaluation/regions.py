@@ -12,8 +12,6 @@ from cmfsim.errors import LandmarkInputError
 from cmfsim.values.checks import Floats, as_floats, as_rows
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 
-__all__ = ["REGIONS", "SKIN_LANDMARKS", "UNMOVED_REGIONS", "skin_regions", "unmoved_regions"]
-
 # Left and up in the view from the front, mm.
 Place = tuple[float, float]
 

@@ -17,8 +17,6 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.frozen import Frozen
 from cmfsim.values.surface_data import SurfaceData
 
-__all__ = ["MOST_BOXES", "MUSCLE_KINDS", "MUSCLE_SIDES", "MuscleSurface", "Musculature"]
-
 # How the fibres of a muscle run: along it; spread from a narrow insertion; round an opening; in a
 # layer whose surface does not tell their direction.
 MUSCLE_KINDS = ("strap", "fan", "ring", "sheet")

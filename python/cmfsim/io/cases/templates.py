@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from cmfsim._core import MOST_BOXES
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.cases.tables import Table, read_tables
 from cmfsim.io.cases.template_archives import (
@@ -29,7 +30,7 @@ from cmfsim.io.landmarks.markups import read_curves, write_curves
 from cmfsim.io.surfaces import read_surface, write_surface
 from cmfsim.values.case_parts import FRAMES, UNITS
 from cmfsim.values.finding import Finding
-from cmfsim.values.musculature import MOST_BOXES, MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
+from cmfsim.values.musculature import MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.template import TemplateData
 

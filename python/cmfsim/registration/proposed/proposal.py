@@ -16,7 +16,6 @@ from cmfsim.registration.proposed.definitions.detection import (
     detect,
     is_lower,
 )
-from cmfsim.registration.proposed.definitions.groups import JAW_SITES
 from cmfsim.registration.proposed.jaw_evidence import (
     JawEvidence,
     jaw_evidence,
@@ -36,7 +35,7 @@ from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead, fit
 from cmfsim.registration.proposed.shape_model.samples import samples_of
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
-from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
+from cmfsim.values.landmark_sites import JAW_SITES, SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 

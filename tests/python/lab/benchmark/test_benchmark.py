@@ -15,7 +15,12 @@ import cmfsim
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError
 from cmfsim.io.results.populations import part_of
-from cmfsim.lab.benchmark.entries import RATIOS, EntryFolder, learned_entries, predict_by_ratios
+from cmfsim.lab.benchmark.entries import (
+    SKIN_RATIOS,
+    EntryFolder,
+    learned_entries,
+    predict_by_ratios,
+)
 from cmfsim.lab.benchmark.least_squares import PartialLeastSquares
 from cmfsim.lab.benchmark.patients import BenchmarkPatient, patients_of
 from cmfsim.lab.virtual import Relocation, VirtualPatient
@@ -362,7 +367,7 @@ def test_ratios_move_their_landmarks_by_their_share(folder):
     patient = BenchmarkPatient("D003", folder / "D003")
     moves = predict_by_ratios(patient)
     jaw = np.array(motion_of(3))
-    for ratio in RATIOS:
+    for ratio in SKIN_RATIOS:
         at = int(np.linalg.norm(patient.skin - patient.landmarks[ratio.skin], axis=1).argmin())
         share = 0.0 if "maxilla" in ratio.segments else ratio.forwards
         # The nearest vertex of this coarse skin is some mm from the landmark.

@@ -9,8 +9,6 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.reference_places import REFERENCE_PLACES
 
-__all__ = ["FAR_JAW", "JAW_SITES", "jaw_distance", "misfits"]
-
 # The distance at which a site counts half in the fit, mm.
 HALF_DISTANCE = 5.0
 LEAST_SITES = 5

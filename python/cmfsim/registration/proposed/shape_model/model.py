@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.registration.proposed.average_head import average_head
-from cmfsim.registration.proposed.definitions.groups import JAW_SITES
 from cmfsim.values.checks import Floats
-from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
+from cmfsim.values.landmark_sites import JAW_SITES, SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
