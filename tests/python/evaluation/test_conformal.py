@@ -136,7 +136,7 @@ def test_a_calibration_is_read_as_it_was_written(tmp_path):
         ({"format": "cmfsim-case"}, "format"),
         ({"model": "X"}, "model"),
         ({"settings": {"contact": "unilateral", "sd": 0.2}}, "settings_digest"),
-        ({"cases": []}, "cases"),
+        ({"cases": []}, "at least one case"),
         ({"cases": [{"case": "P1", "scores": {"chin": -1.0}}]}, "scores.chin"),
         ({"cases": [{"case": "P1", "scores": {}}]}, "has no score"),
         ({"cases": [{"case": "P1", "scores": {"chin": 1.0}}] * 2}, "twice"),

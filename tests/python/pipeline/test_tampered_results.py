@@ -211,7 +211,7 @@ def test_no_file_but_the_results_own_pictures_comes_into_a_report(
         assert main(["report", str(originals), "-q"]) == 2
         assert HIDDEN not in (originals / "report.html").read_text("utf-8")
         err = capsys.readouterr().err
-        assert "an evaluation has no file of that name" in err or "error-H.png" in err
+        assert "another text is needed" in err or "error-H.png" in err
     finally:
         path.write_bytes(data)
         mine.unlink()

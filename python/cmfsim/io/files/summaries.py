@@ -9,13 +9,14 @@ import hashlib
 import json
 import math
 import os
+import re
 import stat
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.reading_writing import refuse_constant
+from cmfsim.io.files.reading_writing import parsed_json
 from cmfsim.values.finding import SEVERITIES
 
 # Above these a summary is not what it says it is: bytes, characters of a text, entries of a list.
@@ -28,8 +29,39 @@ LARGEST = 1e19
 DEEPEST = 12
 CHUNK = 1 << 20
 
-# Refuses a value that is not as it must be, given its place in the summary and the value.
-Check = Callable[[str, object], None]
+# What a value must be: see `check`.
+Shape: TypeAlias = Any
+# A text that is not empty.
+SOME = re.compile(r"(?s).+")
+
+
+class Span(NamedTuple):
+    """Finite numbers within a range."""
+
+    low: float = -LARGEST
+    high: float = LARGEST
+    whole: bool = False
+
+
+class Maybe(NamedTuple):
+    """A shape, or nothing."""
+
+    shape: Shape
+
+
+class Closed(NamedTuple):
+    """A table that has no other names."""
+
+    shape: Mapping[str, Shape]
+
+
+COUNT = Span(0, LARGEST, whole=True)
+# The values of a `Finding`.
+FINDING: Shape = {
+    "severity": frozenset(SEVERITIES),
+    **dict.fromkeys(("code", "what"), SOME),
+    **dict.fromkeys(("where", "why", "fix"), str),
+}
 
 
 def write_summary(
@@ -57,13 +89,14 @@ def write_summary(
     path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def read_summary(path: Path, check: Check, again: str) -> dict[str, Any]:
+def read_summary(path: Path, shape: Shape, again: str) -> dict[str, Any]:
     """The content of a summary that is whole, unchanged and as it must be.
 
     Parameters
     ----------
     path : Path
-    check : callable
+    shape
+        As `check` takes it.
     again : str
         What makes the file again, for the error.
 
@@ -81,9 +114,9 @@ def read_summary(path: Path, check: Check, again: str) -> dict[str, Any]:
             raise CaseInputError("has no digest: an older version or another program wrote it")
         if content.pop("digest") != _digest(content):
             raise CaseInputError("was changed after it was written")
-        plain("", content)
-        mapping(text, most=200)("sha256", content.get("sha256"))
-        check("", content)
+        check("", content, object)
+        check("", content, {"sha256": {str: str}})
+        check("", content, shape)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileNotFoundError(f"{path}: no such file") from error
     except OSError as error:
@@ -137,7 +170,7 @@ def plain_json(path: Path) -> dict[str, Any]:
     if len(data) > MOST_BYTES:
         raise CaseInputError(f"is larger than {MOST_BYTES} bytes")
     try:
-        found = json.loads(data.decode("utf-8"), parse_constant=refuse_constant)
+        found = parsed_json(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise CaseInputError(f"is not JSON ({error})") from error
     if not isinstance(found, dict):
@@ -166,29 +199,79 @@ def _hash_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
-    """A finite number within a range."""
+def check(where: str, value: object, shape: Shape) -> None:
+    """Refuses a value that is not of a shape, with its place in the summary.
 
-    def check(where: str, value: object) -> None:
-        plain = isinstance(value, int | float) and not isinstance(value, bool)
-        # Compared before it is converted: an int may be too large for a float.
-        if not plain or not low <= value <= high or not math.isfinite(value):  # type: ignore[operator,arg-type]
-            _refuse(where, value, f"a number from {low:g} to {high:g} is needed")
+    A shape is `str`, `bool`, `object` for any plain values; a frozenset of texts, or a pattern of
+    a whole text; a `Span` of numbers; a `Maybe`; a list with the shape of its entries (of several,
+    as many are needed); a table of names and shapes, where a name ending in "?" may be absent and
+    others may be there as well unless it is `Closed`, or of the shapes of all names and their
+    values; or a function of place and value that refuses it.
+    """
+    if isinstance(shape, Maybe):
+        if value is not None:
+            check(where, value, shape.shape)
+    elif isinstance(shape, Closed):
+        check(where, value, shape.shape)
+        names = {name.removesuffix("?") for name in shape.shape}
+        for other in [n for n in value if n not in names] if isinstance(value, dict) else ():
+            raise CaseInputError(f"{where} has the unknown name {other!r:.60}".strip())
+    elif isinstance(shape, Span):
+        _check_number(where, value, shape)
+    elif isinstance(shape, list):
+        count = len(shape) if len(shape) > 1 else None
+        if not isinstance(value, list) or len(value) > MOST_ENTRIES:
+            _refuse(where, value, "a list is needed")
+        if count not in {None, len(value)}:
+            _refuse(where, value, f"a list of {count} entries is needed")
+        for place, entry in enumerate(value):
+            check(f"{where}[{place}]", entry, shape[0])
+    elif isinstance(shape, Mapping):
+        _check_table(where, value, shape)
+    elif isinstance(shape, frozenset):
+        if not isinstance(value, str) or value not in shape:
+            _refuse(where, value, f"one of {', '.join(sorted(shape))} is needed")
+    elif isinstance(shape, re.Pattern):
+        _check_text(where, value)
+        if not shape.fullmatch(str(value)):
+            _refuse(where, value, "another text is needed")
+    elif shape is str:
+        _check_text(where, value)
+    elif shape is bool:
+        if not isinstance(value, bool):
+            _refuse(where, value, "true or false is needed")
+    elif shape is object:
+        _check_plain(where, value)
+    else:
+        shape(where, value)
 
-    return check
+
+def _check_table(where: str, value: object, shape: Mapping[Any, Shape]) -> None:
+    if not isinstance(value, dict) or len(value) > MOST_ENTRIES:
+        _refuse(where, value, "a table of names and values is needed")
+    for key, inner in shape.items():
+        if isinstance(key, str):
+            name = key.removesuffix("?")
+            if name in value:
+                check(f"{where}.{name}".lstrip("."), value[name], inner)
+            elif name == key:
+                raise CaseInputError(f"{where} lacks {name!r}".strip())
+            continue
+        for name, entry in value.items():
+            check(f"a name in {where}", name, key)
+            check(f"{where}.{name:.60}".lstrip("."), entry, inner)
 
 
-def whole(low: int = 0, high: int = int(LARGEST)) -> Check:
-    """A whole number within a range."""
+def _check_number(where: str, value: object, span: Span) -> None:
+    kinds = int if span.whole else int | float
+    is_number = isinstance(value, kinds) and not isinstance(value, bool)
+    # Compared before it is converted: an int may be too large for a float.
+    if not is_number or not span.low <= value <= span.high or not math.isfinite(value):  # type: ignore[operator,arg-type]
+        what = "a whole number" if span.whole else "a number"
+        _refuse(where, value, f"{what} from {span.low:g} to {span.high:g} is needed")
 
-    def check(where: str, value: object) -> None:
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            _refuse(where, value, f"a whole number from {low} to {high} is needed")
 
-    return check
-
-
-def text(where: str, value: object) -> None:
+def _check_text(where: str, value: object) -> None:
     """A text that is not endless."""
     if not isinstance(value, str) or len(value) > MOST_TEXT:
         _refuse(where, value, f"a text of {MOST_TEXT} characters at most is needed")
@@ -198,116 +281,21 @@ def text(where: str, value: object) -> None:
         _refuse(where, value, "a text of whole characters is needed")
 
 
-def plain(where: str, value: object, depth: int = 0) -> None:
+def _check_plain(where: str, value: object, depth: int = 0) -> None:
     """Numbers within any range, texts, flags and nothing, in lists and tables."""
     if depth > DEEPEST:
         raise CaseInputError(f"{where:.200} lies deeper than {DEEPEST} tables")
     if isinstance(value, str):
-        text(where, value)
-    elif isinstance(value, list | dict):
-        entries = value.items() if isinstance(value, dict) else enumerate(value)
-        for name, entry in entries:
-            if isinstance(name, str):
-                text(f"a name in {where}", name)
-            plain(
-                f"{where}.{name:.60}".lstrip(".") if isinstance(name, str) else where,
-                entry,
-                depth + 1,
-            )
+        _check_text(where, value)
+    elif isinstance(value, list):
+        for entry in value:
+            _check_plain(where, entry, depth + 1)
+    elif isinstance(value, dict):
+        for name, entry in value.items():
+            _check_text(f"a name in {where}", name)
+            _check_plain(f"{where}.{name:.60}".lstrip("."), entry, depth + 1)
     elif value is not None and not isinstance(value, bool):
-        number()(where, value)
-
-
-def file_of(result: str, is_its: Callable[[str], bool]) -> Check:
-    """A name that files of a result have, such as "a prediction"."""
-
-    def check(where: str, value: object) -> None:
-        if not isinstance(value, str) or not is_its(value):
-            raise CaseInputError(f"{where} is {value!r:.60}: {result} has no file of that name")
-
-    return check
-
-
-def flag(where: str, value: object) -> None:
-    """True or false."""
-    if not isinstance(value, bool):
-        _refuse(where, value, "true or false is needed")
-
-
-def one_of(*known: str) -> Check:
-    """One of some texts."""
-
-    def check(where: str, value: object) -> None:
-        if value not in known:
-            _refuse(where, value, f"one of {', '.join(known)} is needed")
-
-    return check
-
-
-def optional(inner: Check) -> Check:
-    """What a check lets through, or nothing."""
-
-    def check(where: str, value: object) -> None:
-        if value is not None:
-            inner(where, value)
-
-    return check
-
-
-def listing(inner: Check, *, length: int | None = None, least: int = 0) -> Check:
-    """A list of what a check lets through."""
-
-    def check(where: str, value: object) -> None:
-        if not isinstance(value, list) or not least <= len(value) <= MOST_ENTRIES:
-            _refuse(where, value, f"a list of {least} or more entries is needed")
-        if length is not None and len(value) != length:
-            _refuse(where, value, f"a list of {length} entries is needed")
-        for place, entry in enumerate(value):
-            inner(f"{where}[{place}]", entry)
-
-    return check
-
-
-def mapping(inner: Check, *, most: int = MOST_ENTRIES, keys: Check = text) -> Check:
-    """A table of any names with what a check lets through."""
-
-    def check(where: str, value: object) -> None:
-        if not isinstance(value, dict) or len(value) > most:
-            _refuse(where, value, f"a table of {most} names at most is needed")
-        for name, entry in value.items():
-            keys(f"a name in {where}", name)
-            inner(f"{where}.{name:.60}".lstrip("."), entry)
-
-    return check
-
-
-def table(
-    required: Mapping[str, Check], more: Mapping[str, Check] | None = None, *, closed: bool = False
-) -> Check:
-    """A table that has some names, may have more of known kinds, and others unless it is closed."""
-    known = {**required, **(more or {})}
-
-    def check(where: str, value: object) -> None:
-        if not isinstance(value, dict):
-            _refuse(where, value, "a table of names and values is needed")
-        for name in required:
-            if name not in value:
-                raise CaseInputError(f"{where} lacks {name!r}".strip())
-        for name, entry in value.items():
-            if name in known:
-                known[name](f"{where}.{name}".lstrip("."), entry)
-            elif closed:
-                raise CaseInputError(f"{where} has the unknown name {name!r:.60}".strip())
-
-    return check
-
-
-def finding(where: str, value: object) -> None:
-    """The values of a `Finding`."""
-    known = {"severity": one_of(*SEVERITIES), "code": text, "what": text}
-    table({**known, "where": text, "why": text, "fix": text})(where, value)
-    if isinstance(value, dict) and not (value["code"] and value["what"]):
-        raise CaseInputError(f"{where} states nothing")
+        _check_number(where, value, Span())
 
 
 def _refuse(where: str, value: object, needed: str) -> NoReturn:

@@ -7,37 +7,24 @@ from typing import Any
 
 from cmfsim.errors import CalibrationError, CaseInputError
 from cmfsim.io.files.reading_writing import replacing
-from cmfsim.io.files.summaries import (
-    listing,
-    mapping,
-    number,
-    one_of,
-    optional,
-    plain,
-    plain_json,
-    table,
-    text,
-    whole,
-)
+from cmfsim.io.files.summaries import Closed, Maybe, Span, check, plain_json
 from cmfsim.values.calibration import Calibration, CalibrationCase
 from cmfsim.values.prediction import MODELS
 
 CALIBRATION_FORMAT, CALIBRATION_VERSION = "cmfsim-calibration", 1
 
-_CASE = table(
-    {"case": text, "scores": mapping(number(0.0, 1e9), most=1000)}, {"group": text}, closed=True
-)
-_CALIBRATION = table(
+_CASE = Closed({"case": str, "scores": {str: Span(0.0, 1e9)}, "group?": str})
+_CALIBRATION = Closed(
     {
-        "format": one_of(CALIBRATION_FORMAT),
-        "version": whole(CALIBRATION_VERSION, CALIBRATION_VERSION),
-        "model": one_of(*MODELS),
-        "settings": mapping(plain, most=1000),
-        "settings_digest": text,
-        "cases": listing(_CASE, least=1),
-    },
-    {"note": text, "coverage": optional(number(0.0, 1.0))},
-    closed=True,
+        "format": frozenset({CALIBRATION_FORMAT}),
+        "version": Span(CALIBRATION_VERSION, CALIBRATION_VERSION, whole=True),
+        "model": frozenset(MODELS),
+        "settings": {str: object},
+        "settings_digest": str,
+        "cases": [_CASE],
+        "note?": str,
+        "coverage?": Maybe(Span(0.0, 1.0)),
+    }
 )
 
 
@@ -70,7 +57,7 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
         raise FileNotFoundError(f"{path}: no such calibration file")
     try:
         content: dict[str, Any] = plain_json(path)
-        _CALIBRATION("", content)
+        check("", content, _CALIBRATION)
         found = Calibration(
             content["model"],
             content["settings"],

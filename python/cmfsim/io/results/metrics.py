@@ -10,19 +10,14 @@ from typing import Any
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.files.summaries import (
+    COUNT,
+    FINDING,
+    SOME,
+    Maybe,
+    Span,
+    check,
     checked_file,
-    file_of,
-    finding,
-    listing,
-    mapping,
-    number,
-    one_of,
-    optional,
-    plain,
     read_summary,
-    table,
-    text,
-    whole,
 )
 from cmfsim.values.prediction import MODELS
 
@@ -37,62 +32,40 @@ AGAIN = "run cmfsim evaluate again"
 MOST_PICTURE = 64 * 2**20
 PNG = b"\x89PNG\r\n\x1a\n"
 
-_DISTANCE, _SHARE = number(-1e6, 1e6), number(0.0, 1.0)
-_STATISTICS = table(
-    {
-        **dict.fromkeys(
-            ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm"),
-            number(0.0, 1e6),
-        ),
-        "signed_mean_mm": _DISTANCE,
-        "within": table({"2 mm": _SHARE}, dict.fromkeys(("1 mm", "1.5 mm", "3 mm"), _SHARE)),
+_LENGTH, _SHARE = Span(0.0, 1e6), Span(0.0, 1.0)
+_STATISTICS = {
+    **dict.fromkeys(
+        ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm"), _LENGTH
+    ),
+    "signed_mean_mm": Span(-1e6, 1e6),
+    "within": {"2 mm": _SHARE, **dict.fromkeys(("1 mm?", "1.5 mm?", "3 mm?"), _SHARE)},
+    "count?": COUNT,
+}
+_ERRORS = {"regions": {"whole": _STATISTICS, SOME: _STATISTICS}}
+_EVALUATION = {
+    **dict.fromkeys(("case", "key", "case_key"), str),
+    "models": {frozenset(MODELS): _ERRORS},
+    "failed": {frozenset(MODELS): str},
+    "files": [EVALUATION_FILES],
+    "not_operated?": Maybe({"regions": {str: _STATISTICS}}),
+    "thickness?": {
+        "share_of_depth": Span(-1.0, 1.0),
+        "vertices": COUNT,
+        **dict.fromkeys(("mean_depth_mm", "mean_before_mm", "mean_after_mm"), _LENGTH),
+        "mean_mm": {str: {str: _LENGTH}},
     },
-    {"count": whole()},
-)
-_ERRORS = table({"regions": table({"whole": _STATISTICS})}, {"comparison": plain})
-
-
-def _regions(where: str, value: object) -> None:
-    _ERRORS(where, value)
-    if isinstance(value, dict):
-        mapping(_STATISTICS, most=100)(f"{where}.regions", value["regions"])
+    "no_change?": _ERRORS,
+    "wilcoxon?": {str: {"p": Maybe(_SHARE)}},
+    "notes?": [str],
+    "warnings?": [str],
+    "seconds?": {str: Span(0.0, 1e9)},
+    "findings?": [FINDING],
+}
 
 
 def is_evaluation_file(name: str) -> bool:
     """Whether an evaluation is written as files of this name, among others."""
     return EVALUATION_FILES.fullmatch(name) is not None
-
-
-_FILE_NAME = file_of("an evaluation", is_evaluation_file)
-_EVALUATION = table(
-    {
-        "case": text,
-        "key": text,
-        "case_key": text,
-        "models": mapping(_regions, keys=one_of(*MODELS)),
-        "failed": mapping(text, keys=one_of(*MODELS)),
-        "files": listing(_FILE_NAME),
-    },
-    {
-        "not_operated": optional(table({"regions": mapping(_STATISTICS, most=100)})),
-        "thickness": table(
-            {
-                "share_of_depth": number(-1.0, 1.0),
-                "vertices": whole(),
-                **dict.fromkeys(
-                    ("mean_depth_mm", "mean_before_mm", "mean_after_mm"), number(0, 1e6)
-                ),
-                "mean_mm": mapping(mapping(number(0.0, 1e6), most=100), most=10),
-            }
-        ),
-        "no_change": _regions,
-        "wilcoxon": mapping(table({"p": optional(_SHARE)})),
-        "notes": listing(text),
-        "seconds": mapping(number(0.0, 1e9)),
-        "findings": listing(finding),
-        "warnings": listing(text),
-    },
-)
 
 
 def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any]:
@@ -120,7 +93,7 @@ def read_evaluation_picture(
     CaseError
         (also `ValueError`) It is none of that evaluation, or no PNG.
     """
-    _FILE_NAME("files", name)
+    check("files", name, EVALUATION_FILES)
     return read_picture(checked_file(Path(folder), evaluation, name, AGAIN))
 
 

@@ -2,26 +2,32 @@
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from cmfsim.errors import CaseInputError
-from cmfsim.io.files.reading_writing import (
-    FORMAT_VERSION,
-    check_readable,
-    named,
-    parsed_json,
-    replacing,
-)
+from cmfsim.io.files.reading_writing import FORMAT_VERSION, check_readable, named, replacing
+from cmfsim.io.files.summaries import Closed, Maybe, Shape, Span, check, plain_json
 from cmfsim.values.checks import check_one_of
 
 POPULATION_FILE = "population.json"
 FORMAT = "cmfsim-population"
 STATES = MADE, FAILED, PENDING = "made", "failed", "pending"
 PARTS = TRAIN, CALIBRATION, TEST = "train", "calibration", "test"
+# A name of a patient is that of a folder.
+_POPULATION: Shape = {
+    "format": frozenset({FORMAT}),
+    "version": Span(FORMAT_VERSION, FORMAT_VERSION, whole=True),
+    "settings?": Maybe({str: object}),
+    "patients": {
+        re.compile(r"[\w-]*[^\W_][\w-]*"): Closed(
+            {"state": str, "part": str, "operation": str, "reason?": str}
+        )
+    },
+}
 
 
 def part_of(index: int) -> str:
@@ -111,30 +117,7 @@ class Population:
         path = Path(folder) / POPULATION_FILE
         check_readable(path)
         with named(path):
-            found = parsed_json(path.read_text(encoding="utf-8"))
-            if not isinstance(found, dict) or found.get("format") != FORMAT:
-                raise CaseInputError(f'format = "{FORMAT}" is needed')
-            if found.get("version") != FORMAT_VERSION:
-                raise CaseInputError(f"version {found.get('version')!r}: {FORMAT_VERSION} is read")
-            patients = found.get("patients")
-            if not isinstance(patients, dict):
-                raise CaseInputError("patients: a table of patients by name is needed")
-            return cls(
-                {name: _entry(name, values) for name, values in patients.items()},
-                found.get("settings") or {},
-            )
-
-
-def _entry(name: str, values: object) -> PopulationEntry:
-    """One patient of the file."""
-    known = {"state", "part", "operation", "reason"}
-    if not name.replace("_", "").replace("-", "").isalnum():
-        raise CaseInputError(f"patients: {name!r} is no name: letters, digits, _ and - are allowed")
-    if not isinstance(values, dict) or not known >= set(values):
-        raise CaseInputError(f"patients.{name}: a table of {', '.join(sorted(known))} is needed")
-    if not all(isinstance(value, str) for value in values.values()):
-        raise CaseInputError(f"patients.{name}: all values are texts")
-    missing = known - {"reason"} - set(values)
-    if missing:
-        raise CaseInputError(f"patients.{name}: lacks {', '.join(sorted(missing))}")
-    return PopulationEntry(**values)
+            found = plain_json(path)
+            check("", found, _POPULATION)
+            entries = {name: PopulationEntry(**of) for name, of in found["patients"].items()}
+            return cls(entries, found.get("settings") or {})

@@ -2,20 +2,7 @@
 
 import re
 
-from cmfsim.io.files.summaries import (
-    file_of,
-    finding,
-    flag,
-    listing,
-    mapping,
-    number,
-    one_of,
-    optional,
-    plain,
-    table,
-    text,
-    whole,
-)
+from cmfsim.io.files.summaries import COUNT, FINDING, Maybe, Span, check
 from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE
 from cmfsim.values.prediction import MODELS
 
@@ -30,124 +17,88 @@ def is_prediction_file(name: str) -> bool:
     return PREDICTION_FILES.fullmatch(name) is not None
 
 
-_LENGTH, _COUNT, _SECONDS = number(-1e6, 1e6), whole(0, 10**12), number(0.0, 1e9)
-_VECTOR = listing(_LENGTH, length=3)
-_RIGID = table({"translation": _VECTOR, "angle": number(0.0, 360.0), "axis": _VECTOR})
-_MOVED = table({"mean": number(0.0, 1e6), "largest": number(0.0, 1e6)})
+_SIZE, _SHARE, _SECONDS = Span(0.0, 1e6), Span(0.0, 1.0), Span(0.0, 1e9)
+_LARGE, _VECTOR = Span(0.0, 1e12), [Span(-1e6, 1e6)] * 3
+_SCALE = Span(0.1, 10.0)
 
 
 def _motion(where: str, value: object) -> None:
-    table({}, {"mean": number(0.0, 1e6), "bending": number(0.0, 1e6)})(where, value)
+    """A rigid motion by its numbers, or another by how far it goes."""
     rigid = isinstance(value, dict) and "translation" in value
-    (_RIGID if rigid else _MOVED)(where, value)
+    shape = {"translation": _VECTOR, "angle": Span(0.0, 360.0), "axis": _VECTOR}
+    moved = {"mean": _SIZE, "largest": _SIZE, "bending?": _SIZE}
+    check(where, value, {**shape, "mean?": _SIZE, "bending?": _SIZE} if rigid else moved)
 
 
-_SOLUTION = table(
-    {
-        "method": text,
-        "n_tets": _COUNT,
-        "n_unknowns": _COUNT,
-        "residual": optional(number(0.0, 1e12)),
-        "contact_iterations": _COUNT,
-        "contact_gap": optional(_LENGTH),
+_SOLUTION = {
+    "method": str,
+    **dict.fromkeys(("n_tets", "n_unknowns", "contact_iterations"), COUNT),
+    **dict.fromkeys(("residual", "error_bound?", "error_estimate?"), Maybe(_LARGE)),
+    "contact_gap": Maybe(Span(-1e6, 1e6)),
+}
+_FIT = {
+    **dict.fromkeys(("rms_mm", "worst_mm", "median_mm", "p95_mm", "slip_mm?"), _SIZE),
+    "share": _SHARE,
+    "shape?": {
+        "scale": _SCALE,
+        "scale_interval": [_SCALE] * 2,
+        "eigenvalue_ratio": _SHARE,
+        "open": [object],
     },
-    dict.fromkeys(("error_bound", "error_estimate"), optional(number(0.0, 1e12))),
-)
-_SIZE = number(0.1, 10.0)
-_FIT = table(
-    {
-        **dict.fromkeys(("rms_mm", "worst_mm", "median_mm", "p95_mm"), number(0.0, 1e6)),
-        "share": number(0.0, 1.0),
+}
+_YOUNG, _POISSON = Span(*YOUNG_RANGE), Span(-1.0, MOST_POISSON)
+_MUSCLE = {"young_along": _YOUNG, "young_across": _YOUNG, "poisson": _POISSON}
+_BAND_REGION = {
+    **dict.fromkeys(
+        ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm", "sd_mean_mm"), _SIZE
+    ),
+    "calibration": Maybe(
+        {
+            "factor": Span(0.0, 1e9),
+            **dict.fromkeys(("n", "rank"), COUNT),
+            **dict.fromkeys(("coverage", "coverage_5_percent", "coverage_95_percent"), _SHARE),
+        }
+    ),
+    "sources_rms_mm": {str: _SIZE},
+}
+_BAND = {
+    "state": frozenset({"calibrated", "uncalibrated"}),
+    "coverage": _SHARE,
+    "factor_uncalibrated": Maybe(Span(0.0, 1e3)),
+    "settings_digest": str,
+    "settings": {str: object},
+    "regions": {str: _BAND_REGION},
+    "sources": {str: {"sd": _SIZE, "unit": str, "reference": str}},
+    "not_covered": [str],
+    "notes": [str],
+    "calibration": Maybe({"file": str, "note": str, "n": COUNT, "group?": Maybe(str)}),
+    "seconds": _SECONDS,
+}
+PREDICTION = {
+    **dict.fromkeys(("case", "case_key", "note?", "plan_digits?"), str),
+    "model": frozenset(MODELS),
+    "versions": {str: str},
+    "inputs": {str: str},
+    "timings": {str: _SECONDS},
+    "skin": dict.fromkeys(("mean", "p95", "largest"), _SIZE),
+    "plan": {str: _motion},
+    "segments": {str: {"joined": COUNT, "sliding": COUNT}},
+    "mesh": {str: object},
+    "solution": _SOLUTION,
+    "findings": [FINDING],
+    "parts": {frozenset({"bones", "muscles"}): [str]},
+    "files": [PREDICTION_FILES],
+    "left_out?": [str],
+    "achieved?": {"segments": {str: _FIT}},
+    "muscles?": {
+        "volumes?": {str: _LARGE},
+        "template?": str,
+        "moduli?": {
+            "fat": {"young": _YOUNG, "poisson": _POISSON},
+            "muscle": _MUSCLE,
+            "muscles": {str: _MUSCLE},
+        },
     },
-    {
-        "shape": table(
-            {
-                "scale": _SIZE,
-                "scale_interval": listing(_SIZE, length=2),
-                "eigenvalue_ratio": number(0.0, 1.0),
-                "open": listing(plain),
-            }
-        ),
-        "slip_mm": number(0.0, 1e6),
-    },
-)
-_YOUNG, _POISSON = number(*YOUNG_RANGE), number(-1.0, MOST_POISSON)
-_MUSCLE = table({"young_along": _YOUNG, "young_across": _YOUNG, "poisson": _POISSON})
-_WIDTH, _SHARE = number(0.0, 1e6), number(0.0, 1.0)
-_FACTOR = table(
-    {
-        "factor": number(0.0, 1e9),
-        "n": _COUNT,
-        "rank": _COUNT,
-        **dict.fromkeys(("coverage", "coverage_5_percent", "coverage_95_percent"), _SHARE),
-    }
-)
-_BAND_REGION = table(
-    {
-        **dict.fromkeys(
-            ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm", "sd_mean_mm"),
-            _WIDTH,
-        ),
-        "calibration": optional(_FACTOR),
-        "sources_rms_mm": mapping(_WIDTH, most=1000),
-    }
-)
-_BAND = table(
-    {
-        "state": one_of("calibrated", "uncalibrated"),
-        "coverage": _SHARE,
-        "factor_uncalibrated": optional(number(0.0, 1e3)),
-        "settings_digest": text,
-        "settings": mapping(plain),
-        "regions": mapping(_BAND_REGION, most=100),
-        "sources": mapping(
-            table({"sd": number(0.0, 1e6), "unit": text, "reference": text}), most=1000
-        ),
-        "not_covered": listing(text),
-        "notes": listing(text),
-        "calibration": optional(
-            table({"file": text, "note": text, "n": _COUNT}, {"group": optional(text)})
-        ),
-        "seconds": number(0.0, 1e9),
-    }
-)
-PREDICTION = table(
-    {
-        "case": text,
-        "model": one_of(*MODELS),
-        "case_key": text,
-        "versions": mapping(text, most=100),
-        "inputs": mapping(text),
-        "timings": mapping(_SECONDS, most=1000),
-        "skin": table(dict.fromkeys(("mean", "p95", "largest"), number(0.0, 1e6))),
-        "plan": mapping(_motion, most=1000),
-        "segments": mapping(table({"joined": _COUNT, "sliding": _COUNT}), most=1000),
-        "mesh": mapping(plain),
-        "solution": _SOLUTION,
-        "findings": listing(finding),
-        "parts": mapping(listing(text), most=10, keys=one_of("bones", "muscles")),
-        "files": listing(file_of("a prediction", is_prediction_file)),
-    },
-    {
-        "note": text,
-        "plan_digits": text,
-        "left_out": listing(text),
-        "achieved": table({"segments": mapping(_FIT, most=1000)}),
-        "muscles": table(
-            {},
-            {
-                "volumes": mapping(number(0.0, 1e12)),
-                "template": text,
-                "moduli": table(
-                    {
-                        "fat": table({"young": _YOUNG, "poisson": _POISSON}),
-                        "muscle": _MUSCLE,
-                        "muscles": mapping(_MUSCLE, most=1000),
-                    }
-                ),
-            },
-        ),
-        "refined": flag,
-        "band": _BAND,
-    },
-)
+    "refined?": bool,
+    "band?": _BAND,
+}
