@@ -28,7 +28,7 @@ from cmfsim.io.cases.case_tables import (
     tissue_of,
 )
 from cmfsim.io.cases.tables import CaseChanges, read_tables
-from cmfsim.io.files.reading_writing import FORMAT_VERSION, is_there
+from cmfsim.io.files.reading_writing import is_there
 from cmfsim.values.case_parts import (
     CaseBand,
     CaseImage,
@@ -273,12 +273,7 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
     if changes is not None:
         document = document.changed(changes)
     document.only(*TABLES)
-    found = document.text("format")
-    if found != CASE_FORMAT:
-        document.fail("format", f"is {found!r}: {CASE_FORMAT!r} is needed")
-    version = document.need("version", f": write version = {FORMAT_VERSION}")
-    if isinstance(version, bool) or version != FORMAT_VERSION:
-        document.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
+    document.check_format(CASE_FORMAT)
     folder = path.parent
     if ("image" in document) == ("surfaces" in document):
         both = "image" in document

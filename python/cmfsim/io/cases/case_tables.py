@@ -58,6 +58,11 @@ def file_of(table: Table, key: str, folder: Path) -> Path:
     return table.path(key, folder)
 
 
+def _stated(**values: Any) -> dict[str, Any]:
+    """Those of some values that the table states; the others have their defaults."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def file_or_none(table: Table, key: str, folder: Path) -> Path | None:
     """The file that a key names, or None where the key is missing."""
     return file_of(table, key, folder) if key in table else None
@@ -82,18 +87,11 @@ def output_folder(table: Table, folder: Path) -> Path:
 
 def image_of(table: Table, folder: Path) -> CaseImage:
     """The image of [image], with how its values become HU."""
-    table.only(
-        "file",
-        "skin_threshold",
-        "bone_threshold",
-        "metal_threshold",
-        "working_spacing",
-        "series",
-        "rescale",
-    )
-    skin = table.number("skin_threshold", "HU", low=-1024.0, high=3071.0)
-    bone = table.number("bone_threshold", "HU", low=-1024.0, high=3071.0)
-    metal = table.number("metal_threshold", "HU", low=-1024.0, high=MOST_HU)
+    thresholds = ("skin_threshold", "bone_threshold", "metal_threshold")
+    table.only("file", *thresholds, "working_spacing", "series", "rescale")
+    skin = table.number("skin_threshold", "HU", -1024.0, 3071.0)
+    bone = table.number("bone_threshold", "HU", -1024.0, 3071.0)
+    metal = table.number("metal_threshold", "HU", -1024.0, MOST_HU)
     if skin is not None and bone is not None and skin >= bone:
         table.fail(
             "skin_threshold", f"is {skin:g}, bone_threshold is {bone:g}: the former must be smaller"
@@ -103,8 +101,7 @@ def image_of(table: Table, folder: Path) -> CaseImage:
             "bone_threshold",
             f"is {bone:g}, metal_threshold is {metal:g}: the former must be smaller",
         )
-    low, high = WORKING_SPACINGS
-    spacing = table.number("working_spacing", "mm", low=low, high=high)
+    spacing = table.number("working_spacing", "mm", *WORKING_SPACINGS)
     path = file_of(table, "file", folder)
     return CaseImage(path, skin, bone, spacing, metal, _dicom_series(table), _rescale(table))
 
@@ -212,7 +209,7 @@ def region_of(table: Table) -> Region:
     with table.at("lower"):
         return Region(
             plane,
-            table.number("posterior_depth", "mm", low=-200.0, high=200.0),
+            table.number("posterior_depth", "mm", -200.0, 200.0),
             table.number("lower", "mm"),
             table.number("upper", "mm"),
         )
@@ -221,54 +218,42 @@ def region_of(table: Table) -> Region:
 def mesh_of(table: Table, folder: Path) -> CaseMesh:
     """The edge lengths of [mesh], or its own mesh."""
     table.only("edge_length", "refine", "cleft", "parting", "file")
-    low, high = EDGE_LENGTHS
-    edge_length = table.number("edge_length", "mm", low=low, high=high)
-    cleft = table.number("cleft", "mm", low=0.0, high=MOST_CLEFT)
-    parting = table.table("parting").only("surface") if "parting" in table else None
-    default = CaseMesh()
-    return CaseMesh(
-        default.edge_length if edge_length is None else edge_length,
-        table.flag("refine", default=default.refine),
-        default.cleft if cleft is None else cleft,
-        None if parting is None else file_of(parting, "surface", folder),
-        file_or_none(table, "file", folder),
+    given = _stated(
+        edge_length=table.number("edge_length", "mm", *EDGE_LENGTHS),
+        cleft=table.number("cleft", "mm", 0.0, MOST_CLEFT),
+        file=file_or_none(table, "file", folder),
     )
+    if "parting" in table:
+        given["parting"] = file_of(table.table("parting").only("surface"), "surface", folder)
+    return CaseMesh(refine=table.flag("refine", default=CaseMesh().refine), **given)
 
 
 def lips_of(document: Table, folder: Path) -> CaseLips:
     """Whether and where lips are separated; a seam is a way to find it, or a surface."""
     table = document.table("lips").only("contact", "seam", "depth", "height")
-    default = CaseLips()
-    contact = table.flag("contact", default=default.contact)
-    seam: Path | str = default.seam
+    given = _stated(
+        contact=table.flag("contact", default=CaseLips().contact),
+        depth=table.number("depth", "mm", 0.0, MOST_LIP_DEPTH),
+        height=table.number("height", "mm", *LIP_HEIGHTS),
+    )
     if "seam" in table:
-        seam = table.text("seam")
-        if seam not in LIP_SEAMS:
-            seam = file_of(table, "seam", folder)
+        given["seam"] = table.text("seam")
+        if given["seam"] not in LIP_SEAMS:
+            given["seam"] = file_of(table, "seam", folder)
             if "parting" in document.table("mesh"):
                 table.fail("seam", "is a surface, as is parting in [mesh]: give one of them")
-    depth = table.number("depth", "mm", low=0.0, high=MOST_LIP_DEPTH)
-    low, high = LIP_HEIGHTS
-    height = table.number("height", "mm", low=low, high=high)
-    return CaseLips(
-        contact,
-        seam,
-        default.depth if depth is None else depth,
-        default.height if height is None else height,
-    )
+    return CaseLips(**given)
 
 
 def band_of(document: Table, folder: Path) -> CaseBand:
     """Whether a band is asked for, and by which calibration."""
     table = document.table("band").only("calibration", "coverage", "group")
-    low, high = COVERAGES
-    coverage = table.number("coverage", low=low, high=high)
-    return CaseBand(
-        asked="band" in document,
+    given = _stated(
         calibration=file_or_none(table, "calibration", folder),
-        coverage=CaseBand().coverage if coverage is None else coverage,
+        coverage=table.number("coverage", "", *COVERAGES),
         group=table.text("group") if "group" in table else None,
     )
+    return CaseBand(asked="band" in document, **given)
 
 
 def node_kinds_of(table: Table) -> dict[str, Any]:
@@ -286,7 +271,7 @@ def _plain(table: Table) -> dict[str, Any]:
 def tissue_of(table: Table) -> TissueData | None:
     """The fat that the table states; None if it states none."""
     table.only("preset", "young", "poisson")
-    young = table.number("young", "MPa", low=YOUNG_RANGE[0], high=YOUNG_RANGE[1])
+    young = table.number("young", "MPa", *YOUNG_RANGE)
     poisson = table.number("poisson", above=-1.0, high=0.4999)
     if "preset" in table:
         if young is not None or poisson is not None:
@@ -308,18 +293,18 @@ def muscles_of(table: Table, folder: Path) -> CaseMuscles:
     template: Path | str = table.text("template", str(default.template))
     if template != default.template:
         template = file_of(table, "template", folder)
-    smoothing = table.number("smoothing", low=0.0, high=1e6)
-    blur = table.number("blur", "mm", low=0.0, high=MOST_BLUR)
     return CaseMuscles(
         template,
-        default.smoothing if smoothing is None else smoothing,
-        table.text("preset", default.preset, PRESETS),
-        table.text("mixing", default.mixing, MIXINGS),
-        table.whole("samples", default.samples, *SAMPLES),
-        table.whole("seed", default.seed, 0, 2**63 - 1),
-        _muscle_moduli(table),
-        table.flag("fit", default=default.fit),
-        default.blur if blur is None else blur,
+        preset=table.text("preset", default.preset, PRESETS),
+        mixing=table.text("mixing", default.mixing, MIXINGS),
+        samples=table.whole("samples", default.samples, *SAMPLES),
+        seed=table.whole("seed", default.seed, 0, 2**63 - 1),
+        moduli=_muscle_moduli(table),
+        fit=table.flag("fit", default=default.fit),
+        **_stated(
+            smoothing=table.number("smoothing", "", 0.0, 1e6),
+            blur=table.number("blur", "mm", 0.0, MOST_BLUR),
+        ),
     )
 
 
@@ -328,8 +313,7 @@ def _muscle_moduli(table: Table) -> TissueModuli:
     each = table.table("moduli")
 
     def given(table: Table) -> MuscleModuli:
-        low, high = YOUNG_RANGE
-        along, across = (table.number(key, "MPa", low=low, high=high) for key in MODULI[:2])
+        along, across = (table.number(key, "MPa", *YOUNG_RANGE) for key in MODULI[:2])
         poisson = table.number("poisson", above=-1.0, high=MOST_POISSON)
         return MuscleModuli(along, across, poisson)
 
@@ -374,16 +358,11 @@ def solver_of(table: Table) -> SolverOptions:
     """The options of [solver]."""
     names = tuple(SolverOptions().as_dict())
     table.only(*names)
+    texts = {"method": METHODS, "contact": CONTACTS, "element": ELEMENTS, "kinematics": KINEMATICS}
     given: dict[str, Any] = {}
     for key in table:
-        if key == "method":
-            given[key] = table.text(key, choices=METHODS)
-        elif key == "contact":
-            given[key] = table.text(key, choices=CONTACTS)
-        elif key == "element":
-            given[key] = table.text(key, choices=ELEMENTS)
-        elif key == "kinematics":
-            given[key] = table.text(key, choices=KINEMATICS)
+        if key in texts:
+            given[key] = table.text(key, choices=texts[key])
         else:
             given[key] = table.plain(key)
             with table.at(key):

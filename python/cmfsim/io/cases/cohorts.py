@@ -7,7 +7,7 @@ from pathlib import Path
 from cmfsim.errors import CaseInputError
 from cmfsim.io.cases.case_files import CASE_FILE
 from cmfsim.io.cases.tables import CaseChanges, read_tables
-from cmfsim.io.files.reading_writing import FORMAT_VERSION, is_there
+from cmfsim.io.files.reading_writing import is_there
 from cmfsim.values.checks import as_text, check_one_of
 from cmfsim.values.prediction import MODELS
 
@@ -88,12 +88,7 @@ class Cohort:
         document = read_tables(path).only(
             "format", "version", "name", "note", "models", "cases", "output"
         )
-        found = document.text("format")
-        if found != COHORT_FORMAT:
-            document.fail("format", f"is {found!r}: {COHORT_FORMAT!r} is needed")
-        version = document.need("version", f": write version = {FORMAT_VERSION}")
-        if isinstance(version, bool) or version != FORMAT_VERSION:
-            document.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
+        document.check_format(COHORT_FORMAT)
         models = document.plain("models") if "models" in document else list(MODELS)
         if not isinstance(models, list) or not models or set(models) - set(MODELS):
             document.fail("models", f"is {models!r}: a list of {', '.join(MODELS)} is needed")

@@ -16,6 +16,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files.reading_writing import (
+    FORMAT_VERSION,
     LINE_IN_MESSAGE,
     check_numbers,
     check_plain_toml,
@@ -292,6 +293,15 @@ class Table:
             self.fail(None, f"lacks {key!r}{why}")
         return self._values[key]
 
+    def check_format(self, name: str) -> None:
+        """Refuses another format than this, or another version of it."""
+        found = self.text("format")
+        if found != name:
+            self.fail("format", f"is {found!r}: {name!r} is needed")
+        version = self.need("version", f": write version = {FORMAT_VERSION}")
+        if isinstance(version, bool) or version != FORMAT_VERSION:
+            self.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
+
     def text(self, key: str, default: str | None = None, choices: tuple[str, ...] = ()) -> str:
         """A text that is not empty, among the choices if there are any."""
         value = self.need(key) if default is None else self._values.get(key, default)
@@ -313,10 +323,10 @@ class Table:
         self,
         key: str,
         unit: str = "",
-        *,
-        above: float | None = None,
         low: float | None = None,
         high: float | None = None,
+        *,
+        above: float | None = None,
     ) -> float | None:
         """A finite number within its range; None where it is absent."""
         if key not in self._values:

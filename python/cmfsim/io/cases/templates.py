@@ -195,7 +195,7 @@ def _survey_folder(folder: Path, gathered: _Gathered) -> TemplateData | None:
     with gathered.at("correct the line"):
         table.only(*KEYS)
     with gathered.at(f'write format = "{TEMPLATE_FORMAT}"'):
-        _check_format(table)
+        table.check_format(TEMPLATE_FORMAT)
     with gathered.at('state its terms of use: licence = "…"'):
         given["licence"] = table.text("licence")
     with gathered.at("correct the line"):
@@ -233,15 +233,6 @@ def _survey_folder(folder: Path, gathered: _Gathered) -> TemplateData | None:
     return None
 
 
-def _check_format(table: Table) -> None:
-    found = table.text("format")
-    if found != TEMPLATE_FORMAT:
-        table.fail("format", f"is {found!r}: {TEMPLATE_FORMAT!r} is needed")
-    version = table.need("version", f": write version = {FORMAT_VERSION}")
-    if isinstance(version, bool) or version != FORMAT_VERSION:
-        table.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
-
-
 def _file(table: Table, key: str, folder: Path) -> Path:
     """A file inside the template's folder: a template may come from a stranger."""
     name = table.text(key)
@@ -262,7 +253,7 @@ def _surface(table: Table, key: str, folder: Path, units: str, frame: str) -> Su
 
 def _muscle(table: Table, folder: Path, units: str, frame: str) -> MuscleSurface:
     table.only(*MUSCLE_KEYS)
-    boxes = table.number("boxes", low=1, high=MOST_BOXES)
+    boxes = table.number("boxes", "", 1, MOST_BOXES)
     if boxes is not None and boxes != int(boxes):
         table.fail("boxes", f"is {boxes:g}: a whole number is needed")
     name = table.text("name")
