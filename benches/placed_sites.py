@@ -19,8 +19,7 @@ from cmfsim.io import read_landmark_file, read_surface
 from cmfsim.pipeline.filling import filled_landmarks
 from cmfsim.pipeline.proposing import ProposedHead
 from cmfsim.values.landmark_sites import JAW_SITES
-from cmfsim.values.proposed_landmarks import ProposedLandmarks
-from cmfsim.values.site_states import SiteState
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, SiteState
 from marked import publish
 
 NAME = "benches/placed_sites.py"

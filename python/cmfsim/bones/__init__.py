@@ -1,8 +1,13 @@
 """Bone segments from bones: cutting planes, standard procedures, the pieces and their surfaces."""
 
 from cmfsim.bones.contact_sheets import ContactSheet, SheetOptions, contact_sheet, sheet_departure
-from cmfsim.bones.cuts.cutting import CutBones, CutOptions, cut_bones, segments_from_surfaces
-from cmfsim.bones.cuts.parting import part_segment
+from cmfsim.bones.cuts.cutting import (
+    CutBones,
+    CutOptions,
+    cut_bones,
+    part_segment,
+    segments_from_surfaces,
+)
 from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure, free_cut
 from cmfsim.bones.cuts.procedures import PROCEDURES, place_procedure, procedure_options
 from cmfsim.bones.segment_checks import check_segments

@@ -26,6 +26,7 @@ from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import (
     Floats,
+    Frozen,
     as_floats,
     as_positive,
     as_text,
@@ -33,7 +34,6 @@ from cmfsim.values.checks import (
     check_one_of,
     frozen,
 )
-from cmfsim.values.frozen import Frozen
 from cmfsim.values.motion import RigidMotion, carried, decompose_motion, rigid_matrix
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 

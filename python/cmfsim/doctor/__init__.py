@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from cmfsim.doctor.evidence import gather
-from cmfsim.doctor.lips import check_lips
 from cmfsim.doctor.report import findings_text
 from cmfsim.doctor.sites.landmarks import check_automatic
 from cmfsim.doctor.sites.placement import check_placement
@@ -23,7 +22,7 @@ from cmfsim.doctor.surgery.operation import check_cuts, check_plan, pieces_of, v
 from cmfsim.doctor.surgery.plan import state_plan
 from cmfsim.doctor.surgery.plan_size import SizedMotion, check_motion_size
 from cmfsim.doctor.surgery.postoperative import check_after
-from cmfsim.doctor.tissue_ends import check_ends
+from cmfsim.doctor.tissue_ends import check_ends, check_lips
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import SEVERITIES, Finding

@@ -32,8 +32,7 @@ from cmfsim.pipeline.predicting import named_models, predictions_of
 from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
-from cmfsim.values.finding import Finding, OnFindings
-from cmfsim.values.finding_groups import grouped
+from cmfsim.values.finding import Finding, OnFindings, grouped
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import SurfaceData

@@ -18,12 +18,13 @@ from cmfsim.registration.site_covariance import (
 )
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, site_part
-from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
-from cmfsim.values.site_states import (
+from cmfsim.values.proposed_landmarks import (
     CLEARED_SHARE,
     GOOD_ERROR,
     MOST_ERROR,
     SURFACE_REACH,
+    ProposedLandmarks,
+    ProposedSite,
     SiteState,
 )
 from cmfsim.values.surface_data import SurfaceData

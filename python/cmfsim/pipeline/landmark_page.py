@@ -13,8 +13,7 @@ from cmfsim.planning.landmark_page import (
 )
 from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.site_covariance import PLACED_STD, SiteDistribution
-from cmfsim.values.proposed_landmarks import ProposedLandmarks
-from cmfsim.values.site_states import SiteState
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, SiteState
 
 PAGE_FILE = "landmarks.html"
 

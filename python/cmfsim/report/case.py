@@ -9,8 +9,7 @@ from cmfsim.report.causes import not_operated_blocks, statistics_table, thicknes
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MEASURES, MESH, MUSCLES, labelled
 from cmfsim.values.clinical_motion import plan_lines
-from cmfsim.values.finding import Finding
-from cmfsim.values.finding_groups import counted, grouped
+from cmfsim.values.finding import Finding, counted, grouped
 
 Values = Mapping[str, Any]
 

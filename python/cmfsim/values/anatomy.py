@@ -13,11 +13,11 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import (
+    Frozen,
     as_text,
     check_instance,
 )
 from cmfsim.values.finding import Finding
-from cmfsim.values.frozen import Frozen
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.case_region import Plane
-from cmfsim.values.checks import Floats, as_text, check_one_of
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen, as_text, check_one_of
 from cmfsim.values.moduli import TissueModuli
 from cmfsim.values.tissue_data import DEFAULT_PRESET
 

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, as_direction, as_point, as_rows
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen, as_direction, as_point, as_rows
 
 # Distance of the posterior plane behind the roots of the zygomatic arches, mm: behind the whole
 # ramus and its joint, so that the jaw moves inside tissue, and before the mastoid and neck.

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import (
     Floats,
+    Frozen,
     as_point,
     as_rows,
     as_unmasked,
 )
-from cmfsim.values.frozen import Frozen
 
 # Points that are looked up at a time.
 AT_A_TIME = 8192

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import SurfaceMotion
-from cmfsim.values.checks import Floats, Indices
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen, Indices
 from cmfsim.values.scene import SegmentData
 from cmfsim.values.surface_data import MovedSurface
 

@@ -7,8 +7,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.values.checks import frozen
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Frozen, frozen
 
 LIPS = ("upper", "lower")
 

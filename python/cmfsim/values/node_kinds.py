@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import (
+    Frozen,
     check_one_of,
     frozen,
 )
-from cmfsim.values.frozen import Frozen
 
 # Kinds of node (paper 2.5), by the number that files hold.
 NODE_KINDS = ("free", "fixed", "joined", "sliding")

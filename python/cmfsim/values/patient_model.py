@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.anatomy import Anatomy, BoneSegment
-from cmfsim.values.checks import Floats, Indices
+from cmfsim.values.checks import Floats, Frozen, Indices, listing
 from cmfsim.values.finding import Finding, counted_findings
-from cmfsim.values.frozen import Frozen, listing
 from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NodeKinds

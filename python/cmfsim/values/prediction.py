@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, check_one_of
+from cmfsim.values.checks import Floats, Frozen, check_one_of, listing
 from cmfsim.values.finding import Finding, counted_findings
-from cmfsim.values.frozen import Frozen, listing
 from cmfsim.values.model_names import MODELS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene, SceneResult

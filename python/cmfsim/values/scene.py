@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import (
     Floats,
+    Frozen,
     Indices,
     as_floats,
     as_index_rows,
@@ -28,8 +29,8 @@ from cmfsim.values.checks import (
     check_instance,
     check_one_of,
     frozen,
+    listing,
 )
-from cmfsim.values.frozen import Frozen, listing
 from cmfsim.values.motion import carried, rigid_matrix
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.surface_data import MovedSurface, SurfaceData

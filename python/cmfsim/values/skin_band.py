@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.values.calibration import BandFactor, settings_digest
-from cmfsim.values.checks import Floats
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen
 
 # The region that holds the others: what lies in none of them has its factor.
 WHOLE_FACE = "face"

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, SurfaceMotion
-from cmfsim.values.checks import Floats, as_rows
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen, as_rows
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
 

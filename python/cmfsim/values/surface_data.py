@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, Indices, as_index_rows, as_number, as_rows
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen, Indices, as_index_rows, as_number, as_rows
 
 
 @dataclass(frozen=True, eq=False)

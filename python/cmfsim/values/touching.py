@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.values.checks import Indices, as_index_rows, as_indices, as_text, check_instance
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Frozen, Indices, as_index_rows, as_indices, as_text, check_instance
 from cmfsim.values.surface_data import SurfaceData
 
 

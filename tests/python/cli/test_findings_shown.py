@@ -10,8 +10,7 @@ import cmfsim.pipeline.predicting
 from cmfsim.cli import main
 from cmfsim.cli.text.notices import Notices
 from cmfsim.report import case_document, render_page
-from cmfsim.values.finding import Finding
-from cmfsim.values.finding_groups import counted, grouped
+from cmfsim.values.finding import Finding, counted, grouped
 from head_case import HeadCase
 
 pytest.importorskip("meshio")

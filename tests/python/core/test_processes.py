@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Frozen
 
 HERE = Path(__file__).parents[1]
 # A deadlock never ends; on an idle machine the tasks take a few seconds.

@@ -12,7 +12,7 @@ from cmfsim.cli import main
 from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.muscles import check_muscles
 from cmfsim.surfaces.topology import edges_of
-from cmfsim.values.reference_places import REFERENCE_PLACES
+from cmfsim.values.landmark_sites import REFERENCE_PLACES
 from head_case import HeadCase
 
 DATA = Path(os.environ.get("CMFSIM_DATA") or Path(__file__).parents[4] / "shared/data")

@@ -15,7 +15,7 @@ from cmfsim.doctor.sites import landmarks as checks
 from cmfsim.doctor.sites.places import direction_text, shift_text
 from cmfsim.registration import mirror_agreement, swapped_names
 from cmfsim.surfaces.levels import surface_of_level
-from cmfsim.values.reference_places import REFERENCE_PLACES
+from cmfsim.values.landmark_sites import REFERENCE_PLACES
 from head_case import HeadCase
 
 SIDES = [sign * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]

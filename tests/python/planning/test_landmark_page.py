@@ -15,8 +15,7 @@ from cmfsim.pipeline.proposing import ProposedHead
 from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.site_covariance import PLACED_STD
 from cmfsim.values.landmark_sites import site_part
-from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
-from cmfsim.values.site_states import SiteState, site_state
+from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite, SiteState, site_state
 
 pytest.importorskip("fast_simplification")
 

@@ -19,7 +19,6 @@ OUTSIDE = {"scipy", "skimage", "SimpleITK", "meshio", "matplotlib", "pyvista", "
 MUSCLES = {
     "cmfsim.values.musculature",
     "cmfsim.muscles.template",
-    "cmfsim.values.template",
     "cmfsim.muscles.equivalent",
     "cmfsim.pipeline.building.tissue.muscles",
     "cmfsim.doctor.muscles",

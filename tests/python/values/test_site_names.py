@@ -17,7 +17,7 @@ from cmfsim.values.landmark_sites import (
     site_labels,
     site_part,
 )
-from cmfsim.values.site_states import ORIGINS, SiteState, site_state
+from cmfsim.values.proposed_landmarks import ORIGINS, SiteState, site_state
 
 ROOT = Path(__file__).parents[3]
 KINDS = {"skull": tuple(SKULL_LANDMARKS), "skin": SKIN_LANDMARKS}

@@ -13,9 +13,8 @@ from cmfsim._core import rigid_fit
 from cmfsim.errors import LandmarkInputError
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
-from cmfsim.values.landmark_sites import is_lower_site
+from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site
 from cmfsim.values.motion import carried
-from cmfsim.values.reference_places import REFERENCE_PLACES
 
 # The sites of each procedure. Nasion is not among those of Le Fort I: it would only state which
 # side of the plane of the upper teeth is up.

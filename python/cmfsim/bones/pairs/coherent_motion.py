@@ -23,8 +23,7 @@ from cmfsim.bones.pairs.rigid_pieces import (
     median,
     rigid_pieces,
 )
-from cmfsim.values.checks import Floats
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface
 from cmfsim.errors import RegistrationInputError
-from cmfsim.values.checks import Floats, frozen
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen, frozen
 from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 

@@ -6,8 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from cmfsim.cli.text.terminal import CLEAR_LINE, escaped, in_colour
-from cmfsim.values.finding import Finding
-from cmfsim.values.finding_groups import FindingGroup, counted, grouped
+from cmfsim.values.finding import Finding, FindingGroup, counted, grouped
 
 # ANSI colours of what is printed.
 COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}

@@ -22,7 +22,7 @@ from cmfsim.registration import (
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
-from cmfsim.values.reference_places import REFERENCE_PLACES
+from cmfsim.values.landmark_sites import REFERENCE_PLACES
 
 # The closest points on a surface of (n, 3) points, mm.
 Nearest = Callable[[Floats], Floats]

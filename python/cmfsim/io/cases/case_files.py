@@ -42,8 +42,7 @@ from cmfsim.values.case_parts import (
     CaseSurfaces,
 )
 from cmfsim.values.case_region import Region
-from cmfsim.values.checks import as_text
-from cmfsim.values.frozen import listing
+from cmfsim.values.checks import as_text, listing
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import TissueData
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.values.checks import Floats
-from cmfsim.values.musculature import MuscleSurface
+from cmfsim.values.musculature import MuscleSurface, TemplateData
 from cmfsim.values.surface_data import SurfaceData
-from cmfsim.values.template import TemplateData
 
 TEMPLATE_FORMAT = "cmfsim-template"
 # The factors by which a place is mirrored to the other side.

@@ -30,9 +30,8 @@ from cmfsim.io.landmarks.markups import read_curves, write_curves
 from cmfsim.io.surfaces import read_surface, write_surface
 from cmfsim.values.case_parts import FRAMES, UNITS
 from cmfsim.values.finding import Finding
-from cmfsim.values.musculature import MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface
+from cmfsim.values.musculature import MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface, TemplateData
 from cmfsim.values.surface_data import SurfaceData
-from cmfsim.values.template import TemplateData
 
 TEMPLATE_FILE = "template.toml"
 KEYS = (

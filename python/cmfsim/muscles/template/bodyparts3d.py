@@ -37,10 +37,9 @@ from cmfsim.surfaces.repair import RepairOptions, clean_surface, repair_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
-from cmfsim.values.musculature import MuscleSurface
+from cmfsim.values.musculature import MuscleSurface, as_landmarks
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData, joined_surface
-from cmfsim.values.template import as_landmarks
 
 # Vertices that the tip of temporalis is the mean of; its tendon ends broadly.
 TIP_VERTICES = 20

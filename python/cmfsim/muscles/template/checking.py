@@ -14,8 +14,7 @@ from cmfsim.surfaces.repair import clean_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
-from cmfsim.values.musculature import MuscleSurface
-from cmfsim.values.template import TemplateData
+from cmfsim.values.musculature import MuscleSurface, TemplateData
 
 # Longest extents of a skull or its face, mm: from the facial skeleton alone to a head with neck.
 SKULL_EXTENT = (90.0, 400.0)

@@ -22,9 +22,8 @@ from cmfsim.registration import (
 from cmfsim.values.checks import Floats, as_number
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import is_lower_site
-from cmfsim.values.musculature import MuscleSurface, Musculature
+from cmfsim.values.musculature import MuscleSurface, Musculature, TemplateData
 from cmfsim.values.surface_data import SurfaceData
-from cmfsim.values.template import TemplateData
 
 # How many landmarks a finding lists.
 MOST_NAMES = 6

@@ -12,7 +12,7 @@ from cmfsim.muscles.template.built_in import template_path
 from cmfsim.muscles.template.checking import check_contents
 from cmfsim.muscles.template.morphing import MorphedMusculature, morph_template
 from cmfsim.values.finding import Finding
-from cmfsim.values.template import TemplateData
+from cmfsim.values.musculature import TemplateData
 
 
 class MuscleTemplate(TemplateData):

@@ -33,7 +33,7 @@ from cmfsim.values.case_parts import CaseMesh, CaseMotion
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.progress import Progress
-from cmfsim.values.site_states import SiteState, site_state
+from cmfsim.values.proposed_landmarks import SiteState, site_state
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from cmfsim.values.landmark_sites import (
     site_labels,
     site_part,
 )
-from cmfsim.values.site_states import CLEARED_SHARE, GOOD_ERROR, SURFACE_REACH, SiteState
+from cmfsim.values.proposed_landmarks import CLEARED_SHARE, GOOD_ERROR, SURFACE_REACH, SiteState
 from cmfsim.values.surface_data import SurfaceData
 
 # Degrees as in camera.js (azimuth 0 from the front, 90 from the patient's left; elevation 90 from

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from cmfsim.errors import LandmarkInputError
-from cmfsim.values.checks import Floats, as_text, check_instance
-from cmfsim.values.frozen import Frozen
+from cmfsim.values.checks import Floats, Frozen, as_text, check_instance
 from cmfsim.values.surface_data import SurfaceData
 
 

@@ -22,9 +22,8 @@ from cmfsim.pipeline.building.surgery.postoperative import (
 )
 from cmfsim.surfaces.repair import clean_surface
 from cmfsim.values.anatomy import BoneSegment
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, frozen_mapping
 from cmfsim.values.finding import Finding
-from cmfsim.values.frozen import frozen_mapping
 from cmfsim.values.surface_data import MovedSurface, SurfaceData, joined_surface
 
 if TYPE_CHECKING:

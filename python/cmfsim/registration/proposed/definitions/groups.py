@@ -6,8 +6,7 @@ import numpy as np
 
 from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
-from cmfsim.values.landmark_sites import JAW_SITES
-from cmfsim.values.reference_places import REFERENCE_PLACES
+from cmfsim.values.landmark_sites import JAW_SITES, REFERENCE_PLACES
 
 # The distance at which a site counts half in the fit, mm.
 HALF_DISTANCE = 5.0
