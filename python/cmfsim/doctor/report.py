@@ -29,10 +29,6 @@ def findings_text(
         Columns at which lines wrap; 0 keeps each finding's parts on one line.
     escape : callable
         Makes a text from a file harmless for the terminal.
-
-    Returns
-    -------
-    str
     """
     findings = list(findings)
     lines: list[str] = []

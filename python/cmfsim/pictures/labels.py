@@ -103,10 +103,6 @@ def label_places(points: ArrayLike, names: Sequence[str], size: tuple[float, flo
     names : sequence of str
     size : (float, float)
         Of the view, pixels.
-
-    Returns
-    -------
-    LabelPlaces
     """
     at = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     width, height = size

@@ -31,12 +31,7 @@ class SkinEnds:
 
 
 def skin_ends(skin: SurfaceData) -> SkinEnds:
-    """The ends of a skin, short of its ragged rim; of one a few edges across nothing is left off.
-
-    Parameters
-    ----------
-    skin : SurfaceData
-    """
+    """The ends of a skin, short of its ragged rim; of one a few edges across nothing is cut."""
     vertices, triangles = skin.vertices, skin.triangles
     edge = float(np.median(np.linalg.norm(np.diff(vertices[triangles[:, :2]], axis=1), axis=2)))
     low, high = vertices.min(axis=0), vertices.max(axis=0)

@@ -108,10 +108,6 @@ def site_covariance(proposal: ProposedLandmarks, bone: Floats) -> SiteDistributi
     bone : (n, 3) float64, mm
         Vertices of the bones.
 
-    Returns
-    -------
-    SiteDistribution
-
     Notes
     -----
     A normal distribution of shapes with smooth deviations (Lüthi, Gerig, Jud & Vetter 2018,

@@ -66,10 +66,6 @@ def case_document(
     left_out : str
         What does not belong to these predictions and is missing for that.
 
-    Returns
-    -------
-    Document
-
     Raises
     ------
     CaseError

@@ -44,12 +44,7 @@ def not_operated_blocks(evaluation: Values) -> list[Note | Table]:
 
 
 def thickness_blocks(evaluation: Values) -> list[Note | Table]:
-    """The mean errors with the fitted change of thickness; nothing where none was fitted.
-
-    Parameters
-    ----------
-    evaluation : mapping
-    """
+    """The mean errors with the fitted change of thickness; nothing where none was fitted."""
     found = evaluation.get("thickness")
     if found is None:
         return []

@@ -12,14 +12,6 @@ DISCLAIMER = "Research software, not a medical device. Not for diagnosis or trea
 def render_page(document: Document) -> str:
     """The page of a report: all text escaped, pictures inside, no scripts, no addresses.
 
-    Parameters
-    ----------
-    document : Document
-
-    Returns
-    -------
-    str
-
     Raises
     ------
     CaseError

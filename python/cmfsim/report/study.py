@@ -33,10 +33,6 @@ def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document
     study : mapping
         `StudyReport.as_dict()`.
     figures : sequence of Figure
-
-    Returns
-    -------
-    Document
     """
     models = tuple(study["models"])
     done = [case for case in study["cases"] if case["status"] != "failed"]
@@ -67,10 +63,6 @@ def table3_text(study: Values, table: ErrorTable) -> str:
         `StudyReport.as_dict()`.
     table : ErrorTable
         Of the same study.
-
-    Returns
-    -------
-    str
     """
     models = tuple(study["models"])
     blocks = [f"# {plain_line(study['cohort'])}: errors by patient and model"]

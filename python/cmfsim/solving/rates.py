@@ -217,10 +217,6 @@ def skin_rates(
     solution : Solution
         Of the scene's plan.
 
-    Returns
-    -------
-    SkinRates
-
     Raises
     ------
     CaseError

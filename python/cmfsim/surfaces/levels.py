@@ -264,10 +264,6 @@ def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> S
     max_triangles : int
         A surface that has no more is given back as it is.
 
-    Returns
-    -------
-    SurfaceData
-
     Raises
     ------
     CaseError

@@ -121,10 +121,6 @@ def coherent_motion(motion: MovedSurface) -> CoherentMotion:
     motion : MovedSurface
         Without triangles that have no area (`sound_motion`).
 
-    Returns
-    -------
-    CoherentMotion
-
     Raises
     ------
     BoundaryError

@@ -173,10 +173,6 @@ def fit_shape(
     most_points : int
         Vertices used in the fit.
 
-    Returns
-    -------
-    ShapeFit
-
     Raises
     ------
     RegistrationError

@@ -235,10 +235,6 @@ CaseOrPath: TypeAlias = Case | str | os.PathLike[str]
 def as_case(case: CaseOrPath) -> Case:
     """The case itself, or the one that the file or folder at a path describes.
 
-    Parameters
-    ----------
-    case : Case or path
-
     Raises
     ------
     FileNotFoundError, CaseError

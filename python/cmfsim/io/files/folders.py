@@ -112,10 +112,6 @@ def finish_writing(folder: Path) -> None:
     What a stranger put there under such a name can neither lead out of the folder nor keep a run
     from working.
 
-    Parameters
-    ----------
-    folder : Path
-
     Raises
     ------
     OSError

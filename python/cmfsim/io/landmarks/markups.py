@@ -187,10 +187,6 @@ def read_curves(path: str | os.PathLike[str]) -> tuple[Floats, ...]:
     A closed curve ends where it starts. A file that states no frame is read as LPS, as Slicer's
     schema says.
 
-    Parameters
-    ----------
-    path : path
-
     Returns
     -------
     tuple of (n, 3) float64, mm

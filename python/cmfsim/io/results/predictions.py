@@ -50,10 +50,6 @@ def is_result_file(name: str) -> bool:
 def read_prediction(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """What `prediction.json` in a folder holds, which `write_prediction` wrote there.
 
-    Parameters
-    ----------
-    folder : path
-
     Returns
     -------
     dict of str to plain values

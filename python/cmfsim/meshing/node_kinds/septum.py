@@ -80,10 +80,6 @@ def septum(
         is no septum: it lies up to 15 mm off the bone, where the noise of a triangle's rotation
         would move it by millimetres.
 
-    Returns
-    -------
-    Septum
-
     Notes
     -----
     Cartilage (2.7 MPa; Griffin et al. 2016) is a thousand times as stiff as fat, so the septum

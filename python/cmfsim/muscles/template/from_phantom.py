@@ -40,10 +40,6 @@ def phantom_template(
     progress : callable, optional
         Is told what is made.
 
-    Returns
-    -------
-    MuscleTemplate
-
     Raises
     ------
     ImportError

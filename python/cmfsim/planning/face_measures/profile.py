@@ -56,10 +56,6 @@ def midline_profile(surface: SurfaceData, landmarks: Mapping[str, ArrayLike]) ->
     landmarks : mapping of str to (3,) float64, mm
         On the skin; two or more of `MIDLINE`.
 
-    Returns
-    -------
-    MidlineProfile
-
     Raises
     ------
     LandmarkError

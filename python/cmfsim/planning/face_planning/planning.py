@@ -77,10 +77,6 @@ def bounded_least_squares(
     start, low, high : (n,) float64
     steps : int
         Maximum number of steps.
-
-    Returns
-    -------
-    Minimum
     """
     x = np.clip(start, low, high)
     r = residuals(x)

@@ -127,10 +127,6 @@ def landmark_content(
     built_for : str
         The state of the case.
 
-    Returns
-    -------
-    LandmarkContent
-
     Raises
     ------
     CaseError

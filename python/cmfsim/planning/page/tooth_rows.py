@@ -69,14 +69,6 @@ class ToothRows:
 def tooth_rows(patient: PatientModel) -> ToothRows:
     """The tooth rows of a patient.
 
-    Parameters
-    ----------
-    patient : PatientModel
-
-    Returns
-    -------
-    ToothRows
-
     Raises
     ------
     CaseError

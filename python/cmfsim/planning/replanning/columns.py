@@ -61,14 +61,6 @@ class PlanColumns:
 def plan_columns(operator: PlanOperator) -> PlanColumns:
     """The columns of an operator with their centres, checked against its displacements.
 
-    Parameters
-    ----------
-    operator : PlanOperator
-
-    Returns
-    -------
-    PlanColumns
-
     Raises
     ------
     SolverError

@@ -140,10 +140,6 @@ def landmarks_from(
     templates : sequence of TemplateHead
         The first is the average head, in its own frame; at least one.
 
-    Returns
-    -------
-    ProposedLandmarks
-
     Raises
     ------
     LandmarkError

@@ -210,10 +210,6 @@ def write_demo_case(
     truth : Path, optional
         An archive with the face after the operation, instead of the package's own.
 
-    Returns
-    -------
-    DemoCase
-
     Raises
     ------
     CaseError

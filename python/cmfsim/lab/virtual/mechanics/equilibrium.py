@@ -143,10 +143,6 @@ def find_equilibrium(
     contact : Contact, optional
     options : EquilibriumOptions, optional
 
-    Returns
-    -------
-    Equilibrium
-
     Raises
     ------
     SolverError
