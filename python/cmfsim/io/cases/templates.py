@@ -3,13 +3,10 @@
 A survey reads as much as it can and lists everything that is wrong; reading refuses at the first.
 """
 
-import contextlib
-import glob
 import json
 import os
 import re
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +20,7 @@ from cmfsim.io.cases.template_archives import (
     read_template_archive,
     write_template_archive,
 )
-from cmfsim.io.files.leftovers import abandoned, temporary_folder
+from cmfsim.io.files.folders import PREFIX, replacing_files
 from cmfsim.io.files.reading_writing import FORMAT_VERSION, beside, is_there, named
 from cmfsim.io.landmarks.landmark_files import read_landmark_file, write_landmarks
 from cmfsim.io.landmarks.markups import read_curves, write_curves
@@ -115,8 +112,8 @@ def write_template(
 
     A report is written beside it in the folder, as `report.json`; an archive has no place for one.
 
-    A folder is written under another name first and takes its place whole. A folder that is there
-    is replaced if it holds a template and nothing else.
+    The files of a folder take their places together. A folder that is there must hold a template
+    and nothing else; files that the new one lacks go.
 
     Raises
     ------
@@ -129,11 +126,16 @@ def write_template(
     if path.suffix == ".npz":
         write_template_archive(path, template)
         return
-    with _replacing_folder(path) as fresh:
+    _refuse_foreign(path)
+
+    def fill(fresh: Path) -> list[str]:
         _write_files(fresh, template)
         if report is not None:
             text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
             (fresh / "report.json").write_text(text + "\n", encoding="utf-8", newline="\n")
+        return _names_in(fresh)
+
+    replacing_files(path, None, _is_template_file, fill, lambda: _names_in(path))
 
 
 class _Gathered:
@@ -325,46 +327,19 @@ def _toml_text(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-@contextlib.contextmanager
-def _replacing_folder(folder: Path) -> Iterator[Path]:
-    """A new folder beside `folder`, which takes its place when all went well.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) `folder` is a file, or holds what no template is written as.
-    """
-    folder = Path.cwd() / folder
-    _refuse_foreign(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    prefix = f".{folder.name}.writing-"
-    for left in abandoned(folder.parent, f"{glob.escape(prefix)}*"):
-        # Killed between the two renames below: the old folder comes back.
-        if (left / "old").exists() and not folder.exists():
-            (left / "old").replace(folder)
-        shutil.rmtree(left, ignore_errors=True)
-    with temporary_folder(folder.parent, prefix) as fresh:
-        try:
-            new, old = fresh / "new", fresh / "old"
-            new.mkdir()
-            yield new
-            if folder.exists():
-                folder.replace(old)
-            try:
-                new.replace(folder)
-            except BaseException:
-                if old.exists():
-                    old.replace(folder)
-                raise
-        finally:
-            shutil.rmtree(fresh, ignore_errors=True)
-
-
 # What templates and their reports are written as.
 TEMPLATE_FILES = re.compile(
     r"template\.toml|skull\.ply|skull\.mrk\.json|report\.json|muscles\.png|"
     r"muscle-[A-Za-z0-9_+-]+\.ply|course-[A-Za-z0-9_+-]+\.mrk\.json"
 )
+
+
+def _names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def _is_template_file(name: str) -> bool:
+    return TEMPLATE_FILES.fullmatch(name) is not None
 
 
 def _refuse_foreign(folder: Path) -> None:
@@ -373,7 +348,8 @@ def _refuse_foreign(folder: Path) -> None:
         return
     if not folder.is_dir():
         raise CaseInputError(f"{folder.name}: is a file, but a folder is to be written there")
-    foreign = sorted(p.name for p in folder.iterdir() if not TEMPLATE_FILES.fullmatch(p.name))
+    left = [name for name in _names_in(folder) if not name.startswith(PREFIX)]
+    foreign = [name for name in left if not _is_template_file(name)]
     if foreign:
         raise CaseInputError(
             f"{folder.name}: holds {foreign[0]!r} ({len(foreign)} such), which is not part of a "

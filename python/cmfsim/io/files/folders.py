@@ -25,7 +25,7 @@ UNDO = "undo.json"
 MOST_JOURNAL = 2**20
 # Files that state what the others are. Old ones go first and new ones come last, so that files of
 # two runs are never together beneath one of them.
-STATEMENTS = (".json", ".html")
+STATEMENTS = (".json", ".html", ".toml")
 
 Ours = Callable[[str], bool]
 
@@ -51,7 +51,7 @@ def replacing_files(
     All files are written next to the old ones first and then take their places; where one cannot,
     the old ones come back. Files that an earlier summary lists and the new ones have not go, and so
     do those that `stale` finds. What a killed run left is removed, or finished if only places had
-    still to be taken: until then the files that state what the others are (`.json`, `.html`) are
+    still to be taken: until then the files that state what the others are (`STATEMENTS`) are
     missing, so that nothing reads old and new files as one.
 
     Parameters
