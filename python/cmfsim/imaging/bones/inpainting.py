@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim.imaging.intensities.intensity import SOFT
 from cmfsim.imaging.morphology import Mask, Volume, ndimage, sparse
 
 # Directions over half a turn: at the rim of a head (100 mm) they are 1.3 mm apart.
@@ -27,7 +28,6 @@ LEAST_PATH = 0.05
 PLAIN = (-500.0, 350.0)
 PLAIN_SIGMA = 1.0
 ENAMEL = 2000.0
-SOFT = 40.0
 # Rays through less water than this are not normalised, mm.
 LEAST_WATER = 5.0
 # Threshold of metal, HU; the value of metal itself carries no information.

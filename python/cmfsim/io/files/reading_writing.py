@@ -1,4 +1,4 @@
-"""Shared by all readers and writers: names in errors, documents, safe replacement.
+"""Shared by all readers and writers: names in errors, documents, XML, safe replacement.
 
 Files come from strangers: paths may not lead out of a folder, sizes are checked before memory is
 taken. A file is written under a temporary name and renamed, so a run that fails leaves the old one
@@ -16,8 +16,10 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path, PurePosixPath
+from pyexpat import XMLParserType
 from types import MappingProxyType
 from typing import Any, BinaryIO
+from xml.parsers import expat
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files.leftovers import abandoned, temporary_file
@@ -392,3 +394,33 @@ def check_version(version: object) -> None:
             else "unknown version"
         )
         raise CaseInputError(f"version is {version}, this cmfsim reads {FORMAT_VERSION}; {hint}")
+
+
+def strict_parser(text: bytes, separator: str | None = None) -> XMLParserType:
+    """A parser for a text that refuses zero bytes, document types and entities.
+
+    The encoding is UTF-8 whatever the text states: nothing hides behind another one. Entities could
+    grow without bound.
+
+    Parameters
+    ----------
+    text : bytes
+        What will be parsed.
+    separator : str, optional
+        Between namespace and name; without one, namespaces are not resolved.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) The text holds zero bytes; while parsing, a document type or an entity.
+    """
+    if b"\0" in text:
+        raise CaseInputError("is not XML in UTF-8: it holds zero bytes")
+    parser = expat.ParserCreate("UTF-8", separator)
+
+    def refuse(*_: object) -> None:
+        raise CaseInputError("XML with a document type or entities is not read")
+
+    parser.StartDoctypeDeclHandler = refuse
+    parser.EntityDeclHandler = refuse
+    return parser

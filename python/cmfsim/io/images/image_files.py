@@ -19,6 +19,7 @@ from cmfsim.io.files.reading_writing import is_there, utf8_path
 from cmfsim.io.images.dicom.series import read_dicom_file, read_dicom_folder
 from cmfsim.io.images.image_grids import aligned, shear_of, turn_of, upright
 from cmfsim.io.images.image_headers import KNOWN, ImageHeader, apart
+from cmfsim.io.images.image_reading import last_line
 from cmfsim.io.images.metaimage import is_meta, meta_header
 from cmfsim.io.images.nifti import GZIP, is_nifti, read_nifti
 from cmfsim.io.images.nrrd import nrrd_header
@@ -166,19 +167,13 @@ def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
                 itk.WriteImage(written, f"{plain}/image{suffix}", useCompression=True)
             (fresh / f"image{suffix}").replace(path)
         except RuntimeError as error:
-            raise ImageError(f"{path.name}: cannot be written ({_last_line(error)})") from error
+            raise ImageError(f"{path.name}: cannot be written ({last_line(error)})") from error
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
 
 
 def _simpleitk() -> Any:
     return third_party("SimpleITK", "images are read", "imaging", ImageError)
-
-
-def _last_line(error: Exception) -> str:
-    """What ITK says of an error, without the places in its sources."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else type(error).__name__
 
 
 def _read_file(path: Path, header: ImageHeader) -> ImageFile:

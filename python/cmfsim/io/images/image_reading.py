@@ -75,7 +75,7 @@ def _read(path: str, kind: str) -> Any:
         image = reader.Execute()
     except RuntimeError as error:
         raise ImageInputError(
-            f"{name}: cannot be decoded ({_last_line(error)[:100]}): copy it again; if other "
+            f"{name}: cannot be decoded ({last_line(error)[:100]}): copy it again; if other "
             "programs show it, save it again with one of them (DICOM: with gdcmconv or dcmconv)"
         ) from error
     if image.GetNumberOfComponentsPerPixel() != 1:
@@ -86,7 +86,7 @@ def _read(path: str, kind: str) -> Any:
     return image
 
 
-def _last_line(error: Exception) -> str:
+def last_line(error: Exception) -> str:
     """What ITK reports of an error, without the places in its sources."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1] if lines else type(error).__name__

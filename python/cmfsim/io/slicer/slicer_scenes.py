@@ -16,8 +16,7 @@ from xml.parsers import expat
 import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.files.reading_writing import check_readable, is_below, is_there, named
-from cmfsim.io.files.strict_xml import strict_parser
+from cmfsim.io.files.reading_writing import check_readable, is_below, is_there, named, strict_parser
 from cmfsim.io.slicer.transforms import motion_in_lps, read_transform_file
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.strict_xml import strict_parser
+from cmfsim.io.files.reading_writing import strict_parser
 from cmfsim.io.files.text_numbers import real_numbers, shown, whole_numbers
 from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
 from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
