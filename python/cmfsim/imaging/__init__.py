@@ -2,8 +2,7 @@
 
 from cmfsim.imaging.head import segment_head
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.imaging.two_scans.alignment import VolumeAlignment, register_volumes
-from cmfsim.imaging.two_scans.alignment_options import AlignmentOptions
+from cmfsim.imaging.two_scans.alignment import AlignmentOptions, VolumeAlignment, register_volumes
 from cmfsim.imaging.two_scans.undeformed import undeformed_mask
 
 __all__ = [

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from test_pictures import read
 
 import cmfsim
-from cmfsim.pictures import canvas, labels, picture_landmarks
+from cmfsim.pictures import canvas, landmarks, picture_landmarks
 
 SIZE = (700, 700)
 VIEWS = {"front": ((1, 0, 0), None), "left": ((0, 1, 0), "_R"), "right": ((0, -1, 0), "_L")}
@@ -23,7 +23,7 @@ def test_heights_are_spread_by_isotonic_regression(heights, gap, bounded):
     optimize = pytest.importorskip("scipy.optimize")
     steps = gap * np.arange(len(heights))
     low, high = (0.0, max(100.0, steps[-1])) if bounded else (-1e6, 1e6)
-    found = labels.spread(heights, gap, low, high)
+    found = landmarks.spread(heights, gap, low, high)
     order = np.argsort(heights, kind="stable")
     best = optimize.isotonic_regression(np.asarray(heights)[order] - steps).x
     expected = np.clip(best, low, high - steps[-1]) + steps
@@ -32,9 +32,9 @@ def test_heights_are_spread_by_isotonic_regression(heights, gap, bounded):
 
 
 def test_names_without_room_stand_closer_and_stay_inside():
-    found = labels.spread([50.0, 50.0, 50.0, 50.0], 10.0, 40.0, 52.0)
+    found = landmarks.spread([50.0, 50.0, 50.0, 50.0], 10.0, 40.0, 52.0)
     np.testing.assert_allclose(np.sort(found), [40.0, 44.0, 48.0, 52.0])
-    assert labels.spread([], 1.0, 0.0, 1.0).shape == (0,)
+    assert landmarks.spread([], 1.0, 0.0, 1.0).shape == (0,)
 
 
 def _overlap(one, other):
@@ -55,17 +55,17 @@ def test_no_name_covers_another_on_any_head(seed):
             at = np.array(list(shown.values()))
             at = np.column_stack([at @ across, at[:, 2]])
             at = 2.5 * (at - at.mean(axis=0)) + 350.0
-            boxes = labels.label_places(at, list(shown), SIZE).boxes
+            boxes = landmarks.label_places(at, list(shown), SIZE).boxes
             assert len(boxes) == len(shown)
             assert not any(_overlap(a, b) for a, b in itertools.combinations(boxes, 2))
             assert (boxes[:, 0] >= -1e-6).all()
             assert (boxes[:, 2] <= SIZE[0] + 1e-6).all()
-            assert (boxes[:, 1] >= labels.CAPTION - 1e-6).all()
+            assert (boxes[:, 1] >= landmarks.CAPTION - 1e-6).all()
 
 
 def test_a_name_stands_on_the_side_of_its_point():
     at = [[100.0, 300.0], [600.0, 300.0], [350.0, 400.0], [352.0, 200.0]]
-    found = labels.label_places(at, ["a", "b", "c", "d"], SIZE)
+    found = landmarks.label_places(at, ["a", "b", "c", "d"], SIZE)
     assert found.left.tolist() == [True, False, False, True]
 
 
@@ -77,7 +77,7 @@ def test_every_name_is_drawn_where_it_was_placed(tmp_path):
     except cmfsim.CaseError as error:
         pytest.skip(f"cannot draw here: {error}")
     names = [f"supra_glenoid_{i}" for i in range(20)]
-    points = [labels.Label(name, np.array([0.1 * i, 0.0, 0.0])) for i, name in enumerate(names)]
+    points = [landmarks.Label(name, np.array([0.1 * i, 0.0, 0.0])) for i, name in enumerate(names)]
     corners = np.array([[-100.0, -100.0, -100.0], [100.0, 100.0, 100.0]])
     path = tmp_path / "labels.png"
     toward = np.array([0.0, -1.0, 0.0])
@@ -86,12 +86,12 @@ def test_every_name_is_drawn_where_it_was_placed(tmp_path):
         [canvas.View("front", "")],
         corners,
         SIZE,
-        lambda plotter, _: labels.add_labels(plotter, toward, points),
+        lambda plotter, _: landmarks.add_labels(plotter, toward, points),
     )
     image = read(path)
     scale = SIZE[1] / (2.0 * canvas.MARGIN * 100.0)
     at = np.array([[350.0 + 0.1 * i * scale, 350.0] for i in range(20)])
-    found = labels.label_places(at, names, SIZE)
+    found = landmarks.label_places(at, names, SIZE)
     for left, bottom, right, top in found.boxes:
         inside = image[round(SIZE[1] - top) : round(SIZE[1] - bottom), round(left) : round(right)]
         dark = (inside < 110).all(axis=2)
