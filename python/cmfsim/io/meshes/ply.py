@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,8 +87,8 @@ def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
     for name in ("vertex", kind):
         if names.count(name) != 1:
             raise CaseInputError(f"has {names.count(name)} elements {name!r}: one is needed")
-    source = _Binary(data, start, order) if order else _Text(data, start)
-    rows = {element.name: source.rows(element) for element in elements}
+    source: _Source = _Binary(data, start, order) if order else _Text(data, start)
+    rows = {element.name: _rows(source, element) for element in elements}
     left = source.left()
     if left and _may_be_a_row(source, elements[-1], elements[names.index("vertex")].number):
         raise CaseInputError(
@@ -123,10 +123,10 @@ def _strips(corners: Integers, lengths: Integers) -> tuple[Integers, Integers]:
     return np.unique(number[kept], return_counts=True)[1], corners[kept]
 
 
-def _may_be_a_row(source: "_Binary | _Text", last: _Element, n_vertices: int) -> bool:
+def _may_be_a_row(source: "_Source", last: _Element, n_vertices: int) -> bool:
     """Whether what follows the last element may be one more row of it, which no header counts."""
     try:
-        row = source.rows(_Element(last.name, 1, last.properties))
+        row = _rows(source, _Element(last.name, 1, last.properties))
     except CaseInputError:
         return False
     if last.name != "face":
@@ -239,144 +239,135 @@ def _property(words: list[bytes]) -> _Property | None:
     return None
 
 
+def _rows(source: "_Source", element: _Element) -> _Rows:
+    """The rows of the next element."""
+    if not element.number or not element.properties:
+        return _empty(element)
+    # Usually every list has the length of the first row's: then all rows are alike.
+    lengths, after = list[int | None](), source.at
+    for prop in element.properties:
+        length = None
+        if prop.count:
+            length, after = source.length(element, prop, after, 0)
+        lengths.append(length)
+        after += source.width(prop) * (1 if length is None else length)
+    width = after - source.at
+    if source.at + element.number * width <= source.end:
+        columns = source.alike(element, lengths)
+        if columns is not None:
+            source.at += element.number * width
+            counts = (None if n is None else np.full(element.number, n) for n in lengths)
+            return _Rows(tuple(columns), tuple(counts))
+    if all(length is None for length in lengths):
+        _short(element, (source.end - source.at) // width)
+    return _one_by_one(source, element)
+
+
+def _one_by_one(source: "_Source", element: _Element) -> _Rows:
+    places: list[list[slice]] = [[] for _ in element.properties]
+    lengths: list[list[int]] = [[] for _ in element.properties]
+    for row in range(element.number):
+        for i, prop in enumerate(element.properties):
+            length = 1
+            if prop.count:
+                length, source.at = source.length(element, prop, source.at, row)
+                lengths[i].append(length)
+            place = slice(source.at, source.at + length * source.width(prop))
+            if place.stop > source.end:
+                _short(element, row)
+            places[i].append(place)
+            source.at = place.stop
+    return _Rows(
+        tuple(source.column(element, i, of) for i, of in enumerate(places)),
+        tuple(
+            np.array(n, dtype=np.int64) if p.count else None
+            for n, p in zip(lengths, element.properties, strict=True)
+        ),
+    )
+
+
+def _short(element: _Element, row: int) -> NoReturn:
+    raise CaseInputError(
+        f"is cut short or damaged: its header states {element.number} of element "
+        f"{element.name!r}, the file ends in number {row}; copy or export it again"
+    )
+
+
 class _Binary:
-    """Elements one after the other in bytes."""
+    """Elements in bytes."""
 
     def __init__(self, data: bytes, start: int, order: str) -> None:
-        self.data, self.at, self.order = data, start, order
-
-    def rows(self, element: _Element) -> _Rows:
-        """The rows of the next element."""
-        if not element.number or not element.properties:
-            return _empty(element)
-        # Usually every list has the length of the first row's: then all rows are alike.
-        lengths = self._first_lengths(element)
-        kind = np.dtype(
-            [
-                field
-                for i, (p, length) in enumerate(zip(element.properties, lengths, strict=True))
-                for field in self._fields(i, p, length)
-            ]
-        )
-        if self.at + element.number * kind.itemsize <= len(self.data):
-            table = np.frombuffer(self.data, kind, element.number, self.at)
-            if all((table[f"n{i}"] == n).all() for i, n in enumerate(lengths) if n is not None):
-                self.at += element.number * kind.itemsize
-                return _of_table(element, table, lengths)
-        if all(length is None for length in lengths):
-            self._cut(element, kind.itemsize)
-        return self._one_by_one(element)
+        self.data, self.at, self.end, self.order = data, start, len(data), order
 
     def left(self) -> str:
         """What no element takes, in words; empty if there is nothing but a line end."""
-        left = len(self.data) - self.at
+        left = self.end - self.at
         return "" if self.data[self.at : self.at + 3] in LINE_ENDS else f"{left} bytes"
 
-    def _fields(
-        self, number: int, prop: _Property, length: int | None
-    ) -> list[tuple[str, str] | tuple[str, str, tuple[int, ...]]]:
-        if length is None:
-            return [(f"v{number}", self.order + prop.kind)]
-        return [
-            (f"n{number}", self.order + prop.count),
-            (f"v{number}", self.order + prop.kind, (length,)),
-        ]
+    def width(self, prop: _Property) -> int:
+        """What a number takes."""
+        return np.dtype(prop.kind).itemsize
 
-    def _first_lengths(self, element: _Element) -> list[int | None]:
-        at, lengths = self.at, list[int | None]()
-        for prop in element.properties:
-            if not prop.count:
-                lengths.append(None)
-                at += np.dtype(prop.kind).itemsize
-                continue
-            length, at = self._length(element, prop, at, 0)
-            lengths.append(length)
-            at += length * np.dtype(prop.kind).itemsize
-        return lengths
-
-    def _length(self, element: _Element, prop: _Property, at: int, row: int) -> tuple[int, int]:
+    def length(self, element: _Element, prop: _Property, at: int, row: int) -> tuple[int, int]:
         """The length of a list, and where its entries begin; they are all there."""
-        size = np.dtype(prop.count).itemsize
-        if at + size > len(self.data):
-            self._short(element, row)
-        length = int.from_bytes(
-            self.data[at : at + size],
-            "big" if self.order == ">" else "little",
-            signed=prop.count[0] == "i",
-        )
-        at += size
+        after = at + np.dtype(prop.count).itemsize
+        if after > self.end:
+            _short(element, row)
+        length = int(np.frombuffer(self.data[at:after], self.order + prop.count)[0])
         if length < 0:
             raise CaseInputError(f"{element.name} {row} has a list of length {length}")
-        if at + length * np.dtype(prop.kind).itemsize > len(self.data):
-            self._short(element, row)
-        return length, at
+        if after + length * self.width(prop) > self.end:
+            _short(element, row)
+        return length, after
 
-    def _one_by_one(self, element: _Element) -> _Rows:
-        values: list[list[NDArray[np.generic]]] = [[] for _ in element.properties]
-        lengths: list[list[int]] = [[] for _ in element.properties]
-        kinds = [np.dtype(self.order + p.kind) for p in element.properties]
-        for row in range(element.number):
-            for i, prop in enumerate(element.properties):
-                length = 1
-                if prop.count:
-                    length, self.at = self._length(element, prop, self.at, row)
-                    lengths[i].append(length)
-                size = length * kinds[i].itemsize
-                if self.at + size > len(self.data):
-                    self._short(element, row)
-                values[i].append(np.frombuffer(self.data, kinds[i], length, self.at))
-                self.at += size
-        return _Rows(
-            tuple(_wide(np.concatenate(v)) for v in values),
-            tuple(
-                np.array(n, dtype=np.int64) if p.count else None
-                for n, p in zip(lengths, element.properties, strict=True)
-            ),
-        )
+    def alike(self, element: _Element, lengths: list[int | None]) -> list[Column] | None:
+        """The columns if all lists are as long as those of the first row; None if they are not."""
+        fields: list[Any] = []
+        for i, (prop, n) in enumerate(zip(element.properties, lengths, strict=True)):
+            fields += [] if n is None else [(f"n{i}", self.order + prop.count)]
+            fields.append((f"v{i}", self.order + prop.kind, () if n is None else (n,)))
+        table = np.frombuffer(self.data, np.dtype(fields), element.number, self.at)
+        if not all((table[f"n{i}"] == n).all() for i, n in enumerate(lengths) if n is not None):
+            return None
+        return [_wide(table[f"v{i}"].reshape(-1)) for i in range(len(lengths))]
 
-    def _short(self, element: _Element, row: int) -> NoReturn:
-        raise CaseInputError(
-            f"is cut short or damaged: its header states {element.number} of element "
-            f"{element.name!r}, the file ends in number {row}; copy or export it again"
-        )
-
-    def _cut(self, element: _Element, size: int) -> NoReturn:
-        self._short(element, (len(self.data) - self.at) // size)
+    def column(self, element: _Element, number: int, places: list[slice]) -> Column:
+        """The values of a property at some places."""
+        raw = b"".join(self.data[place] for place in places)
+        return _wide(np.frombuffer(raw, self.order + element.properties[number].kind))
 
 
 class _Text:
-    """Elements one after the other in words."""
+    """Elements in words."""
 
     def __init__(self, data: bytes, start: int) -> None:
         self.words, self.at = data[start:].split(), 0
-
-    def rows(self, element: _Element) -> _Rows:
-        """The rows of the next element."""
-        if not element.number or not element.properties:
-            return _empty(element)
-        width, lengths = 0, list[int | None]()
-        for prop in element.properties:
-            length = None
-            if prop.count:
-                length = self._length(element, self.at + width, 0)
-                width += 1
-            lengths.append(length)
-            width += 1 if length is None else length
-        if self.at + element.number * width <= len(self.words):
-            rows = self._alike(element, lengths, width)
-            if rows is not None:
-                return rows
-        if all(length is None for length in lengths):
-            self._short(element, (len(self.words) - self.at) // width)
-        return self._one_by_one(element)
+        self.end = len(self.words)
 
     def left(self) -> str:
         """What no element takes, in words; empty if there is nothing."""
-        left = len(self.words) - self.at
+        left = self.end - self.at
         return f"{left} words" if left else ""
 
-    def _alike(self, element: _Element, lengths: list[int | None], width: int) -> _Rows | None:
-        """The rows where all lists have the length of the first row's; None where they do not."""
+    def width(self, _: _Property) -> int:
+        """What a number takes: a word."""
+        return 1
+
+    def length(self, element: _Element, _: _Property, at: int, row: int) -> tuple[int, int]:
+        """The length of a list, and where its entries begin; they are all there."""
+        if at >= self.end:
+            _short(element, row)
+        length = int(whole_numbers([self.words[at]], lambda _: f"{element.name} {row}")[0])
+        if not 0 <= length <= self.end - at - 1:
+            raise CaseInputError(
+                f"{element.name} {row} has a list of length {length}, and "
+                f"{self.end - at - 1} numbers are left: is it cut short?"
+            )
+        return length, at + 1
+
+    def alike(self, element: _Element, lengths: list[int | None]) -> list[Column] | None:
+        """The columns if all lists are as long as those of the first row; None if they are not."""
+        width = sum(1 if n is None else 1 + n for n in lengths)
         words = self.words[self.at : self.at + element.number * width]
         columns: list[Column] = []
         place = 0
@@ -390,59 +381,19 @@ class _Text:
                 _values(prop, words[place + i :: width], f"{element.name} {{}}".format)
                 for i in range(count)
             ]
-            column: Column = _values(prop, [], str)
-            if parts:
-                table: NDArray[Any] = np.stack(parts, axis=1)
-                column = table.reshape(-1)
-            columns.append(column)
+            table: NDArray[Any] = np.stack(parts, axis=1) if parts else _values(prop, [], str)
+            columns.append(table.reshape(-1))
             place += count
-        self.at += element.number * width
-        return _Rows(
-            tuple(columns),
-            tuple(None if n is None else np.full(element.number, n) for n in lengths),
-        )
+        return columns
 
-    def _one_by_one(self, element: _Element) -> _Rows:
-        values: list[list[bytes]] = [[] for _ in element.properties]
-        lengths: list[list[int]] = [[] for _ in element.properties]
-        for row in range(element.number):
-            for i, prop in enumerate(element.properties):
-                length = 1
-                if prop.count:
-                    length = self._length(element, self.at, row)
-                    self.at += 1
-                    lengths[i].append(length)
-                if self.at + length > len(self.words):
-                    self._short(element, row)
-                values[i] += self.words[self.at : self.at + length]
-                self.at += length
-        return _Rows(
-            tuple(
-                _values(p, v, lambda _: f"element {element.name!r}")
-                for p, v in zip(element.properties, values, strict=True)
-            ),
-            tuple(
-                np.array(n, dtype=np.int64) if p.count else None
-                for n, p in zip(lengths, element.properties, strict=True)
-            ),
-        )
+    def column(self, element: _Element, number: int, places: list[slice]) -> Column:
+        """The values of a property at some places."""
+        words = [word for place in places for word in self.words[place]]
+        return _values(element.properties[number], words, lambda _: f"element {element.name!r}")
 
-    def _length(self, element: _Element, at: int, row: int) -> int:
-        if at >= len(self.words):
-            self._short(element, row)
-        length = int(whole_numbers([self.words[at]], lambda _: f"{element.name} {row}")[0])
-        if not 0 <= length <= len(self.words) - at - 1:
-            raise CaseInputError(
-                f"{element.name} {row} has a list of length {length}, and "
-                f"{len(self.words) - at - 1} numbers are left: is it cut short?"
-            )
-        return length
 
-    def _short(self, element: _Element, row: int) -> NoReturn:
-        raise CaseInputError(
-            f"is cut short or damaged: its header states {element.number} of element "
-            f"{element.name!r}, the file ends in number {row}; copy or export it again"
-        )
+# What elements are read from; each has a place and an end, in bytes or in words.
+_Source: TypeAlias = _Binary | _Text
 
 
 def _values(prop: _Property, words: list[bytes], where: Callable[[int], str]) -> Column:
@@ -455,13 +406,6 @@ def _empty(element: _Element) -> _Rows:
     return _Rows(
         tuple(_values(p, [], str) for p in element.properties),
         tuple(np.zeros(0, dtype=np.int64) if p.count else None for p in element.properties),
-    )
-
-
-def _of_table(element: _Element, table: NDArray[np.void], lengths: list[int | None]) -> _Rows:
-    return _Rows(
-        tuple(_wide(table[f"v{i}"].reshape(-1)) for i in range(len(element.properties))),
-        tuple(None if n is None else np.full(element.number, n) for n in lengths),
     )
 
 
