@@ -8,14 +8,13 @@ from cmfsim.bones.cuts.cutting import (
     part_segment,
     segments_from_surfaces,
 )
-from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure, free_cut
+from cmfsim.bones.cuts.planes import CuttingPlane, Procedure, free_cut
 from cmfsim.bones.cuts.procedures import PROCEDURES, place_procedure, procedure_options
 from cmfsim.bones.segment_checks import check_segments
 
 __all__ = [
     "PROCEDURES",
     "ContactSheet",
-    "Cut",
     "CutBones",
     "CutOptions",
     "CuttingPlane",

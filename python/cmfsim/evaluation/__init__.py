@@ -1,6 +1,6 @@
 """Predictions against the post-operative skin: partners, distances, regions, tests (paper 3.2)."""
 
-from cmfsim.evaluation.comparison import MATCHINGS, SkinComparison, compare_skins
+from cmfsim.evaluation.comparison import SkinComparison, compare_skins
 from cmfsim.evaluation.conformal import (
     calibrate,
     cases_needed,
@@ -14,12 +14,7 @@ from cmfsim.evaluation.models import (
     ModelComparison,
     compare_models,
 )
-from cmfsim.evaluation.regions import (
-    REGIONS,
-    UNMOVED_REGIONS,
-    skin_regions,
-    unmoved_regions,
-)
+from cmfsim.evaluation.regions import REGIONS, skin_regions, unmoved_regions
 from cmfsim.evaluation.significance import (
     LEAST_PAIRS,
     PairedChange,
@@ -27,19 +22,16 @@ from cmfsim.evaluation.significance import (
     paired_change,
     wilcoxon_test,
 )
-from cmfsim.evaluation.statistics import LIMITS, DistanceStatistics, distance_statistics
+from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.evaluation.tables import ErrorTable, error_table
 from cmfsim.evaluation.unmoved import ThicknessChange, compare_unmoved, fitted_thickness
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 
 __all__ = [
     "LEAST_PAIRS",
-    "LIMITS",
-    "MATCHINGS",
     "NO_CHANGE",
     "REGIONS",
     "SKIN_LANDMARKS",
-    "UNMOVED_REGIONS",
     "WHOLE",
     "DistanceStatistics",
     "ErrorTable",

@@ -11,12 +11,7 @@ from cmfsim.io.cases.variants import AS_GIVEN, Variant, Variants
 from cmfsim.io.files.folders import finish_writing, replacing_files
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.images.image_files import read_image, write_image
-from cmfsim.io.landmarks.landmark_files import (
-    LandmarkFile,
-    read_landmark_file,
-    read_landmarks,
-    write_landmarks,
-)
+from cmfsim.io.landmark_files import read_landmark_file, read_landmarks, write_landmarks
 from cmfsim.io.meshes import ply
 from cmfsim.io.meshes.mesh_files import read_tet_mesh
 from cmfsim.io.results.metrics import write_metrics
@@ -42,7 +37,6 @@ __all__ = [
     "CaseChanges",
     "CaseOrPath",
     "Cohort",
-    "LandmarkFile",
     "Variant",
     "Variants",
     "as_case",

@@ -5,7 +5,7 @@
 
 from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
 from cmfsim.meshing.quality import mesh_findings, mesh_report, report_of_part
-from cmfsim.meshing.separation import SeparatedMesh, part_mesh, separated_mesh
+from cmfsim.meshing.separation import part_mesh, separated_mesh
 from cmfsim.meshing.stuffing import (
     MeshOptions,
     TissueMesh,
@@ -17,7 +17,6 @@ from cmfsim.meshing.tissue import TissueRegion, near_skin, tissue_level
 
 __all__ = [
     "MeshOptions",
-    "SeparatedMesh",
     "TissueMesh",
     "TissueRegion",
     "anatomy_from_surfaces",

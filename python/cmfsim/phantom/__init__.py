@@ -5,7 +5,7 @@ as level functions, label images, CT-like images and closed surfaces; `HeadParam
 people.
 """
 
-from cmfsim.phantom.model import BONES, LABELS, PARTS, PhantomHead, make_head
+from cmfsim.phantom.model import BONES, LABELS, PhantomHead, make_head
 from cmfsim.phantom.muscles import Muscle
 from cmfsim.phantom.parameters import PARAMETER_RANGES, HeadParameters
 
@@ -13,7 +13,6 @@ __all__ = [
     "BONES",
     "LABELS",
     "PARAMETER_RANGES",
-    "PARTS",
     "HeadParameters",
     "Muscle",
     "PhantomHead",

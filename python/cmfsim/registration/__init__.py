@@ -5,7 +5,6 @@ The splines and fits themselves are `cmfsim.ThinPlateSpline` and `cmfsim.rigid_f
 
 from cmfsim.registration.closest import icp
 from cmfsim.registration.consistency import (
-    CommonShift,
     LandmarkAgreement,
     common_shift,
     leave_one_out,
@@ -16,7 +15,6 @@ from cmfsim.registration.folds import FoldReport, fold_report
 from cmfsim.registration.landmarks import LandmarkMatch, match_landmarks, side_vectors, wrong_sides
 
 __all__ = [
-    "CommonShift",
     "FoldReport",
     "LandmarkAgreement",
     "LandmarkMatch",

@@ -1,12 +1,11 @@
 """Reports of results: one self-contained page for a case or a study, on screen and on paper."""
 
 from cmfsim.report.case import case_document
-from cmfsim.report.document import Alert, Document, Figure, Note, Section, Table
+from cmfsim.report.document import Document, Figure, Note, Section, Table
 from cmfsim.report.page import render_page
 from cmfsim.report.study import study_document
 
 __all__ = [
-    "Alert",
     "Document",
     "Figure",
     "Note",

@@ -9,7 +9,7 @@ import pytest
 
 import cmfsim
 from cmfsim.io.cases.templates import write_template
-from cmfsim.io.landmarks.markups import read_curves, write_curves
+from cmfsim.io.markups import read_curves, write_curves
 from cmfsim.muscles.template import phantom_muscle
 
 MIRROR = np.array([-1.0, 1.0, 1.0])

@@ -17,7 +17,7 @@ from cmfsim.cli.patients.case_commands import print_findings
 from cmfsim.cli.text.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError, LandmarkError
 from cmfsim.io import Case
-from cmfsim.io.landmarks.landmark_files import write_landmarks
+from cmfsim.io.landmark_files import write_landmarks
 from cmfsim.pictures import picture_landmarks
 from cmfsim.pipeline.building.inputs import (
     read_anatomy,

@@ -22,8 +22,8 @@ from cmfsim.io.cases.template_archives import (
 )
 from cmfsim.io.files.folders import PREFIX, replacing_files
 from cmfsim.io.files.reading_writing import FORMAT_VERSION, beside, is_there, named
-from cmfsim.io.landmarks.landmark_files import read_landmark_file, write_landmarks
-from cmfsim.io.landmarks.markups import read_curves, write_curves
+from cmfsim.io.landmark_files import read_landmark_file, write_landmarks
+from cmfsim.io.markups import read_curves, write_curves
 from cmfsim.io.surfaces import read_surface, write_surface
 from cmfsim.values.case_parts import FRAMES, UNITS
 from cmfsim.values.finding import Finding

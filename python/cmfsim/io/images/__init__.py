@@ -1,5 +1,1 @@
 """Images of any format, one format a file, and the masks of segmentations."""
-
-from cmfsim.io.images.image_files import read_image, read_image_file, write_image
-
-__all__ = ["read_image", "read_image_file", "write_image"]

@@ -1,6 +1,6 @@
 """The open benchmark: displacements of the skin, by any method, scored on virtual patients."""
 
-from cmfsim.lab.benchmark.running import Benchmark, run_benchmark
+from cmfsim.lab.benchmark.running import run_benchmark
 from cmfsim.lab.benchmark.skin_predictions import (
     SkinPrediction,
     read_skin_prediction,
@@ -9,7 +9,6 @@ from cmfsim.lab.benchmark.skin_predictions import (
 from cmfsim.lab.benchmark.tables import BenchmarkTable
 
 __all__ = [
-    "Benchmark",
     "BenchmarkTable",
     "SkinPrediction",
     "read_skin_prediction",

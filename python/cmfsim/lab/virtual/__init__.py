@@ -10,17 +10,14 @@ from cmfsim.lab.virtual.patient_folder import virtual_patients, write_virtual_pa
 from cmfsim.lab.virtual.people import PATIENTS, Relocation, VirtualPatient
 from cmfsim.lab.virtual.population import drawn_patient
 from cmfsim.lab.virtual.population_folder import PatientOutcome, virtual_population
-from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth
 
 __all__ = [
     "PATIENTS",
     "EquilibriumOptions",
     "PatientOutcome",
-    "PostoperativeTruth",
     "Relocation",
     "VirtualPatient",
     "drawn_patient",
-    "postoperative_truth",
     "virtual_patients",
     "virtual_population",
     "write_virtual_patient",

@@ -1,6 +1,6 @@
 """The lips: the seam between them, and the part of a mesh's boundary that belongs to each."""
 
 from cmfsim.meshing.lips.regions import lip_regions, seam_faces
-from cmfsim.meshing.lips.seam import LIP_LANDMARKS, LipSeam, lip_seam
+from cmfsim.meshing.lips.seam import LipSeam, lip_seam
 
-__all__ = ["LIP_LANDMARKS", "LipSeam", "lip_regions", "lip_seam", "seam_faces"]
+__all__ = ["LipSeam", "lip_regions", "lip_seam", "seam_faces"]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.io.landmarks.landmark_files import read_landmarks
+from cmfsim.io.landmark_files import read_landmarks
 from cmfsim.io.surfaces import read_surface
 from cmfsim.muscles.template.bodyparts3d_parts import (
     BONES,

@@ -1,16 +1,14 @@
 """Measures of a face that surgeons use: angles and distances between named sites."""
 
-from cmfsim.planning.face_measures.definitions import FORMULAS, MEASURES, Measure, measure_sites
-from cmfsim.planning.face_measures.profile import MidlineProfile, midline_profile
+from cmfsim.planning.face_measures.definitions import MEASURES, Measure, measure_sites
+from cmfsim.planning.face_measures.profile import midline_profile
 from cmfsim.planning.face_measures.sites import BoneSite, FaceSites, face_sites, measure_face
 
 __all__ = [
-    "FORMULAS",
     "MEASURES",
     "BoneSite",
     "FaceSites",
     "Measure",
-    "MidlineProfile",
     "face_sites",
     "measure_face",
     "measure_sites",

@@ -1,5 +1,5 @@
 """The embedded case: a synthetic class III head with its operation and its true face."""
 
-from cmfsim.lab.virtual.demo.patient import DemoCase, DemoTruth, read_demo_truth, write_demo_case
+from cmfsim.lab.virtual.demo.patient import DemoCase, read_demo_truth, write_demo_case
 
-__all__ = ["DemoCase", "DemoTruth", "read_demo_truth", "write_demo_case"]
+__all__ = ["DemoCase", "read_demo_truth", "write_demo_case"]
