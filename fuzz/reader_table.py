@@ -29,8 +29,7 @@ from cmfsim.io.images.segmentations import read_labels, read_segmentation
 from cmfsim.io.markups import read_curves, write_curves
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.vtk.writing import write_tets
-from cmfsim.io.slicer.bundles import unpack_bundle
-from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
+from cmfsim.io.slicer.slicer_scenes import read_slicer_scene, unpack_bundle
 
 
 @dataclass(frozen=True)

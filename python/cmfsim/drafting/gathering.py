@@ -22,8 +22,7 @@ from cmfsim.drafting.scene_finds import LooseMotion, scene_finds
 from cmfsim.drafting.segment_finds import segment_finds
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.images.segmentations import NAMES_FILE
-from cmfsim.io.slicer.bundles import unpack_bundle
-from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
+from cmfsim.io.slicer.slicer_scenes import read_slicer_scene, unpack_bundle
 
 # Images that are read to see which is the CT.
 MAX_IMAGES = 6

@@ -4,10 +4,9 @@ import sys
 
 from cmfsim.io.cases.case_files import Case, CaseOrPath, as_case
 from cmfsim.io.cases.case_plans import write_plan
-from cmfsim.io.cases.cohorts import Cohort
+from cmfsim.io.cases.cohorts import AS_GIVEN, Cohort, Variant, Variants
 from cmfsim.io.cases.scenes import read_plan, read_scene, write_scene
 from cmfsim.io.cases.tables import CaseChanges
-from cmfsim.io.cases.variants import AS_GIVEN, Variant, Variants
 from cmfsim.io.files.folders import finish_writing, replacing_files
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.images.image_files import read_image, write_image

@@ -25,6 +25,8 @@ from cmfsim.io.results.metrics import (
     REPORT_FILE,
     read_evaluation,
     read_evaluation_picture,
+    skin_errors_file,
+    write_skin_errors,
 )
 from cmfsim.io.results.prediction_schema import is_prediction_file
 from cmfsim.io.results.predictions import (
@@ -36,7 +38,6 @@ from cmfsim.io.results.predictions import (
     stale_results,
     write_timings,
 )
-from cmfsim.io.results.skin_errors import skin_errors_file, write_skin_errors
 from cmfsim.io.slicer.output import SLICER_FILE, write_slicer_bundle
 from cmfsim.pictures import (
     Picture,

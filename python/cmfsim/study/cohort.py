@@ -11,8 +11,7 @@ from cmfsim.errors import CaseError, CaseInputError, CmfsimError
 from cmfsim.io import Case, CaseChanges, Cohort, finish_writing
 from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.files.summaries import checked_file
-from cmfsim.io.results.metrics import AGAIN, read_evaluation
-from cmfsim.io.results.skin_errors import skin_errors_file
+from cmfsim.io.results.metrics import AGAIN, read_evaluation, skin_errors_file
 from cmfsim.pipeline.evaluating import evaluation_key
 from cmfsim.processes.cluster import on_cluster
 from cmfsim.processes.parallel import as_they_end

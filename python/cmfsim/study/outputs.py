@@ -8,7 +8,7 @@ from pathlib import Path
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation import NO_CHANGE, DistanceStatistics, ErrorTable
 from cmfsim.io import replacing_files
-from cmfsim.io.results.skin_errors import SkinErrors, read_skin_errors
+from cmfsim.io.results.metrics import SkinErrors, read_skin_errors
 from cmfsim.pictures import chart_errors, picture_distance_grid
 from cmfsim.pipeline.outputs import optional_pictures, write_report_page
 from cmfsim.report import Figure, study_document

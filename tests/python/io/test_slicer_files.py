@@ -10,8 +10,7 @@ import pytest
 import cmfsim
 from cmfsim.drafting import init_case
 from cmfsim.io.images.segmentations import read_segmentation
-from cmfsim.io.slicer.bundles import unpack_bundle
-from cmfsim.io.slicer.slicer_scenes import read_slicer_scene
+from cmfsim.io.slicer.slicer_scenes import read_slicer_scene, unpack_bundle
 
 POINTS = np.array([[1.0, 2.0, 3.0], [4.0, 2.0, 3.0], [1.0, 6.0, 3.0]])
 LPS = POINTS * [-1.0, -1.0, 1.0]
