@@ -17,7 +17,7 @@ from cmfsim.cli.patients import (
     view_command,
 )
 from cmfsim.cli.research import bench_command, phantom_command, study_commands
-from cmfsim.cli.research.population_parsing import add_population_commands
+from cmfsim.cli.research.population_commands import add_population_commands
 from cmfsim.io import result_suffixes
 from cmfsim.lab.frontier import EDGES, FACTORS
 from cmfsim.muscles.template import WHERE

@@ -1083,7 +1083,7 @@ def test_nothing_is_solved_for_a_page_that_has_gone(held):
 
 SLOW = """
 import time
-from cmfsim.planning.server import server
+from cmfsim.planning import server
 
 class Planning:
     def solve(self, plan):

@@ -1,0 +1,216 @@
+"""`cmfsim virtual-patients` and `cmfsim benchmark`: synthetic heads with their truth, scored."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from cmfsim.cli.exit_codes import DONE
+from cmfsim.cli.text.terminal import StageProgress
+from cmfsim.errors import CaseInputError
+from cmfsim.io.results.populations import FAILED, MADE, PARTS, PENDING, TEST
+from cmfsim.lab.benchmark import run_benchmark
+from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST
+from cmfsim.lab.virtual import PatientOutcome, virtual_population
+from cmfsim.lab.virtual import virtual_patients as write_patients
+from cmfsim.lab.virtual.patient_folder import PATIENTS_WITH_JOINED_LIPS
+from cmfsim.lab.virtual.population import OWN, TRUTHS
+from cmfsim.values.model_names import MODELS
+
+
+def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> None:
+    """Adds both commands."""
+    _add_virtual_patients(commands, common)
+    _add_benchmark(commands, common)
+
+
+def _add_virtual_patients(commands: Any, common: argparse.ArgumentParser) -> None:
+    parser = commands.add_parser(
+        "virtual-patients",
+        parents=[common],
+        help="write virtual patients with their post-operative faces (in silico)",
+        epilog="Existing patients with the same settings are kept.",
+    )
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
+    parser.add_argument(
+        "--patients",
+        metavar="N",
+        type=int,
+        nargs="+",
+        help="patients, 1 to 6 (default 1 to 4; the lips of 5 and 6 touch, which takes longer)",
+    )
+    parser.add_argument(
+        "--count",
+        metavar="N",
+        type=int,
+        help="draw N patients at random (shape, tissue, operation, plan) instead of --patients",
+    )
+    parser.add_argument(
+        "--workers",
+        metavar="N",
+        type=int,
+        default=1,
+        help="number of drawn patients made at a time, one process each (default 1)",
+    )
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="random seed (default 0)")
+    parser.add_argument(
+        "--truth",
+        choices=TRUTHS,
+        help="true tissue of drawn patients: their own (default), or the phantom's, whose muscles "
+        "and moduli the models assume",
+    )
+    parser.add_argument(
+        "--edge-length",
+        metavar="H",
+        type=float,
+        default=6.0,
+        help="edge length of the true mesh, mm (default 6)",
+    )
+    parser.add_argument(
+        "--spacing", metavar="MM", type=float, default=2.0, help="CT voxel size (default 2)"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
+    )
+    parser.set_defaults(run=virtual_patients)
+
+
+def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
+    parser = commands.add_parser(
+        "benchmark",
+        parents=[common],
+        help="score predictions for a population of virtual patients, by method and region",
+        epilog="To enter a method, add predictions/METHOD/PATIENT.npz (docs/benchmark.md). "
+        "Results are written to FOLDER/benchmark; except for the run times, they have "
+        "the same bytes each time.",
+    )
+    parser.add_argument(
+        "folder", metavar="FOLDER", type=Path, help="folder written by virtual-patients --count"
+    )
+    parser.add_argument(
+        "--entries",
+        metavar="ENTRY",
+        nargs="*",
+        choices=(*ENTRIES, *ON_REQUEST),
+        default=list(ENTRIES),
+        help=f"entries of this package to run first, none if empty (default {' '.join(ENTRIES)}; "
+        f"{' '.join(ON_REQUEST)} takes longer)",
+    )
+    parser.add_argument(
+        "--band",
+        metavar="MODEL",
+        nargs="+",
+        choices=MODELS,
+        default=[],
+        help="models whose band of 90 %% is calibrated on the part calibration and tested on "
+        "the scored patients",
+    )
+    parser.add_argument(
+        "--band-parts",
+        metavar="PART",
+        nargs="*",
+        choices=PARTS,
+        help="parts on which bands are calibrated (default calibration, unless it is scored)",
+    )
+    parser.add_argument(
+        "--part", choices=PARTS, default=TEST, help="patients to score (default test)"
+    )
+    parser.add_argument(
+        "--workers",
+        metavar="N",
+        type=int,
+        default=1,
+        help="number of patients predicted at a time, one process each (default 1)",
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
+    )
+    parser.set_defaults(run=benchmark)
+
+
+def virtual_patients(options: argparse.Namespace) -> int:
+    """Writes virtual patients: the case before, the truth after the operation."""
+    if options.count is not None:
+        return _population(options)
+    if options.workers != 1 or options.scheduler is not None or options.truth is not None:
+        raise CaseInputError(
+            "--workers, --scheduler and --truth are for drawn patients: give --count too"
+        )
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        cases = write_patients(
+            options.folder,
+            options.patients or PATIENTS_WITH_JOINED_LIPS,
+            seed=options.seed,
+            edge_length=options.edge_length,
+            spacing=options.spacing,
+            progress=progress.stage,
+        )
+    if options.json:
+        print(json.dumps({"cases": [str(case) for case in cases]}, allow_nan=False))
+    else:
+        for case in cases:
+            print(f"wrote {case} (in silico); the truth is in {case.parent / 'truth'}")
+        print(f"next: cmfsim study {options.folder / 'cohort.toml'}")
+    return DONE
+
+
+def _population(options: argparse.Namespace) -> int:
+    """Writes drawn patients."""
+    if options.patients is not None:
+        raise CaseInputError("--patients names patients, --count draws them: give one of the two")
+
+    def tell(outcome: PatientOutcome) -> None:
+        if not options.quiet:
+            why = f": {outcome.reason}" if outcome.reason else ""
+            counted = f"{outcome.done} of {outcome.count}"
+            print(f"{counted}  {outcome.name} {outcome.status}{why}", file=sys.stderr, flush=True)
+
+    found = virtual_population(
+        options.folder,
+        options.count,
+        seed=options.seed,
+        edge_length=options.edge_length,
+        spacing=options.spacing,
+        truth=options.truth or OWN,
+        workers=options.workers,
+        scheduler=options.scheduler,
+        progress=tell,
+    )
+    if options.json:
+        patients = {name: entry.as_dict() for name, entry in found.patients.items()}
+        print(json.dumps({"settings": dict(found.settings), "patients": patients}))
+        return DONE
+    counts = ", ".join(f"{len(found.named(MADE, part))} {part}" for part in PARTS)
+    print(f"{len(found.patients)} patients drawn (in silico): {counts}")
+    for state in (FAILED, PENDING):
+        if found.named(state):
+            print(f"{state}: {', '.join(found.named(state))} (population.json)")
+    print(f"next: cmfsim benchmark {options.folder}")
+    return DONE
+
+
+def benchmark(options: argparse.Namespace) -> int:
+    """Makes the package's own entries, and scores all that are there."""
+
+    def tell(line: str) -> None:
+        if not options.quiet:
+            print(line, file=sys.stderr, flush=True)
+
+    found = run_benchmark(
+        options.folder,
+        part=options.part,
+        entries=options.entries,
+        band=options.band,
+        band_parts=options.band_parts,
+        workers=options.workers,
+        scheduler=options.scheduler,
+        progress=tell,
+    )
+    if options.json:
+        print(found.table.json(), end="")
+        return DONE
+    print(found.table.markdown())
+    for file in found.files:
+        print(f"wrote {file}")
+    return DONE
