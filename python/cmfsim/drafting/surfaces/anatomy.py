@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cmfsim._core import Surface
 from cmfsim.drafting.case_lines import Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.values.checks import Floats
@@ -92,11 +91,3 @@ class Anatomy:
         frame = find.stated or self.frame or "LPS"
         scale = UNITS.get(self.units, 1.0) * (FLIP if frame == "RAS" else np.ones(3))
         return find.surface.vertices * scale
-
-
-def index_of(vertices: Floats, find: SurfaceFind) -> Surface:
-    """The triangles of a surface at other places, to be searched."""
-    return Surface(
-        np.ascontiguousarray(vertices, dtype=np.float64),
-        np.ascontiguousarray(find.surface.triangles, dtype=np.uint32),
-    )

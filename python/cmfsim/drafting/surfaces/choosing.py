@@ -13,7 +13,6 @@ from cmfsim.drafting.surfaces.anatomy import (
     UNITS,
     Anatomy,
     Question,
-    index_of,
 )
 from cmfsim.drafting.surfaces.teeth import ROWS, add_teeth, report_joined
 from cmfsim.values.checks import Floats
@@ -191,7 +190,7 @@ def _share(piece: SurfaceFind, whole: SurfaceFind) -> float:
         return 0.0
     points = piece.surface.vertices
     points = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLES)], dtype=np.float64)
-    index = index_of(whole.surface.vertices, whole)
+    index = whole.surface.searched
     closest, _, _ = index.closest(points)
     near = np.linalg.norm(closest - points, axis=1) < NEAR * whole.extent.max() / 150.0
     inside = index.winding_number(points) > 0.5

@@ -8,7 +8,7 @@ import numpy as np
 from cmfsim.drafting.case_lines import Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.drafting.roles import JAWS_OF_TEETH, safe_key
-from cmfsim.drafting.surfaces.anatomy import SAMPLES, Anatomy, Question, index_of
+from cmfsim.drafting.surfaces.anatomy import SAMPLES, Anatomy, Question
 from cmfsim.meshing.levels import signed_level
 from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.values.checks import Floats
@@ -89,7 +89,9 @@ def _jaw_of(anatomy: Anatomy, teeth: SurfaceFind) -> str | None:
     away = {}
     for name in found.values():
         bone = anatomy.bones[name]
-        closest, _, _ = index_of(anatomy.placed(bone), bone).closest(points)
+        closest, _, _ = SurfaceData(anatomy.placed(bone), bone.surface.triangles).searched.closest(
+            points
+        )
         away[name] = float(np.quantile(np.linalg.norm(closest - points, axis=1), 0.9))
     near, far = sorted(away, key=away.__getitem__) if len(away) == 2 else ("", "")
     return near if near and away[near] < NEARER * away[far] else None
