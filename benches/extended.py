@@ -211,11 +211,7 @@ class ExtendedModel:
     """
 
     def __init__(
-        self,
-        nodes: Floats,
-        tets: Indices,
-        materials: Sequence[Material],
-        material_of: Indices,
+        self, nodes: Floats, tets: Indices, materials: Sequence[Material], material_of: Indices
     ) -> None:
         self.nodes = nodes
         self.tets = tets.astype(np.int64)

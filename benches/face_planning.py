@@ -112,10 +112,7 @@ def search_again(
 
 def table(planning: cmfsim.PlanningModel, plans: int) -> str:
     """The table of all searches."""
-    lines = [
-        HEAD,
-        "| ---: | ---: | --- |" + " ---: |" * 8,
-    ]
+    lines = [HEAD, "| ---: | ---: | --- |" + " ---: |" * 8]
     default = f"{cmfsim.FaceSearch().prior_shift:g}"
     rows = ((120, 0.0, True), (120, 0.0, False), (30, NOISE, True), (30, NOISE, False))
     for count, noise, prior in rows:

@@ -54,10 +54,7 @@ def compared(name: str, found: ProposedLandmarks, truth: Truth, seconds: float) 
     """The errors of one head."""
     errors = {
         (kind, label): float(np.linalg.norm(site.point - known[label]))
-        for kind, sites, known in (
-            ("skull", found.skull, truth[0]),
-            ("skin", found.skin, truth[1]),
-        )
+        for kind, sites, known in (("skull", found.skull, truth[0]), ("skin", found.skin, truth[1]))
         for label, site in sites.items()
         if label in known
     }

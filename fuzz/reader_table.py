@@ -892,10 +892,7 @@ def _read_plan(path: Path) -> Any:
         tets=TETS,
         tissue=cmfsim.TissueData("isotropic", young=0.003, poisson=0.46),
         fixed=[0, 1],
-        segments={
-            "bone": cmfsim.SegmentData(joined=[6]),
-            "teeth": cmfsim.SegmentData(joined=[7]),
-        },
+        segments={"bone": cmfsim.SegmentData(joined=[6]), "teeth": cmfsim.SegmentData(joined=[7])},
         plan={"bone": np.eye(4), "teeth": np.eye(4)},
     )
     return cmfsim.read_plan(path, scene)

@@ -69,12 +69,7 @@ def bar(contrast: float = 1.0) -> tuple[Floats, NDArray[np.uint32], Problem]:
     materials = (isotropic(FAT, NU), isotropic(FAT * contrast, NU))
     end = where(nodes[:, 0] == 60.0)
     problem = Problem(
-        nodes,
-        tets,
-        materials,
-        material_of,
-        fixed=where(nodes[:, 0] == 0.0),
-        joined={"end": end},
+        nodes, tets, materials, material_of, fixed=where(nodes[:, 0] == 0.0), joined={"end": end}
     )
     return nodes, end, problem
 

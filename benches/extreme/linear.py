@@ -281,12 +281,7 @@ def run_cmfsim(case: Case, method: str) -> cmfsim.Solution:
 
 def judge(case: Case, method: str) -> Row:
     """Solves a case with a method and compares."""
-    blank = Row(
-        case.group,
-        case.name,
-        case.parameter,
-        method,
-    )
+    blank = Row(case.group, case.name, case.parameter, method)
     problem(case)
     begin = time.perf_counter()
     try:

@@ -15,11 +15,7 @@ from case import Case, Clock, NotInstalled, Result
 RESIDUAL = 1e-10
 """Relative residual at which conjugate gradients stop."""
 OPTIONS: dict[str, dict[str, object]] = {
-    "mumps": {
-        "ksp_type": "preonly",
-        "pc_type": "cholesky",
-        "pc_factor_mat_solver_type": "mumps",
-    },
+    "mumps": {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"},
     "gamg": {
         "ksp_type": "cg",
         "ksp_norm_type": "unpreconditioned",

@@ -33,10 +33,7 @@ def pardiso(matrix: object) -> Callable[[np.ndarray], np.ndarray]:
     return lambda b: solver.solve(upper, b).ravel()
 
 
-FACTORS = {
-    "cholmod": (cholmod, "scikit-sparse"),
-    "pardiso": (pardiso, "pypardiso"),
-}
+FACTORS = {"cholmod": (cholmod, "scikit-sparse"), "pardiso": (pardiso, "pypardiso")}
 
 
 def solve(case: Case, clock: Clock, method: str, threads: int, scratch: Path) -> Result:

@@ -173,11 +173,7 @@ class Tissue:
     def from_stiffness(stiffness: ArrayLike) -> Tissue: ...
     @staticmethod
     def preset(
-        name: str,
-        fraction: ArrayLike,
-        fibre: ArrayLike | None = None,
-        *,
-        mixing: str = "moduli",
+        name: str, fraction: ArrayLike, fibre: ArrayLike | None = None, *, mixing: str = "moduli"
     ) -> Tissue: ...
     @property
     def n_tets(self) -> int: ...
@@ -420,11 +416,7 @@ class IcpFit:
 def rigid_matrix(matrix: ArrayLike, name: str = "matrix") -> _Floats: ...
 def tube_levels(points: _Floats, segments: _Floats, outside: float) -> _Floats: ...
 def rigid_fit(
-    moving: ArrayLike,
-    fixed: ArrayLike,
-    *,
-    weights: ArrayLike | None = None,
-    scale: bool = False,
+    moving: ArrayLike, fixed: ArrayLike, *, weights: ArrayLike | None = None, scale: bool = False
 ) -> RigidFit: ...
 def icp(
     moving: ArrayLike,

@@ -25,9 +25,5 @@ def keep_freed_memory() -> None:
     # musl has neither.
     if not (hasattr(library, "gnu_get_libc_version") and hasattr(library, "mallopt")):
         return
-    for parameter, value in (
-        (ARENA_MAX, 1),
-        (MMAP_THRESHOLD, LARGEST),
-        (TRIM_THRESHOLD, KEPT),
-    ):
+    for parameter, value in ((ARENA_MAX, 1), (MMAP_THRESHOLD, LARGEST), (TRIM_THRESHOLD, KEPT)):
         library.mallopt(parameter, value)

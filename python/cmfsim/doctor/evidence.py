@@ -403,9 +403,5 @@ def _check_output(case: Case, findings: list[Finding]) -> None:
         return
     what = "is not writable" if folder.is_dir() else "is a file, not a folder"
     findings.append(
-        Finding(
-            "output-not-writable",
-            f"{folder} {what}",
-            where=case.where("output.folder"),
-        )
+        Finding("output-not-writable", f"{folder} {what}", where=case.where("output.folder"))
     )

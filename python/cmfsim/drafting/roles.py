@@ -73,15 +73,7 @@ REGISTERS = frozenset(
     ("registration", "register", "registered", "align", "alignment", "aligned", "icp")
 )
 # Segments that a plan may move; the cranium holds the head.
-MOVING = (
-    "maxilla",
-    "midface",
-    "mandible",
-    "mandible_body",
-    "ramus_left",
-    "ramus_right",
-    "chin",
-)
+MOVING = ("maxilla", "midface", "mandible", "mandible_body", "ramus_left", "ramus_right", "chin")
 # A name in two cases, or with digits, holds several words.
 WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 UMLAUTS = str.maketrans({"ß": "ss", "œ": "oe", "æ": "ae"})

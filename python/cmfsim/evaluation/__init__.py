@@ -1,19 +1,8 @@
 """Predictions against the post-operative skin: partners, distances, regions, tests (paper 3.2)."""
 
 from cmfsim.evaluation.comparison import SkinComparison, compare_skins
-from cmfsim.evaluation.conformal import (
-    calibrate,
-    cases_needed,
-    covered_interval,
-    region_scores,
-)
-from cmfsim.evaluation.models import (
-    NO_CHANGE,
-    WHOLE,
-    Improvement,
-    ModelComparison,
-    compare_models,
-)
+from cmfsim.evaluation.conformal import calibrate, cases_needed, covered_interval, region_scores
+from cmfsim.evaluation.models import NO_CHANGE, WHOLE, Improvement, ModelComparison, compare_models
 from cmfsim.evaluation.regions import REGIONS, skin_regions, unmoved_regions
 from cmfsim.evaluation.significance import (
     LEAST_PAIRS,

@@ -9,24 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, ThinPlateSpline
-from cmfsim.errors import (
-    CaseInputError,
-    LandmarkError,
-    LandmarkInputError,
-    RegistrationInputError,
-)
+from cmfsim.errors import CaseInputError, LandmarkError, LandmarkInputError, RegistrationInputError
 from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
 from cmfsim.evaluation.regions import skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
-from cmfsim.values.checks import (
-    Floats,
-    as_indices,
-    as_positive,
-    as_rows,
-    check_one_of,
-    frozen,
-)
+from cmfsim.values.checks import Floats, as_indices, as_positive, as_rows, check_one_of, frozen
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData

@@ -10,12 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.errors import CaseInputError
-from cmfsim.evaluation.comparison import (
-    Choice,
-    Landmarks,
-    SkinComparison,
-    compare_skins,
-)
+from cmfsim.evaluation.comparison import Choice, Landmarks, SkinComparison, compare_skins
 from cmfsim.evaluation.regions import skin_regions
 from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics

@@ -51,9 +51,7 @@ def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
 
 def _turned(what: str) -> Finding:
     return Finding(
-        "ct-flipped",
-        f"{what}: the image is flipped, or its header is wrong",
-        where="image",
+        "ct-flipped", f"{what}: the image is flipped, or its header is wrong", where="image"
     )
 
 

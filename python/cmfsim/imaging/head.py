@@ -145,10 +145,7 @@ def _bones(
     level = np.minimum(bone_values.result(), skin.level)
     parts = {"skull": level}
     if jaws.side is not None:
-        parts = {
-            "cranium": np.minimum(level, -jaws.side),
-            "mandible": np.minimum(level, jaws.side),
-        }
+        parts = {"cranium": np.minimum(level, -jaws.side), "mandible": np.minimum(level, jaws.side)}
     with ThreadPoolExecutor(THREADS) as pool:
         bones = dict(zip(parts, pool.map(work.image, parts.values()), strict=True))
     dense = teeth_level(bone, work, jaws.occlusal_height)

@@ -16,15 +16,7 @@ from cmfsim.imaging.intensities.intensity import (
     check_is_ct,
     saturation_of,
 )
-from cmfsim.imaging.morphology import (
-    Block,
-    Mask,
-    Volume,
-    binned,
-    label,
-    opened,
-    resampled_to,
-)
+from cmfsim.imaging.morphology import Block, Mask, Volume, binned, label, opened, resampled_to
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData

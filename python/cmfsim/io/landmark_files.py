@@ -28,12 +28,7 @@ from cmfsim.io.markups import (
 )
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.finding import Finding
-from cmfsim.values.landmark_sites import (
-    SKIN_LANDMARKS,
-    SKULL_LANDMARKS,
-    label_key,
-    named_site,
-)
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key, named_site
 
 # What each format means where it does not say: Slicer's markups schema, and its fiducial reader.
 UNSTATED: Mapping[str, str] = MappingProxyType({".json": "LPS", ".fcsv": "RAS"})

@@ -107,9 +107,7 @@ def markups_of(text: str, unstated: str) -> list[Markup]:
 
 
 def markup_of(
-    kind: str,
-    points: Iterable[tuple[str, Floats]],
-    descriptions: Mapping[str, str] | None = None,
+    kind: str, points: Iterable[tuple[str, Floats]], descriptions: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """A markup as Slicer writes it, LPS mm, with a description of each point by label."""
     said = descriptions or {}

@@ -402,11 +402,7 @@ def _findings(
                 fix="close the surface in the template",
             )
         if volume.inside == 0.0:
-            yield Finding(
-                "muscle-missed",
-                f"{name} contains no sample of any tet",
-                where=name,
-            )
+            yield Finding("muscle-missed", f"{name} contains no sample of any tet", where=name)
         elif volume.enclosed is not None:
             lost = 1.0 - volume.inside / volume.enclosed
             if lost > LOST_PART and lost * volume.enclosed > 3.0 * volume.error:

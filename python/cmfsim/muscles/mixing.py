@@ -54,11 +54,7 @@ def mixed_tissue(
     # Fat has no direction; any unit vector serves.
     fibre = np.where(p[:, np.newaxis] > 0.0, shares.fibre, [1.0, 0.0, 0.0])
     data = TissueData(
-        "transversely_isotropic",
-        young_along=along,
-        young_across=across,
-        poisson=ratio,
-        fibre=fibre,
+        "transversely_isotropic", young_along=along, young_across=across, poisson=ratio, fibre=fibre
     )
     return Tissue.transversely_isotropic(along, across, ratio, fibre), data
 

@@ -7,16 +7,7 @@ the other side is its mirror image), y backwards, z up; the Frankfort plane is z
 import numpy as np
 
 from cmfsim.phantom.geometry.curves import Table, smooth_curve, turn_about
-from cmfsim.phantom.geometry.shapes import (
-    Blend,
-    Box,
-    Egg,
-    Engraving,
-    Loft,
-    Plane,
-    Step,
-    Tube,
-)
+from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, Engraving, Loft, Plane, Step, Tube
 from cmfsim.phantom.parameters import HeadParameters
 
 # The box of the head, mm, with the neck cut off below.
@@ -36,13 +27,7 @@ def _engrave(points: list[list[float]], width: float, behind: float = -40.0) -> 
 
 def skin_shape(p: HeadParameters) -> Blend:
     """The skin of one person in the canonical frame."""
-    steps: list[Step | Engraving] = [
-        *_head(p),
-        *_eyes(),
-        *_nose(p),
-        *_mouth(p),
-        *_ear(),
-    ]
+    steps: list[Step | Engraving] = [*_head(p), *_eyes(), *_nose(p), *_mouth(p), *_ear()]
     steps.append(Step("meet", Plane((0.0, 0.0, NECK_CUT), (0.0, 0.0, -1.0)), 0.0))
     return Blend(tuple(steps), HEAD_BOX)
 

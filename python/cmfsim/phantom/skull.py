@@ -141,10 +141,7 @@ def _orbits_and_arches() -> tuple[Step, ...]:
         # Lateral wall of the orbit, between it and the temple.
         Step(
             "join",
-            _plate(
-                [[40.5, -50, 18, 1.6, 10.5], [38, -47, 18.5, 1.6, 10]],
-                (0.82, 0.57, 0),
-            ),
+            _plate([[40.5, -50, 18, 1.6, 10.5], [38, -47, 18.5, 1.6, 10]], (0.82, 0.57, 0)),
             3.0,
         ),
         # Arch: from the cheekbone free of the temple to the ear.

@@ -19,12 +19,7 @@ from cmfsim.pictures.distances import (
     picture_distance_grid,
     picture_distances,
 )
-from cmfsim.pictures.faces import (
-    picture_plan,
-    picture_prediction,
-    plan_picture,
-    prediction_picture,
-)
+from cmfsim.pictures.faces import picture_plan, picture_prediction, plan_picture, prediction_picture
 from cmfsim.pictures.landmarks import picture_landmarks
 from cmfsim.pictures.muscles import picture_muscles
 from cmfsim.pictures.window import ViewPart, has_screen, view_parts

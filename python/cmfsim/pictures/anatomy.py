@@ -41,10 +41,7 @@ OTHER_COLOURS = ("#76b7b2", "#b6992d", "#d37295", "#79706e", "#86bcb6", "#9d7660
 
 
 def picture_segments(
-    path: str | os.PathLike[str],
-    segments: Sequence[BoneSegment],
-    *,
-    size: tuple[int, int] = SIZE,
+    path: str | os.PathLike[str], segments: Sequence[BoneSegment], *, size: tuple[int, int] = SIZE
 ) -> None:
     """Writes a picture of bone segments in colours: from the front, the left front and the left.
 
@@ -193,10 +190,7 @@ def picture_node_kinds(
             if len(corner):
                 count = np.arange(3 * len(corner)).reshape(-1, 3)
                 plotter.add_mesh(
-                    polydata(corner.reshape(-1, 3), count),
-                    color=colour,
-                    ambient=0.25,
-                    specular=0.0,
+                    polydata(corner.reshape(-1, 3), count), color=colour, ambient=0.25, specular=0.0
                 )
 
     views = (

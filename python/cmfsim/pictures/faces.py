@@ -27,10 +27,7 @@ STAYS = 0.5
 
 
 def picture_prediction(
-    path: str | os.PathLike[str],
-    prediction: Prediction,
-    *,
-    size: tuple[int, int] = TWO_ROWS,
+    path: str | os.PathLike[str], prediction: Prediction, *, size: tuple[int, int] = TWO_ROWS
 ) -> None:
     """Writes a picture of a face before and after, and how far each point of it moves.
 
@@ -110,10 +107,7 @@ def picture_faces(
 
 
 def picture_plan(
-    path: str | os.PathLike[str],
-    prediction: Prediction,
-    *,
-    size: tuple[int, int] = SIZE,
+    path: str | os.PathLike[str], prediction: Prediction, *, size: tuple[int, int] = SIZE
 ) -> None:
     """Writes a picture of a plan: bone segments where they go, and behind them where they were.
 

@@ -25,15 +25,7 @@ from cmfsim.values.skin_band import WHOLE_FACE, SkinBand
 from cmfsim.values.uncertainty import ADDED, NOT_COVERED, band_sources
 
 # Regions of `skin_regions` that a band holds simultaneously, each by itself.
-BAND_REGIONS = (
-    WHOLE_FACE,
-    "nose",
-    "upper lip",
-    "lower lip",
-    "chin",
-    "left cheek",
-    "right cheek",
-)
+BAND_REGIONS = (WHOLE_FACE, "nose", "upper lip", "lower lip", "chin", "left cheek", "right cheek")
 
 
 # Noses and necks, which are deeper, do not become thicker as cheeks do, mm.

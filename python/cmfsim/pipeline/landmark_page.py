@@ -19,11 +19,7 @@ PAGE_FILE = "landmarks.html"
 
 
 def head_content(
-    name: str,
-    head: ProposedHead,
-    placed: GivenSites | None = None,
-    *,
-    built_for: str = "",
+    name: str, head: ProposedHead, placed: GivenSites | None = None, *, built_for: str = ""
 ) -> LandmarkContent:
     """The content of the page of a head.
 
@@ -59,9 +55,7 @@ def head_content(
 
 
 def _sites(
-    found: ProposedLandmarks,
-    distribution: SiteDistribution,
-    placed: GivenSites,
+    found: ProposedLandmarks, distribution: SiteDistribution, placed: GivenSites
 ) -> list[PageSite]:
     errors = distribution.errors
     proposed = {"skull": found.skull, "skin": found.skin}

@@ -148,11 +148,7 @@ class _Drawing:
     """The pictures of predictions as they are begun, in a folder for each of several models."""
 
     def __init__(
-        self,
-        painter: Painter,
-        fresh: Path,
-        models: Sequence[str],
-        wanted: Callable[[str], bool],
+        self, painter: Painter, fresh: Path, models: Sequence[str], wanted: Callable[[str], bool]
     ) -> None:
         self._painter, self._fresh = painter, fresh
         self._models, self._wanted = models, wanted

@@ -242,8 +242,7 @@ def _apart(before: Musculature, after: Musculature) -> dict[str, float]:
     return {
         muscle.name: float(
             np.linalg.norm(
-                after[muscle.name].surface.vertices - muscle.surface.vertices,
-                axis=1,
+                after[muscle.name].surface.vertices - muscle.surface.vertices, axis=1
             ).mean()
         )
         for muscle in before

@@ -48,10 +48,6 @@ def _evaluated(case: Case, models: Sequence[str]) -> bool:
         return False
     evaluation = evaluate(case, models, check=False, findings=found)
     write_results(
-        case.output,
-        evaluation.predictions,
-        models,
-        stage=_log.info,
-        evaluation=lambda: evaluation,
+        case.output, evaluation.predictions, models, stage=_log.info, evaluation=lambda: evaluation
     )
     return True

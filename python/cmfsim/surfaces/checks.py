@@ -289,11 +289,7 @@ def _areas_volumes(vertices: Floats, triangles: NDArray[np.int64]) -> tuple[Floa
 
 
 def _components(
-    vertices: Floats,
-    triangles: NDArray[np.int64],
-    edges: Edges,
-    areas: Floats,
-    volumes: Floats,
+    vertices: Floats, triangles: NDArray[np.int64], edges: Edges, areas: Floats, volumes: Floats
 ) -> tuple[Component, ...]:
     labels = component_labels(edges, len(triangles))
     if not len(labels):

@@ -74,11 +74,7 @@ class _Grid:
         step = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
         span = spans[owner]
         offset = np.stack(
-            [
-                step % span[:, 0],
-                step // span[:, 0] % span[:, 1],
-                step // (span[:, 0] * span[:, 1]),
-            ],
+            [step % span[:, 0], step // span[:, 0] % span[:, 1], step // (span[:, 0] * span[:, 1])],
             axis=1,
         )
         place = first[owner] + offset

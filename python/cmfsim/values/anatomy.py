@@ -12,11 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    Frozen,
-    as_text,
-    check_instance,
-)
+from cmfsim.values.checks import Frozen, as_text, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData

@@ -229,10 +229,7 @@ def clinical_motion(
 
 
 def planned_motion(
-    point: ArrayLike,
-    *,
-    shift: ArrayLike = (0.0, 0.0, 0.0),
-    turn: ArrayLike = (0.0, 0.0, 0.0),
+    point: ArrayLike, *, shift: ArrayLike = (0.0, 0.0, 0.0), turn: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Floats:
     """The rigid motion with given clinical numbers at a point: the inverse of `clinical_motion`.
 
@@ -313,10 +310,7 @@ def _parts(entries: Iterable[tuple[float, str, str]], least: float) -> list[tupl
 def _pairs(motion: ArrayLike | MovedSurface, points: Floats | None) -> tuple[Floats, Floats] | None:
     """Places before and after, where a motion is given vertex by vertex."""
     if isinstance(motion, MovedSurface):
-        return (
-            motion.surface.vertices,
-            motion.moved_vertices,
-        )
+        return (motion.surface.vertices, motion.moved_vertices)
     shifts = np.asarray(motion, dtype=np.float64)
     return (
         (points, points + shifts) if points is not None and shifts.shape == points.shape else None

@@ -5,13 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    Floats,
-    Frozen,
-    as_number,
-    as_point,
-    check_one_of,
-)
+from cmfsim.values.checks import Floats, Frozen, as_number, as_point, check_one_of
 
 JAWS = ("upper", "lower")
 # Half the width, and the length, of the smallest arch, mm: less is landmarks exchanged or in cm.

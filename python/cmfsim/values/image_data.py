@@ -8,13 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    Floats,
-    Frozen,
-    as_point,
-    as_rows,
-    as_unmasked,
-)
+from cmfsim.values.checks import Floats, Frozen, as_point, as_rows, as_unmasked
 
 # Points that are looked up at a time.
 AT_A_TIME = 8192

@@ -6,11 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    Frozen,
-    check_one_of,
-    frozen,
-)
+from cmfsim.values.checks import Frozen, check_one_of, frozen
 
 # Kinds of node (paper 2.5), by the number that files hold.
 NODE_KINDS = ("free", "fixed", "joined", "sliding")

@@ -154,10 +154,7 @@ class ProposedLandmarks:
         return tuple(self._findings())
 
     def _findings(self) -> Iterator[Finding]:
-        sites = {
-            **self.skull,
-            **{f"{name} (skin)": site for name, site in self.skin.items()},
-        }
+        sites = {**self.skull, **{f"{name} (skin)": site for name, site in self.skin.items()}}
         typical = sorted(s.error for s in sites.values() if s.origin == "proposed")
         count = len(typical)
         yield from _following(sites)

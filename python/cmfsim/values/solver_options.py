@@ -5,10 +5,7 @@ from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    as_positive,
-    check_one_of,
-)
+from cmfsim.values.checks import as_positive, check_one_of
 
 CONTACTS = ("bilateral", "unilateral")
 

@@ -8,14 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    Floats,
-    Frozen,
-    as_floats,
-    as_text,
-    check_one_of,
-    frozen,
-)
+from cmfsim.values.checks import Floats, Frozen, as_floats, as_text, check_one_of, frozen
 
 # Arrays that each kind of tissue needs, with the number of axes after the first.
 TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(

@@ -70,8 +70,7 @@ def test_files_written_together_stay_together_whenever_the_writer_is_killed(tmp_
     seen = set()
     for number in range(12):
         writer = subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(tmp_path), str(100 * number)],
-            stdout=subprocess.PIPE,
+            [sys.executable, "-c", WRITER, str(tmp_path), str(100 * number)], stdout=subprocess.PIPE
         )
         assert writer.stdout.readline() == b"ready\n"
         time.sleep(0.02 + 0.15 * rng.random())

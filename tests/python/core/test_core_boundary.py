@@ -106,8 +106,7 @@ def test_any_layout_gives_the_same_bits(layout):
     matrix = cmfsim.rigid_motion((1, 2, 3), 30, (1, 2, 3))
     surface = mesh.surface()
     np.testing.assert_array_equal(
-        surface.transformed(variants(matrix)[layout]).vertices,
-        surface.transformed(matrix).vertices,
+        surface.transformed(variants(matrix)[layout]).vertices, surface.transformed(matrix).vertices
     )
 
 

@@ -14,13 +14,7 @@ import meshes
 skfem = pytest.importorskip("skfem")
 from skfem.models.elasticity import linear_elasticity  # noqa: E402
 
-from independent import (  # noqa: E402
-    corotational_stress,
-    internal_forces,
-    lame,
-    neo_hookean_stress,
-    space_of,
-)
+from independent import corotational_stress, internal_forces, lame, neo_hookean_stress, space_of  # noqa: E402
 from panels import BEAM, COOK, far_side_loads, panel  # noqa: E402
 
 Array = NDArray[np.float64]

@@ -15,11 +15,7 @@ from extreme.rows import ALL, FAST
 
 CASES = linear.cases()
 SOLVED = [
-    pytest.param(
-        case,
-        method,
-        id=f"{case.key} [{method}]",
-    )
+    pytest.param(case, method, id=f"{case.key} [{method}]")
     for case in CASES
     for method in case.methods
 ]

@@ -53,10 +53,7 @@ def reference(nodes, tets, young, held, moved, pairs):
     u[free] = factor.solve(-(stiffness @ u)[free])
     rows = np.arange(len(pairs))
     gaps = scipy.sparse.coo_array(
-        (
-            np.tile([1.0, -1.0], len(pairs)),
-            (np.repeat(rows, 2), (3 * pairs + 2).ravel()),
-        ),
+        (np.tile([1.0, -1.0], len(pairs)), (np.repeat(rows, 2), (3 * pairs + 2).ravel())),
         shape=(len(pairs), len(u)),
     ).tocsr()[:, free]
     moves = factor.solve(gaps.T.toarray())

@@ -219,11 +219,7 @@ DEFECTS = {
         "warning",
         "surface-open",
     ),
-    "skin crosses itself": (
-        folded,
-        "warning",
-        "surface-crossing",
-    ),
+    "skin crosses itself": (folded, "warning", "surface-crossing"),
     "skin with an inner wall": (with_inner_wall, "warning", "surface-inner-wall"),
     "skin with an inner wall that faces outwards": (
         lambda h: with_inner_wall(h, inwards=False),
@@ -263,16 +259,8 @@ DEFECTS = {
         "warning",
         "edge-length-coarse",
     ),
-    "plan 30 mm": (
-        lambda h: h.replace("[0, -4, 1]", "[0, 30, 0]"),
-        "warning",
-        "plan-far",
-    ),
-    "plan 400 mm": (
-        lambda h: h.replace("[0, -4, 1]", "[0, -400, 0]"),
-        "error",
-        "plan-far",
-    ),
+    "plan 30 mm": (lambda h: h.replace("[0, -4, 1]", "[0, 30, 0]"), "warning", "plan-far"),
+    "plan 400 mm": (lambda h: h.replace("[0, -4, 1]", "[0, -400, 0]"), "error", "plan-far"),
     "turn about the origin": (
         lambda h: h.replace("angle = 2\naxis = [1, 0, 0]\ncentre = [3, -100, 1450]", "angle = 3"),
         "error",
@@ -287,10 +275,7 @@ DEFECTS = {
         "plan-turned",
     ),
     "bone moved through the skin": (
-        lambda h: (
-            shifted(h, "mandible", [0, -22.0, 0]),
-            h.replace("[0, -4, 1]", "[0, -15, 0]"),
-        ),
+        lambda h: (shifted(h, "mandible", [0, -22.0, 0]), h.replace("[0, -4, 1]", "[0, -15, 0]")),
         "warning",
         "plan-through-skin",
     ),
@@ -323,11 +308,7 @@ DEFECTS = {
     ),
     "unknown preset": (lambda h: h.replace("kim2010", "kim2011"), "error", "unknown-name"),
     "missing skin": (lambda h: h.replace("skin.ply", "face.ply"), "error", "file-missing"),
-    "missing landmarks": (
-        lambda h: h.replace("skull.mrk", "no.mrk"),
-        "error",
-        "file-missing",
-    ),
+    "missing landmarks": (lambda h: h.replace("skull.mrk", "no.mrk"), "error", "file-missing"),
     "output is a file": (
         lambda h: h.replace("[tissue]", '[output]\nfolder = "skin.ply"\n\n[tissue]'),
         "error",

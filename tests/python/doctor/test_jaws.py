@@ -95,10 +95,7 @@ def test_a_whole_jaw_that_leaves_its_joint_lacks_a_split():
 def test_tables_of_the_jaws_exchanged_or_with_other_signs_are_found(tmp_path_factory, wrong):
     """The embedded case: the maxilla forwards, the mandible back; and the other way round."""
     patient = coarse_demo_patient(tmp_path_factory)
-    plan = {
-        "maxilla": shifted(y=-5.0, z=0.5),
-        "mandible_body": shifted(y=3.5, z=0.5),
-    }
+    plan = {"maxilla": shifted(y=-5.0, z=0.5), "mandible_body": shifted(y=3.5, z=0.5)}
     made = {
         "exchanged": {"maxilla": plan["mandible_body"], "mandible_body": plan["maxilla"]},
         "reversed": {name: np.linalg.inv(motion) for name, motion in plan.items()},

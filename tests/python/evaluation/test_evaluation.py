@@ -252,11 +252,7 @@ def test_mappings_are_matched_by_name_and_the_result_ignores_their_order():
             cmfsim.LandmarkError,
             "4 landmarks of one skin and 3",
         ),
-        (
-            {"landmarks": (np.eye(3), np.eye(3))},
-            cmfsim.RegistrationError,
-            "four|4",
-        ),
+        ({"landmarks": (np.eye(3), np.eye(3))}, cmfsim.RegistrationError, "four|4"),
     ],
 )
 def test_bad_comparisons_are_named(arguments, error, pattern):

@@ -466,8 +466,7 @@ def test_the_real_jaws_are_parted_without_landmarks(coarse_phantom, reference):
 
 @needs_phantom
 @pytest.mark.parametrize(
-    ("axis", "code"),
-    [pytest.param(1, "ct-flipped", marks=pytest.mark.slow), (2, "ct-flipped")],
+    ("axis", "code"), [pytest.param(1, "ct-flipped", marks=pytest.mark.slow), (2, "ct-flipped")]
 )
 def test_a_flipped_real_ct_is_found(coarse_phantom, axis, code):
     flipped = coarse_phantom.with_values(np.flip(coarse_phantom.values, axis))

@@ -149,14 +149,8 @@ LINEAR = '<LinearTransform id="t1" name="A" matrixTransformToParent="{}"/>'
         ("", "is not in the scene"),
         ('<LinearTransform id="t1" name="A" references="transform:t1;"/>', "its own parent"),
         ('<LinearTransform id="t1" name="A" matrixTransformToParent="1 0 0"/>', "16 are needed"),
-        (
-            LINEAR.format("2 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1"),
-            "cannot be used as a rigid motion",
-        ),
-        (
-            LINEAR.format("nan 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1"),
-            "cannot be used as a rigid motion",
-        ),
+        (LINEAR.format("2 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1"), "cannot be used as a rigid motion"),
+        (LINEAR.format("nan 0 0 0  0 1 0 0  0 0 1 0  0 0 0 1"), "cannot be used as a rigid motion"),
         ('<BSplineTransform id="t1" name="A"></BSplineTransform>', "check that it is linear"),
         (
             '<LinearTransform id="t1" name="A" references="storage:s2;"/>'

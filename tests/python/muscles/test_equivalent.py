@@ -59,10 +59,7 @@ def test_moduli_mix_as_the_paper_says(preset):
     young, nu = FAT[preset]
     fibre = np.where(p[:, None] > 0.0, mixture.fibre, [1.0, 0.0, 0.0])
     expected = cmfsim.Tissue.transversely_isotropic(
-        young * (1 - p) + along * p,
-        young * (1 - p) + across * p,
-        nu * (1 - p) + poisson * p,
-        fibre,
+        young * (1 - p) + along * p, young * (1 - p) + across * p, nu * (1 - p) + poisson * p, fibre
     )
     assert np.allclose(mixture.tissue.stiffness(), expected.stiffness(), rtol=1e-12, atol=1e-15)
     assert mixture.tissue.smallest_eigenvalues().min() > 0.0

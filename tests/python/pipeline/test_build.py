@@ -405,10 +405,9 @@ def test_writing_that_fails_half_way_leaves_the_old_results(
             raise error
         return real(*arguments, **options)
 
-    owner, name = {
-        "draw": (case_model, "picture_anatomy"),
-        "move": (Path, "replace"),
-    }.get(call, (models, call))
+    owner, name = {"draw": (case_model, "picture_anatomy"), "move": (Path, "replace")}.get(
+        call, (models, call)
+    )
     real = getattr(owner, name)
     with monkeypatch.context() as patch:
         if call != "draw":

@@ -71,20 +71,13 @@ HARD = {
         (0.3, 3.0, 0.9),
     ),
     "pillow and holder": (
-        lambda i: variants.with_holder(
-            variants.with_pillow(variants.without_couch(i, -107.0)),
-        ),
+        lambda i: variants.with_holder(variants.with_pillow(variants.without_couch(i, -107.0))),
         {"rest-removed"},
         (0.9, 1.1),
         (0.3, 1.0, 0.9),
     ),
     "noise": (lambda i: variants.with_noise(i, 60.0), set(), (0.9, 1.1), (0.3, 1.0, 0.85)),
-    "voxels of 3 mm": (
-        lambda i: resampled(i, 3.0),
-        {"ct-spacing-coarse"},
-        (0.85, 1.1),
-        None,
-    ),
+    "voxels of 3 mm": (lambda i: resampled(i, 3.0), {"ct-spacing-coarse"}, (0.85, 1.1), None),
     "raw": (
         lambda i: i.with_values((i.values.astype(np.int32) + 1024).astype(np.uint16)),
         {"ct-not-hu"},

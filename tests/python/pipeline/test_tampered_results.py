@@ -7,15 +7,7 @@ import json
 import random
 
 import pytest
-from test_stale_results import (  # noqa: F401 (fixtures)
-    PNG,
-    as_model,
-    case,
-    evaluation,
-    no_pictures,
-    prediction,
-    write,
-)
+from test_stale_results import PNG, as_model, case, evaluation, no_pictures, prediction, write  # noqa: F401 (fixtures)
 
 import cmfsim
 from cmfsim.cli import main

@@ -102,10 +102,7 @@ def test_noise_is_within_the_stated_deviations(planning):
 def test_bounds_hold_and_are_named(planning):
     rng = np.random.default_rng(2)
     points = moving_points(planning, 60, rng)
-    plan = {
-        "maxilla": cmfsim.rigid_motion((0, -9, 0)),
-        "mandible": cmfsim.rigid_motion((0, 2, 0)),
-    }
+    plan = {"maxilla": cmfsim.rigid_motion((0, -9, 0)), "mandible": cmfsim.rigid_motion((0, 2, 0))}
     goals = points + planning.carried(plan, points)
     search = cmfsim.FaceSearch(shift=6.0)
     found = cmfsim.plan_for_face(planning, [cmfsim.PointTarget(points, goals)], search, exact=False)
@@ -148,10 +145,7 @@ def test_a_measure_is_met_by_the_smallest_move(planning):
 
 
 def test_the_face_of_a_plan_is_found_as_a_surface(planning):
-    plan = {
-        "maxilla": cmfsim.rigid_motion((0, -4, 1)),
-        "mandible": cmfsim.rigid_motion((1, 3, 0)),
-    }
+    plan = {"maxilla": cmfsim.rigid_motion((0, -4, 1)), "mandible": cmfsim.rigid_motion((1, 3, 0))}
     wish = cmfsim.SurfaceTarget(planning.skin(plan), std=0.1)
     found = cmfsim.plan_for_face(planning, [wish], exact=False)
     reached = planning.displacements(found.plan)

@@ -36,11 +36,7 @@ def bone(n=30):
     theta, phi = np.meshgrid(np.linspace(0.2, 1.8, n), np.linspace(0, 5.0, n), indexing="ij")
     r = 30 + 4 * np.sin(2 * theta) * np.cos(3 * phi) + 3 * np.sin(phi)
     points = np.stack(
-        [
-            r * np.sin(theta) * np.cos(phi),
-            0.8 * r * np.sin(theta) * np.sin(phi),
-            r * np.cos(theta),
-        ],
+        [r * np.sin(theta) * np.cos(phi), 0.8 * r * np.sin(theta) * np.sin(phi), r * np.cos(theta)],
         axis=-1,
     ).reshape(-1, 3)
     i = np.arange(n * n).reshape(n, n)

@@ -70,11 +70,7 @@ def test_a_missing_site_is_where_the_others_put_it(bone):
 def test_a_head_in_another_pose_and_size_has_the_same_distribution(bone):
     angle = np.deg2rad(20.0)
     turn = np.array(
-        [
-            [1.0, 0.0, 0.0],
-            [0.0, np.cos(angle), -np.sin(angle)],
-            [0.0, np.sin(angle), np.cos(angle)],
-        ]
+        [[1.0, 0.0, 0.0], [0.0, np.cos(angle), -np.sin(angle)], [0.0, np.sin(angle), np.cos(angle)]]
     )
     shift = np.array([10.0, 1500.0, -40.0])
     plain = site_covariance(proposal(gone=("gonion_L",)), bone)

@@ -437,10 +437,7 @@ def test_options_replace_those_of_the_scene(saved, capsys):
     """--method, --contact and --plan win over the file."""
     s = dataclasses.replace(
         scene(),
-        segments={
-            "bone": cmfsim.SegmentData(joined=HIGH),
-            "floor": scene().segments["floor"],
-        },
+        segments={"bone": cmfsim.SegmentData(joined=HIGH), "floor": scene().segments["floor"]},
         plan={"bone": np.eye(4), "floor": np.eye(4)},
     )
     cmfsim.write_scene(saved, s)

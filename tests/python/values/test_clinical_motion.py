@@ -34,10 +34,7 @@ def about(angle, axis, translation=(0, 0, 0)):
     [
         (about(0, (1, 0, 0), (0, -5, 0)), f"5.0 mm forwards {AT}"),
         (about(0, (1, 0, 0), (0, 5, 0)), f"5.0 mm backwards {AT}"),
-        (
-            about(0, (1, 0, 0), (1, -5, 0.5)),
-            f"5.0 mm forwards, 0.5 mm up, 1.0 mm to the left {AT}",
-        ),
+        (about(0, (1, 0, 0), (1, -5, 0.5)), f"5.0 mm forwards, 0.5 mm up, 1.0 mm to the left {AT}"),
         (about(0, (1, 0, 0), (-1, 0, -0.5)), f"0.5 mm down, 1.0 mm to the right {AT}"),
         (about(-2, (1, 0, 0)), f"0.0 mm {AT}; pitch +2.0° (front up)"),
         (about(2, (1, 0, 0)), f"0.0 mm {AT}; pitch −2.0° (front down)"),
@@ -46,10 +43,7 @@ def about(angle, axis, translation=(0, 0, 0)):
         (about(-4, (0, 1, 0)), f"0.0 mm {AT}; roll +4.0° (left side up)"),
         (about(4, (0, 1, 0)), f"0.0 mm {AT}; roll −4.0° (left side down)"),
         (about(0, (1, 0, 0), (0, -0.005, 0)), f"0.005 mm forwards {AT}"),
-        (
-            about(0.035, (1, 0, 0), (0, -5, 0)),
-            f"5.0 mm forwards {AT}; pitch −0.035° (front down)",
-        ),
+        (about(0.035, (1, 0, 0), (0, -5, 0)), f"5.0 mm forwards {AT}; pitch −0.035° (front down)"),
         (np.eye(4), "stays"),
     ],
 )

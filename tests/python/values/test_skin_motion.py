@@ -82,9 +82,7 @@ def test_a_turn_of_the_skin_does_not_swing_what_is_far_from_it():
     assert size.max() < 2.0 * STEP * np.sin(np.radians(10.0))
     near = skin.vertices + [0.0, 0.0, 1.0]
     np.testing.assert_allclose(
-        carried_points(skin, moved, near),
-        near @ turn[:3, :3].T + turn[:3, 3] - near,
-        atol=1e-9,
+        carried_points(skin, moved, near), near @ turn[:3, :3].T + turn[:3, 3] - near, atol=1e-9
     )
 
 

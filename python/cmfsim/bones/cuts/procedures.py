@@ -127,9 +127,7 @@ def procedure_options(kind: str) -> dict[str, float]:
 
 
 def place_procedure(
-    kind: str,
-    landmarks: Mapping[str, ArrayLike],
-    options: Mapping[str, float] | None = None,
+    kind: str, landmarks: Mapping[str, ArrayLike], options: Mapping[str, float] | None = None
 ) -> Procedure:
     """The procedure with its planes placed from skull landmarks.
 
@@ -237,12 +235,7 @@ def _upper_frame(kind: str, points: Mapping[str, Floats]) -> _Frame:
     above = np.cross(left - tip, right - tip)
     above = above * (np.sign(above[2]) or 1.0)
     return _frame(
-        kind,
-        points,
-        ("supra_m2",),
-        tip=tip,
-        back=_middle(points, "supra_m2"),
-        above=above,
+        kind, points, ("supra_m2",), tip=tip, back=_middle(points, "supra_m2"), above=above
     )
 
 
@@ -338,10 +331,7 @@ def _bsso(
     frame = _lower_frame("bsso", points)
     middle = 0.5 * (points["infradentale"] + points["menton"])
     cuts = []
-    for side, name, outward in (
-        ("L", "ramus_left", frame.left),
-        ("R", "ramus_right", -frame.left),
-    ):
+    for side, name, outward in (("L", "ramus_left", frame.left), ("R", "ramus_right", -frame.left)):
         molar, angle = points[f"sub_m2_{side}"], points[f"gonion_{side}"]
         outer = molar + options["setback"] * _unit("bsso", f"sub_m2_{side}, gonion", angle - molar)
         behind = _turned(-frame.front, outward, options["angle"])

@@ -48,9 +48,7 @@ class AlongSurface:
         matrix = sparse.diags_array(1.0 / total) @ matrix
         far = ((self.here[a] - self.here[b]) ** 2).sum(axis=1)
         spread = np.bincount(
-            np.concatenate([a, b]),
-            np.concatenate([far * self.areas[b], far * self.areas[a]]),
-            n,
+            np.concatenate([a, b]), np.concatenate([far * self.areas[b], far * self.areas[a]]), n
         )
         # Two dimensions: the variance along one axis is half of the mean square.
         return matrix, max(0.5 * float(np.median(spread / total)), 1e-6)

@@ -16,13 +16,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface
 from cmfsim.bones.motion import RemovedBone, missing_patches
-from cmfsim.bones.pairs.rigid_pieces import (
-    PASSES,
-    QUIET,
-    PairedBone,
-    median,
-    rigid_pieces,
-)
+from cmfsim.bones.pairs.rigid_pieces import PASSES, QUIET, PairedBone, median, rigid_pieces
 from cmfsim.values.checks import Floats, Frozen
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface
@@ -143,11 +137,7 @@ def coherent_motion(motion: MovedSurface) -> CoherentMotion:
         mine = np.flatnonzero(piece == number)
         found.append(RigidPiece(matrix, float(paired.areas[mine].sum()), mine))
     return CoherentMotion(
-        MovedSurface(motion.surface, deviation.rigid + rest),
-        tuple(found),
-        removed,
-        slip,
-        noise,
+        MovedSurface(motion.surface, deviation.rigid + rest), tuple(found), removed, slip, noise
     )
 
 

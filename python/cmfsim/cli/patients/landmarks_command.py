@@ -19,11 +19,7 @@ from cmfsim.errors import CmfsimError, LandmarkError
 from cmfsim.io import Case
 from cmfsim.io.landmark_files import write_landmarks
 from cmfsim.pictures import picture_landmarks
-from cmfsim.pipeline.building.inputs import (
-    read_anatomy,
-    read_case_landmarks,
-    read_placed_sites,
-)
+from cmfsim.pipeline.building.inputs import read_anatomy, read_case_landmarks, read_placed_sites
 from cmfsim.pipeline.filling import filled_landmarks
 from cmfsim.pipeline.landmark_page import PAGE_FILE, head_content, write_landmark_page
 from cmfsim.pipeline.preparation import prepare

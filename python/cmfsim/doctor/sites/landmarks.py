@@ -13,12 +13,7 @@ from cmfsim._core import Surface
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.doctor.sites.places import direction_text, place_text, shift_text
 from cmfsim.errors import LandmarkError, RegistrationError
-from cmfsim.registration import (
-    common_shift,
-    leave_one_out,
-    mirror_agreement,
-    swapped_names,
-)
+from cmfsim.registration import common_shift, leave_one_out, mirror_agreement, swapped_names
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
@@ -256,12 +251,7 @@ def _asymmetric(
             else f"{base}_L and {base}_R deviate from mirror symmetry by {distance:.1f} mm, "
             "judged by the other landmarks"
         )
-        yield Finding(
-            "landmark-asymmetric",
-            what,
-            where=where,
-            facts={"placed": PLACED_FROM[key]},
-        )
+        yield Finding("landmark-asymmetric", what, where=where, facts={"placed": PLACED_FROM[key]})
 
 
 def _disagreeing(key: str, landmarks: Mapping[str, Floats], where: str) -> Iterator[Finding]:

@@ -328,10 +328,7 @@ def _check_directions(
     elif signs[1] < 0 or signs[2] < 0:
         what = "the face looks backwards" if signs[1] < 0 else "the head is upside down"
         yield Finding(
-            "frame-turned",
-            f"according to its landmarks, {what}",
-            severity="error",
-            where=where,
+            "frame-turned", f"according to its landmarks, {what}", severity="error", where=where
         )
     elif any(v is not None and s == 0 for v, s in zip((left, back, up), signs, strict=True)):
         yield Finding(

@@ -9,11 +9,7 @@ NAMED_SHARE = 0.6
 # Components of a shift that are named: at least this share of the largest.
 SHIFT_SHARE = 0.3
 # Towards the negative and the positive end of each axis, L, P, S.
-DIRECTIONS = (
-    ("to the right of", "to the left of"),
-    ("in front of", "behind"),
-    ("below", "above"),
-)
+DIRECTIONS = (("to the right of", "to the left of"), ("in front of", "behind"), ("below", "above"))
 SHIFTS = (
     ("too far to the right", "too far to the left"),
     ("too far forwards", "too far back"),

@@ -7,13 +7,7 @@ import numpy as np
 from cmfsim.drafting.case_lines import Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.drafting.roles import MOVING, safe_key
-from cmfsim.drafting.surfaces.anatomy import (
-    FLIP,
-    SAMPLES,
-    UNITS,
-    Anatomy,
-    Question,
-)
+from cmfsim.drafting.surfaces.anatomy import FLIP, SAMPLES, UNITS, Anatomy, Question
 from cmfsim.drafting.surfaces.teeth import ROWS, add_teeth, report_joined
 from cmfsim.values.checks import Floats
 

@@ -199,11 +199,7 @@ def _median(part: Volume, spacing: NDArray[np.float64]) -> Volume:
 
 
 def without_streaks(
-    mask: Mask,
-    metal: Metal,
-    spacing: NDArray[np.float64],
-    *,
-    bone: bool = False,
+    mask: Mask, metal: Metal, spacing: NDArray[np.float64], *, bone: bool = False
 ) -> Mask:
     """The mask without thin pieces that stand far out from it in the slices of the metal.
 

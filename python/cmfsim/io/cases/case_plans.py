@@ -13,12 +13,7 @@ from cmfsim.io.cases.case_tables import checked_name, file_of, plane_of, stated_
 from cmfsim.io.cases.tables import Table
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.slicer.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
-from cmfsim.values.case_parts import (
-    DIRECTIONS,
-    PROCEDURES,
-    CaseMotion,
-    CaseOsteotomy,
-)
+from cmfsim.values.case_parts import DIRECTIONS, PROCEDURES, CaseMotion, CaseOsteotomy
 from cmfsim.values.motion import rigid_matrix, rigid_motion
 
 # A name that TOML takes as a key without quotes.

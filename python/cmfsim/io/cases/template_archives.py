@@ -67,10 +67,7 @@ def _packed(points: Floats) -> NDArray[Any]:
 
 
 def _counts(surface: SurfaceData) -> dict[str, int]:
-    return {
-        "vertices": len(surface.vertices),
-        "triangles": len(surface.triangles),
-    }
+    return {"vertices": len(surface.vertices), "triangles": len(surface.triangles)}
 
 
 def _are_mirrored(one: MuscleSurface, other: MuscleSurface) -> bool:

@@ -104,9 +104,7 @@ def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
 
 
 def write_template(
-    path: str | os.PathLike[str],
-    template: TemplateData,
-    report: Mapping[str, Any] | None = None,
+    path: str | os.PathLike[str], template: TemplateData, report: Mapping[str, Any] | None = None
 ) -> None:
     """Writes a template: a folder, or one archive if the name ends in `.npz`.
 

@@ -45,10 +45,7 @@ PACKING = 1
 # What begins each entry of an archive's directory.
 ENTRY = b"PK\x01\x02"
 ENCRYPTED = 0x1
-HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class _Members(Mapping[str, NDArray[Any]]):

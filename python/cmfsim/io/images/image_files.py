@@ -219,10 +219,7 @@ def _unpacked(path: Path, header: ImageHeader) -> Iterator[Path]:
 
 
 def _placed(
-    path: Path,
-    values: NDArray[Any],
-    affine: NDArray[np.float64],
-    findings: tuple[Finding, ...],
+    path: Path, values: NDArray[Any], affine: NDArray[np.float64], findings: tuple[Finding, ...]
 ) -> ImageFile:
     """The image of voxels with their map to LPS, on axes of the patient."""
     if values.dtype.kind == "f":

@@ -215,10 +215,7 @@ def of_slices(
 
 
 def _rows_to_left(
-    values: NDArray[Any],
-    positions: NDArray[np.float64],
-    axes: NDArray[np.float64],
-    spacing: float,
+    values: NDArray[Any], positions: NDArray[np.float64], axes: NDArray[np.float64], spacing: float
 ) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float64]]:
     """The same slices with rows that run to the patient's left, in ascending order again."""
     if axes[0, 0] >= 0.0:

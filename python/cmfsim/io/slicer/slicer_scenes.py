@@ -231,10 +231,7 @@ def _stores(attributes: Mapping[str, str], storages: Mapping[str, Mapping[str, s
 
 
 def _node(
-    tag: str,
-    attributes: Mapping[str, str],
-    storages: Mapping[str, Mapping[str, str]],
-    folder: Path,
+    tag: str, attributes: Mapping[str, str], storages: Mapping[str, Mapping[str, str]], folder: Path
 ) -> SceneNode:
     references = dict(REFERENCE.findall(attributes.get("references", "")))
     parent = references.get("transform", attributes.get("transformNodeRef", "")).strip() or None

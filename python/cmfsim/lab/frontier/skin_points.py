@@ -8,12 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.evaluation import (
-    SKIN_LANDMARKS,
-    DistanceStatistics,
-    distance_statistics,
-    skin_regions,
-)
+from cmfsim.evaluation import SKIN_LANDMARKS, DistanceStatistics, distance_statistics, skin_regions
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.patient_model import PatientModel

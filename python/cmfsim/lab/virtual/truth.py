@@ -377,10 +377,7 @@ def _nearest(points: Floats, places: Floats) -> NDArray[np.intp]:
 
 
 def _outward(
-    patient: VirtualPatient,
-    before: SurfaceData,
-    after: Floats,
-    segments: Mapping[str, BoneSegment],
+    patient: VirtualPatient, before: SurfaceData, after: Floats, segments: Mapping[str, BoneSegment]
 ) -> Floats:
     """Swelling of each vertex of the skin: outward by a share of the tissue's depth, (v, 3) mm."""
     depth = tissue_depth(before.vertices, [segment.surface for segment in segments.values()])
@@ -424,10 +421,7 @@ def _opened(
     tets = tets[kept]
     used, left = used_nodes(tets[largest_body(tets)])
     return _Opened(
-        nodes[used],
-        left.astype(np.uint32),
-        kinds.of_nodes(used),
-        np.flatnonzero(bared[used]),
+        nodes[used], left.astype(np.uint32), kinds.of_nodes(used), np.flatnonzero(bared[used])
     )
 
 
@@ -446,9 +440,7 @@ def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _moved_sites(
-    sites: Mapping[str, Floats],
-    segments: Mapping[str, BoneSegment],
-    motions: Mapping[str, Floats],
+    sites: Mapping[str, Floats], segments: Mapping[str, BoneSegment], motions: Mapping[str, Floats]
 ) -> dict[str, Floats]:
     """Bone landmarks, each moved with the segment in which it lies deepest."""
     points = np.array(list(sites.values()))

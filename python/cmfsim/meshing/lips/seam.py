@@ -247,9 +247,5 @@ def _told(source: str, way: str) -> list[Finding]:
 
 
 def _not_found(why: str) -> LipSeam:
-    finding = Finding(
-        "lip-seam-not-found",
-        f"the lips were not separated: {why}",
-        where="lips",
-    )
+    finding = Finding("lip-seam-not-found", f"the lips were not separated: {why}", where="lips")
     return LipSeam(None, "none", {"source": "none"}, (finding,))

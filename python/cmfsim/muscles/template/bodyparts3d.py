@@ -205,14 +205,7 @@ def _verified(folder: Path, *, must_be_known: bool) -> list[Finding]:
         )
     why = "other releases have different coordinates, and files may have been damaged"
     return [
-        Finding(
-            "bodyparts3d-parts",
-            what,
-            severity="warning",
-            where=folder.name,
-            why=why,
-            fix=fix,
-        )
+        Finding("bodyparts3d-parts", what, severity="warning", where=folder.name, why=why, fix=fix)
     ]
 
 

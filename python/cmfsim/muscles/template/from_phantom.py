@@ -22,10 +22,7 @@ GRAIN = 1.0 / 128.0
 
 
 def phantom_template(
-    head: PhantomHead | None = None,
-    *,
-    name: str = "phantom",
-    progress: Progress | None = None,
+    head: PhantomHead | None = None, *, name: str = "phantom", progress: Progress | None = None
 ) -> MuscleTemplate:
     """The muscles, skull and landmarks of a phantom head as a template, with known fibre lines.
 

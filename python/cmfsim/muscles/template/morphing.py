@@ -13,12 +13,7 @@ from cmfsim._core import ThinPlateSpline
 from cmfsim.errors import CaseInputError, LandmarkError
 from cmfsim.io.cases.templates import write_template
 from cmfsim.io.landmark_files import read_landmark_file
-from cmfsim.registration import (
-    LandmarkAgreement,
-    LandmarkMatch,
-    leave_one_out,
-    match_landmarks,
-)
+from cmfsim.registration import LandmarkAgreement, LandmarkMatch, leave_one_out, match_landmarks
 from cmfsim.values.checks import Floats, as_number
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import is_lower_site

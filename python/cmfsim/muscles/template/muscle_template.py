@@ -112,10 +112,7 @@ class MuscleTemplate(TemplateData):
         return check_contents(self)
 
     def morph(
-        self,
-        landmarks: Mapping[str, ArrayLike] | str | os.PathLike[str],
-        *,
-        smoothing: float = 0.0,
+        self, landmarks: Mapping[str, ArrayLike] | str | os.PathLike[str], *, smoothing: float = 0.0
     ) -> MorphedMusculature:
         """The template's muscles in a patient, by a thin-plate spline through the landmarks.
 

@@ -23,14 +23,7 @@ class Course(NamedTuple):
 
 
 def _ring(
-    x: float,
-    z: float,
-    half_x: float,
-    half_z: float,
-    *,
-    place: float,
-    thick: float,
-    wide: float,
+    x: float, z: float, half_x: float, half_z: float, *, place: float, thick: float, wide: float
 ) -> tuple[Row, ...]:
     """Rows about an eye, from the inner corner over the upper lid."""
     turns = (

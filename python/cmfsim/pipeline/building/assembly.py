@@ -28,11 +28,7 @@ from cmfsim.values.surface_data import SurfaceData
 
 
 def assembled(
-    head: Head,
-    stages: Stages,
-    bones: PlannedBones,
-    nodes: Nodes,
-    procedures: Sequence[Procedure],
+    head: Head, stages: Stages, bones: PlannedBones, nodes: Nodes, procedures: Sequence[Procedure]
 ) -> PatientModel:
     """The patient without muscles."""
     case, anatomy, kinds = head.case, head.anatomy, nodes.kinds

@@ -180,11 +180,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         if case.muscles is None:
             return _without_muscles(head, stages, kinds, options, tissue)[0]
         # A case without muscles loads nothing of them.
-        from cmfsim.pipeline.building.tissue.muscles import (  # noqa: PLC0415
-            NoMuscles,
-            placed_muscles,
-            with_muscles,
-        )
+        from cmfsim.pipeline.building.tissue.muscles import NoMuscles, placed_muscles, with_muscles  # noqa: PLC0415
 
         placing = beside.submit(placed_muscles, case.muscles, head.skull, head.anatomy)
 

@@ -14,13 +14,7 @@ import numpy as np
 
 from cmfsim._core import __version__
 from cmfsim.errors import CaseInputError
-from cmfsim.io import (
-    Case,
-    read_bone_pair,
-    read_landmark_file,
-    read_surface_file,
-    read_transform,
-)
+from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface_file, read_transform
 from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.images.dicom.series import dicom_files
 from cmfsim.io.images.image_files import read_image_file

@@ -11,14 +11,7 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
 # Skin landmarks that determine the midsagittal plane, and how many are needed.
-MIDLINE = (
-    "nasion",
-    "pronasale",
-    "subnasale",
-    "labiale_superius",
-    "labiale_inferius",
-    "pogonion",
-)
+MIDLINE = ("nasion", "pronasale", "subnasale", "labiale_superius", "labiale_inferius", "pogonion")
 LEAST_MIDLINE = 2
 # Length of the profile behind the foremost point, mm: past throat and forehead.
 DEPTH = 110.0

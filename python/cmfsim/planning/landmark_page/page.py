@@ -218,21 +218,14 @@ def _framing(surfaces: Mapping[str, SurfaceData]) -> dict[str, Any]:
     bones = [s.vertices for name, s in surfaces.items() if name != "skin"]
     vertices = np.concatenate(bones)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return {
-        "target": (0.5 * (low + high)).tolist(),
-        "span": SPAN_SHARE * float((high - low).max()),
-    }
+    return {"target": (0.5 * (low + high)).tolist(), "span": SPAN_SHARE * float((high - low).max())}
 
 
 def site_view(name: str) -> dict[str, float]:
     """The azimuth, elevation (degrees) and height (mm) of the picture that shows a site."""
     side = name[-2:] if name.endswith(("_L", "_R")) else ""
     azimuth, elevation, span = VIEWS.get(name.removesuffix(side), MIDLINE)
-    return {
-        "azimuth": -azimuth if side == "_R" else azimuth,
-        "elevation": elevation,
-        "span": span,
-    }
+    return {"azimuth": -azimuth if side == "_R" else azimuth, "elevation": elevation, "span": span}
 
 
 def landmark_page_text(content: LandmarkContent) -> str:

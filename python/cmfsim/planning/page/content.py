@@ -136,10 +136,7 @@ def page_content(
         "bones": bones,
         **_measured(planning, sites),
         "variants": [
-            {
-                "name": name,
-                "motions": [m.ravel().tolist() for m in planning.whole(plan).values()],
-            }
+            {"name": name, "motions": [m.ravel().tolist() for m in planning.whole(plan).values()]}
             for name, plan in (variants or {}).items()
         ],
         **profile,

@@ -3,8 +3,4 @@
 from cmfsim.registration.proposed.proposal import landmarks_from, measured_biases
 from cmfsim.registration.proposed.template_head import TemplateHead
 
-__all__ = [
-    "TemplateHead",
-    "landmarks_from",
-    "measured_biases",
-]
+__all__ = ["TemplateHead", "landmarks_from", "measured_biases"]

@@ -63,10 +63,7 @@ class JawEvidence:
 
 
 def jaw_evidence(
-    sites: Mapping[str, Floats],
-    lower: SurfaceData,
-    pose: Pose,
-    left_out: Mapping[str, float],
+    sites: Mapping[str, Floats], lower: SurfaceData, pose: Pose, left_out: Mapping[str, float]
 ) -> JawEvidence:
     """Evidence against a jaw.
 

@@ -284,10 +284,7 @@ class _Similarity:
 
 
 def _similarities(
-    samples: Samples,
-    surface: Surface,
-    starts: Iterable[tuple[Floats, Floats]],
-    rounds: int,
+    samples: Samples, surface: Surface, starts: Iterable[tuple[Floats, Floats]], rounds: int
 ) -> list[_Similarity]:
     """The similarities in the plane x = 0 that fit best, from each of several starts.
 

@@ -120,9 +120,7 @@ def _surface_place(found: SitesOfKind, name: str, place: Floats, size: float) ->
 
 
 def landmarks_from(
-    bones: Mapping[str, SurfaceData],
-    skin: SurfaceData | None,
-    templates: Sequence[TemplateHead],
+    bones: Mapping[str, SurfaceData], skin: SurfaceData | None, templates: Sequence[TemplateHead]
 ) -> ProposedLandmarks:
     """The landmarks of a head, each where its definition holds, with what is doubtful about it.
 

@@ -76,9 +76,7 @@ def frozen_forces(contact: LipContact, u: np.ndarray, at: np.ndarray) -> np.ndar
         swings = touch.swing.any(axis=(1, 2))
         across = way - np.einsum("cij,cj->ci", fixed, way)
         normal = np.where(
-            swings[:, None],
-            -across / np.linalg.norm(across, axis=1, keepdims=True),
-            touch.normal,
+            swings[:, None], -across / np.linalg.norm(across, axis=1, keepdims=True), touch.normal
         )
         d = np.maximum(-(way * normal).sum(axis=1), 0.0)
         pressing = np.where(d < contact.onset, 0.5 * d**2 / contact.onset, d - 0.5 * contact.onset)

@@ -444,11 +444,7 @@ def _placed(
 
 
 def _tilt_findings(
-    name: str,
-    stack: Stack,
-    along: NDArray[np.float64],
-    *,
-    straight: bool,
+    name: str, stack: Stack, along: NDArray[np.float64], *, straight: bool
 ) -> list[Finding]:
     """Findings on slices that are shifted against one another, and on a tilt that is not there."""
     heights = stack.heights - stack.heights[0]

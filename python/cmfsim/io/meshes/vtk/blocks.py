@@ -69,9 +69,5 @@ def _lz4_length(block: bytes, at: int, length: int) -> tuple[int, int]:
 
 # By the name that VTK gives the program that packed them; each takes a block and its unpacked size.
 UNPACKERS: Mapping[str, Callable[[bytes, int], bytes]] = MappingProxyType(
-    {
-        "vtkZLibDataCompressor": _zlib,
-        "vtkLZ4DataCompressor": _lz4,
-        "vtkLZMADataCompressor": _lzma,
-    }
+    {"vtkZLibDataCompressor": _zlib, "vtkLZ4DataCompressor": _lz4, "vtkLZMADataCompressor": _lzma}
 )

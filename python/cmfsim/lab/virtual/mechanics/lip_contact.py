@@ -234,10 +234,7 @@ class LipContact:
     def _touches(self, displacements: Floats) -> tuple[_Touch, _Touch]:
         """The nodes of the upper lip in the lower, and those of the lower in the upper."""
         places = self.points + displacements
-        return (
-            _touch(places, self.upper, self.lower),
-            _touch(places, self.lower, self.upper),
-        )
+        return (_touch(places, self.upper, self.lower), _touch(places, self.lower, self.upper))
 
 
 def _touch(places: Floats, lip: Lip, other: Lip) -> _Touch:

@@ -48,8 +48,7 @@ def thickened(muscles: Mapping[str, Muscle], factor: float) -> dict[str, Muscle]
     times = as_positive("factor of muscle thickness", factor)
     return {
         name: replace(
-            muscle,
-            tubes=tuple(replace(tube, thick=times * tube.thick) for tube in muscle.tubes),
+            muscle, tubes=tuple(replace(tube, thick=times * tube.thick) for tube in muscle.tubes)
         )
         for name, muscle in muscles.items()
     }

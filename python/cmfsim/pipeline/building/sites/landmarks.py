@@ -72,11 +72,7 @@ def found_landmarks(
     """
     # A case with landmarks loads nothing of the synthetic heads that others are compared with.
     from cmfsim.pipeline.filling import filled_landmarks  # noqa: PLC0415
-    from cmfsim.pipeline.proposing import (  # noqa: PLC0415
-        BY_SHAPE,
-        proposed_head,
-        unproposed_head,
-    )
+    from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head, unproposed_head  # noqa: PLC0415
 
     stages.begin("finding the landmarks")
     skull = placed.get("skull", {})
@@ -142,10 +138,7 @@ def _apart(found: ProposedLandmarks, skull: Mapping[str, Floats]) -> dict[str, f
 
 
 def _check_jaw_of_placed(
-    case: Case,
-    found: ProposedLandmarks,
-    skull: Mapping[str, Floats],
-    apart: Mapping[str, float],
+    case: Case, found: ProposedLandmarks, skull: Mapping[str, Floats], apart: Mapping[str, float]
 ) -> None:
     """Refuses placed sites that lie where the opposite ones of the other jaw were found."""
     wrong = []

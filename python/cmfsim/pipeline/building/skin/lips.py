@@ -159,13 +159,7 @@ def lip_contact(
         return CaseLipContact({}, kinds)
     nodes = mesh.nodes
     by_jaw = {} if arches is None else arches.by_jaw
-    regions = lip_regions(
-        nodes,
-        mesh.boundary_triangles(),
-        kinds,
-        seam.surface,
-        height=height,
-    )
+    regions = lip_regions(nodes, mesh.boundary_triangles(), kinds, seam.surface, height=height)
     touching = tuple(
         _touching(nodes, regions[one], regions[other])
         for one, other in (("lower", "upper"), ("upper", "lower"))

@@ -68,8 +68,4 @@ def _tissue(anatomy: Anatomy, point: Floats, front: Floats, *, last: bool = Fals
 
 
 def _missing(what: str) -> Finding:
-    return Finding(
-        "skin-implausible",
-        what,
-        where="skin",
-    )
+    return Finding("skin-implausible", what, where="skin")

@@ -148,9 +148,7 @@ def _bent_finding(name: str, where: str, fit: ShapeFit | None) -> Finding:
         "mm (95th percentile)"
     )
     return Finding(
-        "motion-bent",
-        f"{name} has a different shape after the operation: {left}",
-        where=where,
+        "motion-bent", f"{name} has a different shape after the operation: {left}", where=where
     )
 
 

@@ -11,11 +11,7 @@ from cmfsim._core import rigid_fit
 from cmfsim.errors import CaseInputError, RegistrationError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.images.image_files import read_image_file
-from cmfsim.pipeline.building.inputs import (
-    read_case_landmarks,
-    refuse_errors,
-    segment_options,
-)
+from cmfsim.pipeline.building.inputs import read_case_landmarks, refuse_errors, segment_options
 from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.case_parts import CasePostoperative

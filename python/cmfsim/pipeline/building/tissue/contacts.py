@@ -8,12 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import TetMesh
-from cmfsim.bones import (
-    ContactSheet,
-    SheetOptions,
-    contact_sheet,
-    sheet_departure,
-)
+from cmfsim.bones import ContactSheet, SheetOptions, contact_sheet, sheet_departure
 from cmfsim.meshing.node_kinds import DentalArches, KindOptions
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.values.anatomy import Anatomy, BoneSegment

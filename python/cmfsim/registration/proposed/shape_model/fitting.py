@@ -119,11 +119,7 @@ class _Effort:
 
 
 def _stepped(
-    model: HeadModel,
-    samples: HeadSamples,
-    state: State,
-    effort: _Effort,
-    known: Known,
+    model: HeadModel, samples: HeadSamples, state: State, effort: _Effort, known: Known
 ) -> Evidence:
     noise, modes = effort.noise, effort.modes
     own = model.points + model.modes @ state.shape

@@ -80,10 +80,7 @@ class HeadSamples:
     def without_ends(self) -> "HeadSamples":
         """Without the points on the ends of the image, which are no surface of the head."""
         kept = []
-        for points, normals in (
-            (self.bone, self.bone_normals),
-            (self.skin, self.skin_normals),
-        ):
+        for points, normals in ((self.bone, self.bone_normals), (self.skin, self.skin_normals)):
             on_end = np.zeros(len(points), dtype=bool)
             for sign, ends in ((-1.0, self.low), (1.0, self.high)):
                 near = sign * (ends - points) < AT_END

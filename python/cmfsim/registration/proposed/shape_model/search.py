@@ -112,11 +112,7 @@ def _starts(model: HeadModel, samples: HeadSamples, flip: Floats) -> Iterator[St
         for size, missing in product(SIZES, above):
             x, y, z = turned.T / size
             offset = np.array(
-                [
-                    -np.median(x),
-                    front - np.quantile(y, 0.02),
-                    top - missing - np.quantile(z, 0.99),
-                ]
+                [-np.median(x), front - np.quantile(y, 0.02), top - missing - np.quantile(z, 0.99)]
             )
             yield Start(rotation / size, offset)
 
