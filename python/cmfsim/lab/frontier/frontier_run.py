@@ -19,9 +19,7 @@ from cmfsim.lab.frontier.choice import Choice, case_choice
 from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread, with_front
 from cmfsim.lab.frontier.skin_points import WHOLE, read_points, skin_errors
 from cmfsim.lab.frontier.sweep import reference_choice, sweep_choices
-from cmfsim.lab.frontier.timing.machine import machine
-from cmfsim.lab.frontier.timing.measure import STOPPED, Answer, kept, run_job
-from cmfsim.lab.frontier.timing.worker import MOVED_FORMAT
+from cmfsim.lab.frontier.timing import MOVED_FORMAT, STOPPED, Answer, kept, machine, run_job
 from cmfsim.pipeline.building.inputs import input_hashes
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.progress import Progress, no_progress

@@ -2,8 +2,10 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +30,7 @@ from cmfsim.lab.frontier import frontier as bench_frontier
 from cmfsim.lab.frontier import frontier_run as bench
 from cmfsim.lab.frontier.rows import FrontierRow, with_front
 from cmfsim.lab.frontier.sweep import EARLY
-from cmfsim.lab.frontier.timing.measure import run_job
+from cmfsim.lab.frontier.timing import machine, run_job
 from cmfsim.values.skin_motion import carried_points
 from head_case import HeadCase
 
@@ -306,3 +308,10 @@ def test_the_command_writes_table_page_picture_and_figures(case, swept, capsys):
     assert [line["role"] for line in lines] == ["base", "", "", "", "reference"]
     first = written["rows"][0]["error"][WHOLE]
     assert float(lines[0]["mean_mm"]) == first["mean_mm"]
+
+
+def test_the_machine_is_named_with_the_commit_of_its_source():
+    source = Path(cmfsim.__file__).parents[2]
+    if shutil.which("git") is None or not (source / ".git").exists():
+        pytest.skip("the package is not imported from a checkout")
+    assert re.fullmatch("[0-9a-f]{7,}", machine(None)["commit"])

@@ -1,1 +1,0 @@
-"""Time and memory of one run, measured in a process of its own."""
