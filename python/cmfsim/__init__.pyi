@@ -245,7 +245,6 @@ from cmfsim.values.finding import Finding as Finding
 from cmfsim.values.image_data import ImageData as ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS
 from cmfsim.values.lifted_tissue import LiftedTissue as LiftedTissue
-from cmfsim.values.lip_region import LipRegion as LipRegion
 from cmfsim.values.mesh_report import MeshReport as MeshReport
 from cmfsim.values.moduli import FatModuli as FatModuli
 from cmfsim.values.moduli import MuscleModuli as MuscleModuli
@@ -268,5 +267,6 @@ from cmfsim.values.solver_options import SolverOptions as SolverOptions
 from cmfsim.values.surface_data import MovedSurface as MovedSurface
 from cmfsim.values.surface_data import SurfaceData as SurfaceData
 from cmfsim.values.tissue_data import TissueData as TissueData
+from cmfsim.values.touching import LipRegion as LipRegion
 from cmfsim.values.touching import ObstacleData as ObstacleData
 from cmfsim.values.touching import TouchingData as TouchingData

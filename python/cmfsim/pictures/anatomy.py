@@ -12,9 +12,9 @@ from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, View, bounds, draw, polydata
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, as_index_rows, as_rows
-from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.touching import LipRegion
 
 SKIN_COLOUR = "#e3b7a0"
 # Kim et al. (2010), Figure 4: fixed pink, joined orange, sliding blue, free white.

@@ -6,7 +6,7 @@ from test_doctor import diagnosis, image_case
 import cmfsim
 from cmfsim import Anatomy, BoneSegment, ImageData, NodeKinds, SurfaceData
 from cmfsim.meshing import TissueRegion
-from cmfsim.pipeline.building.tissue.tissue_ends import end_findings
+from cmfsim.pipeline.building.tissue.nodes import end_findings
 from head_case import HeadCase
 
 

@@ -8,9 +8,9 @@ from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.case_parts import LIP_HEIGHT
 from cmfsim.values.checks import Floats, Indices, as_index_rows, as_positive, as_rows
-from cmfsim.values.lip_region import LIPS, LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.touching import LIPS, LipRegion
 
 # A triangle lies above or below the seam, and not past a corner of the mouth or behind the teeth,
 # where the way to it leads off the normal of the seam by this share of its length, or so many mm.

@@ -21,11 +21,10 @@ from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
-from cmfsim.values.lip_region import LipRegion
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.surface_data import SurfaceData
-from cmfsim.values.touching import ObstacleData, TouchingData
+from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 
 # Nodes of a lip further than this from the other lip, or from the teeth, do not come to them, mm.
 REACH = 8.0
