@@ -667,6 +667,17 @@ def test_what_vtk_passes_on_of_a_damaged_file_is_refused(cells, match, tmp_path)
     refused(saved(tmp_path, "it.vtk", STRIP + cells), match)
 
 
+def test_offsets_of_vtk_that_do_not_begin_at_0_are_refused(tmp_path):
+    text = STRIP.replace("3.0", "5.1").replace("POLYDATA", "UNSTRUCTURED_GRID")
+    text += "CELLS 3 8\nOFFSETS vtktypeint64\n{} 4 8\nCONNECTIVITY vtktypeint64\n"
+    text += "0 1 2 4 0 1 2 4\nCELL_TYPES 2\n10 10\n"
+    saved(tmp_path, "it.vtk", text.format(0))
+    assert len(cmfsim.read_tet_mesh(tmp_path / "it.vtk")[1]) == 2
+    saved(tmp_path, "it.vtk", text.format(-2))
+    with pytest.raises(cmfsim.CaseError, match="cut short or damaged"):
+        cmfsim.read_tet_mesh(tmp_path / "it.vtk")
+
+
 def test_files_that_name_other_files_are_refused(tmp_path):
     for name in ("it.xdmf", "it.ele", "it"):
         refused(saved(tmp_path, name, "<Xdmf/>"), "are not supported: save it as .vtu")

@@ -185,7 +185,7 @@ def _check_stated(data: bytes, arrays: Mapping[str, NDArray[Any]], start: int) -
                 if by_offsets
                 else (first, int(line["second"]) - first)
             )
-            if (n, size) != wanted or (np.diff(ends) < 0).any() or ends[-1] != size:
+            if (n, size) != wanted or (np.diff(ends) < 0).any() or (ends[0], ends[-1]) != (0, size):
                 raise CaseInputError(
                     f"is cut short or damaged: it states {wanted[0]} {name} with {wanted[1]} "
                     f"corners, {n} with {size} were read; export it again"
