@@ -34,7 +34,7 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding, OnFindings, grouped
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.progress import Progress
+from cmfsim.values.progress import ProgressOrBar, comparing_stages, shown_progress
 from cmfsim.values.surface_data import SurfaceData
 
 WILCOXON_NOTE = (
@@ -153,7 +153,7 @@ def evaluate(
     case: CaseOrPath,
     models: str | Sequence[str] = MODELS,
     *,
-    progress: Progress | None = None,
+    progress: ProgressOrBar = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
     anatomy: Anatomy | None = None,
@@ -170,7 +170,7 @@ def evaluate(
     case : Case, or path of its file or folder
         With [postoperative].
     models : str or sequence of str
-    progress : callable, optional
+    progress : callable or bool, optional
     check : bool
     findings : iterable of Finding
     anatomy : Anatomy, optional
@@ -199,54 +199,55 @@ def evaluate(
     1.21
     """
     case, models = as_case(case), named_models(models)
-    if progress is not None:
-        progress("reading the face after the operation")
-    key = evaluation_key(case, models)
-    # First, for it fails at once where the case has none.
-    postoperative = read_postoperative(case)
-    if postoperative.skin is None:
-        raise CaseInputError(
-            f"{case.where('postoperative')}: the case has no face to compare with: add skin or "
-            "image"
-        )
-    options = BuildOptions(
-        progress=progress,
-        check=check,
-        findings=findings,
-        anatomy=anatomy,
-        after=postoperative,
-        on_findings=on_findings,
-    )
-    failed: dict[str, CmfsimError] = {}
-    predictions = tuple(predictions_of(case, models, options, failed))
-    if not predictions:
-        raise next(iter(failed.values()))
-    if progress is not None:
-        progress("comparing the faces")
-    landmarks = face_landmarks(predictions[0].patient)
-    compared = _Compared(predictions, postoperative.skin, postoperative.landmarks, landmarks.points)
-    comparison = compared.models()
-    unmoved, why = compared.unmoved()
-    doubts = check_face_after(case, comparison, unmoved, compared.moved)
-    notes = (*landmarks.findings, *why, *refuse_other_face(doubts))
-    if predictions[0].patient.landmarks_are_found and postoperative.landmarks:
-        notes = (*notes, _landmarks_unused())
-    thickness = fitted = None
-    if fit_thickness:
-        if unmoved is None:
+    with shown_progress(progress, comparing_stages(models)) as shown:
+        shown("reading the face after the operation")
+        key = evaluation_key(case, models)
+        # First, for it fails at once where the case has none.
+        postoperative = read_postoperative(case)
+        if postoperative.skin is None:
             raise CaseInputError(
-                "a change of thickness is fitted where nothing was operated on, but "
-                f"{why[0].what if why else 'there is no such place'}: omit --fit-thickness"
+                f"{case.where('postoperative')}: the case has no face to compare with: add skin or "
+                "image"
             )
-        depth = compared.depth()
-        thickness = fitted_thickness(unmoved.signed, depth[unmoved.vertices])
-        fitted = compared.models(thickness.share * depth)
-    reasons = {model: str(error) for model, error in failed.items()}
-    found = CaseEvaluation(
-        predictions, postoperative, comparison, key, reasons, unmoved, thickness, fitted, notes
-    )
-    if on_findings is not None and found.findings:
-        on_findings(found.findings)
+        options = BuildOptions(
+            progress=shown,
+            check=check,
+            findings=findings,
+            anatomy=anatomy,
+            after=postoperative,
+            on_findings=on_findings,
+        )
+        failed: dict[str, CmfsimError] = {}
+        predictions = tuple(predictions_of(case, models, options, failed))
+        if not predictions:
+            raise next(iter(failed.values()))
+        shown("comparing the faces")
+        landmarks = face_landmarks(predictions[0].patient)
+        compared = _Compared(
+            predictions, postoperative.skin, postoperative.landmarks, landmarks.points
+        )
+        comparison = compared.models()
+        unmoved, why = compared.unmoved()
+        doubts = check_face_after(case, comparison, unmoved, compared.moved)
+        notes = (*landmarks.findings, *why, *refuse_other_face(doubts))
+        if predictions[0].patient.landmarks_are_found and postoperative.landmarks:
+            notes = (*notes, _landmarks_unused())
+        thickness = fitted = None
+        if fit_thickness:
+            if unmoved is None:
+                raise CaseInputError(
+                    "a change of thickness is fitted where nothing was operated on, but "
+                    f"{why[0].what if why else 'there is no such place'}: omit --fit-thickness"
+                )
+            depth = compared.depth()
+            thickness = fitted_thickness(unmoved.signed, depth[unmoved.vertices])
+            fitted = compared.models(thickness.share * depth)
+        reasons = {model: str(error) for model, error in failed.items()}
+        found = CaseEvaluation(
+            predictions, postoperative, comparison, key, reasons, unmoved, thickness, fitted, notes
+        )
+        if on_findings is not None and found.findings:
+            on_findings(found.findings)
     return found
 
 

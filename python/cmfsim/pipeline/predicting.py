@@ -18,7 +18,7 @@ from cmfsim.values.checks import check_one_of
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.progress import Progress
+from cmfsim.values.progress import ProgressOrBar, shown_progress, solving_stages
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ def predict(
     case: CaseOrPath,
     *,
     model: str = "M+S",
-    progress: Progress | None = None,
+    progress: ProgressOrBar = None,
     check: bool = True,
     band: BandOptions | None = None,
 ) -> Prediction:
@@ -41,8 +41,9 @@ def predict(
     model : str
         "H", "M", "H+S" or "M+S" (Kim et al. 2010, section 3.2): homogeneous or with muscles,
         without or with sliding at teeth and mucosa.
-    progress : callable, optional
-        Called with the name of each stage as it begins.
+    progress : callable or bool, optional
+        Called with the name of each stage as it begins; True shows a bar of tqdm with the share
+        that is done and the time left.
     check : bool
         Whether the doctor checks the case first; an error that it finds ends the work.
     band : BandOptions, optional
@@ -64,14 +65,16 @@ def predict(
     >>> prediction.skin.vertices.shape  # doctest: +SKIP
     (19840, 3)
     """
-    return next(predict_models(case, model, progress=progress, check=check, band=band))
+    # To its end: a bar then ends full.
+    (found,) = predict_models(case, model, progress=progress, check=check, band=band)
+    return found
 
 
 def predict_models(  # noqa: PLR0913 (options by name)
     case: CaseOrPath,
     models: str | Sequence[str] = MODELS,
     *,
-    progress: Progress | None = None,
+    progress: ProgressOrBar = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
     anatomy: Anatomy | None = None,
@@ -87,7 +90,7 @@ def predict_models(  # noqa: PLR0913 (options by name)
     ----------
     case : Case, or path of its file or folder
     models : str or sequence of str
-    progress : callable, optional
+    progress : callable or bool, optional
     check : bool
         As for `predict`.
     findings : iterable of Finding
@@ -123,16 +126,18 @@ def predict_models(  # noqa: PLR0913 (options by name)
     >>> for prediction in cmfsim.predict_models(case, ["H", "M+S"]):  # doctest: +SKIP
     ...     print(prediction.model, prediction.result.summary["residual"])
     """
-    options = BuildOptions(
-        progress=progress,
-        check=check,
-        findings=findings,
-        anatomy=anatomy,
-        after=after,
-        on_findings=on_findings,
-        on_muscles=on_muscles,
-    )
-    yield from predictions_of(as_case(case), named_models(models), options, failed, band=band)
+    case, models = as_case(case), named_models(models)
+    with shown_progress(progress, solving_stages(models)) as shown:
+        options = BuildOptions(
+            progress=shown,
+            check=check,
+            findings=findings,
+            anatomy=anatomy,
+            after=after,
+            on_findings=on_findings,
+            on_muscles=on_muscles,
+        )
+        yield from predictions_of(case, models, options, failed, band=band)
 
 
 def predictions_of(

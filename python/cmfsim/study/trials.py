@@ -20,7 +20,7 @@ from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
-from cmfsim.values.progress import Progress
+from cmfsim.values.progress import ProgressOrBar, shown_progress, solving_stages
 
 # Standard deviation of a landmark's place along each axis that moves the masseter by the 2 mm of
 # the paper's three trials, mm.
@@ -145,7 +145,7 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     std: float = LANDMARK_SD,
     seed: int = 0,
     model: str = "M+S",
-    progress: Progress | None = None,
+    progress: ProgressOrBar = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
     on_findings: OnFindings | None = None,
@@ -164,7 +164,7 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     seed : int
     model : str
         "M" or "M+S".
-    progress : callable, optional
+    progress : callable or bool, optional
     check : bool
     findings : iterable of Finding
     on_findings : callable, optional
@@ -193,21 +193,20 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     if (trials if isinstance(trials, int) else len(trials)) < 1:
         raise CaseInputError("no trial was given: at least one is needed")
     case = as_case(case)
-    options = BuildOptions(
-        progress=progress, check=check, findings=findings, on_findings=on_findings
-    )
-    patient = build_patient(case, (model,), options)
-    skull = patient.landmarks.get("skull", {})
-    if isinstance(trials, int):
-        trials = list(landmark_trials(skull, count=trials, std=std, seed=seed))
-    if progress is not None:
-        progress(f"solving {model}")
-    prediction = predict_patient(patient, model)
-    done = []
-    for number, landmarks in enumerate(trials):
-        if progress is not None:
-            progress(f"trial {number + 1} of {len(trials)}")
-        done.append(_trial(prediction, case.muscles or CaseMuscles(), landmarks, model))
+    with shown_progress(progress, {**solving_stages([model]), "trial": 30.0}) as shown:
+        options = BuildOptions(
+            progress=shown, check=check, findings=findings, on_findings=on_findings
+        )
+        patient = build_patient(case, (model,), options)
+        skull = patient.landmarks.get("skull", {})
+        if isinstance(trials, int):
+            trials = list(landmark_trials(skull, count=trials, std=std, seed=seed))
+        shown(f"solving {model}")
+        prediction = predict_patient(patient, model)
+        done = []
+        for number, landmarks in enumerate(trials):
+            shown(f"trial {number + 1} of {len(trials)}")
+            done.append(_trial(prediction, case.muscles or CaseMuscles(), landmarks, model))
     moved = np.linalg.norm(prediction.skin_displacements, axis=1)
     return SensitivityReport(prediction, tuple(done), moved >= 0.1 * moved.max())
 

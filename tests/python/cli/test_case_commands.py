@@ -4,6 +4,8 @@ import argparse
 import dataclasses
 import io
 import json
+import logging
+import re
 import sys
 import types
 
@@ -113,6 +115,30 @@ def test_a_terminal_gets_one_line_that_is_erased_at_the_end():
     assert "\n" not in text
     assert text.startswith("\r\x1b[Kcmfsim: mesh\\x1bing 0.0 s")
     assert text.endswith("\r\x1b[K")
+
+
+def test_a_pipe_gets_a_line_per_stage_and_none_per_step_or_log_line(caplog):
+    """A plan of 96 solutions printed 230 lines."""
+    stream, logger = io.StringIO(), logging.getLogger("cmfsim.solving")
+    with caplog.at_level(logging.INFO, "cmfsim"), StageProgress(stream) as progress:
+        progress.stage("meshing")
+        for step in range(96):
+            progress.stage(f"solving nearby plans ({step + 1} of 96)")
+            logger.info("solved")
+            logger.warning("a warning is shown")
+        progress.line("P1: done")
+    assert stream.getvalue() == "cmfsim: meshing\ncmfsim: solving nearby plans\nP1: done\n"
+    assert {record.getMessage() for record in caplog.records} == {"a warning is shown"}
+
+
+def test_the_line_of_a_terminal_begins_with_share_and_time_left():
+    """Of the stages that are expected; what ended is on a terminal no line of its own."""
+    stream = Terminal()
+    with StageProgress(stream, expected={"cutting the bones": 3.0, "solving M": 5.0}) as progress:
+        progress.stage("cutting the bones")
+        progress.line("P1: done")
+    assert "\n" not in stream.getvalue()
+    assert re.match(r"\r\x1b\[Kcmfsim: 0 %, about 8 s left: cutting the bo", stream.getvalue())
 
 
 def test_a_quiet_display_says_nothing():

@@ -17,6 +17,7 @@ from cmfsim.pipeline.outputs import WrittenResults, write_results
 from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.values.prediction import Prediction
+from cmfsim.values.progress import comparing_stages
 
 DEMO_FOLDER = Path("cmfsim-demo")
 # Without muscles or sliding, with muscles, with both.
@@ -28,7 +29,8 @@ def demo(options: argparse.Namespace) -> int:
     models: tuple[str, ...] = options.models
     begun = time.perf_counter()
     notices = Notices(quiet=options.quiet)
-    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+    expected = {"making a head": 2.0, **comparing_stages(models)}
+    with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         progress.stage("making a head")
         made = write_demo_case(options.folder, edge_length=options.edge_length)
         prepare(made.case, report=True, evaluation=made.truth is not None)

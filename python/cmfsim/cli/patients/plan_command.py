@@ -38,6 +38,7 @@ from cmfsim.planning.replanning import (
     planning_model,
 )
 from cmfsim.planning.server import open_port, serve_planning
+from cmfsim.values.progress import BUILDING, PLANNING
 
 # Name of the plan for a desired face, and the file to which it is saved.
 TOWARDS, PLAN_FILE = "Towards", "towards.toml"
@@ -114,7 +115,8 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
     if wanted is not None:
         wanted.check(models)
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
-    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+    expected = {**BUILDING, **PLANNING}
+    with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         asked = BuildOptions(
             progress=progress.stage, check=False, findings=findings, on_findings=notices.add
         )

@@ -1,10 +1,11 @@
 """`cmfsim predict`, `evaluate`, `sensitivity`, `study` and `report`: faces after operations."""
 
 import argparse
+import contextlib
 import json
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs import (
+    REPORT_STAGE,
     WrittenPrediction,
     WrittenResults,
     write_case_report,
@@ -34,6 +36,11 @@ from cmfsim.study.trials import sensitivity as landmark_sensitivity
 from cmfsim.study.variants import run_variants, write_variants_report
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
+from cmfsim.values.progress import BUILDING, SOLVING, WRITING, comparing_stages
+
+COMPARING = "predicting and comparing the cases"
+# Typical time of one, s, until the first ends.
+ONE_CASE = 60.0
 
 
 def models_of(given: Sequence[str] | None, default: Sequence[str]) -> tuple[str, ...]:
@@ -55,7 +62,11 @@ def predict(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
     failed: dict[str, CmfsimError] = {}
-    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+    expected = dict(BUILDING)
+    for model in models:
+        expected |= {f"solving {model}": SOLVING, f"writing {model}": WRITING}
+    expected[REPORT_STAGE] = WRITING
+    with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         predicted = partial(
             predict_models,
             case,
@@ -124,7 +135,8 @@ def evaluate(options: argparse.Namespace) -> int:
     prepare(case, report=not options.no_report, evaluation=True)
     notices = Notices(quiet=options.quiet)
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
-    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+    expected = comparing_stages(models)
+    with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         found = evaluate_case(
             case,
             models,
@@ -247,37 +259,66 @@ def study(options: argparse.Namespace) -> int:
     if options.variants is not None:
         return _study_variants(cohort, options)
 
-    def say(outcome: CaseOutcome) -> None:
-        if not options.quiet:
-            print(f"{outcome.name}: {outcome.status}, {outcome.seconds:.0f} s", file=sys.stderr)
-
-    found = run_study(
-        cohort,
-        workers=options.workers,
-        scheduler=options.scheduler,
-        fresh=options.fresh,
-        progress=say,
-    )
+    with _counted(len(cohort.cases), quiet=options.quiet) as count:
+        found = run_study(
+            cohort,
+            workers=options.workers,
+            scheduler=options.scheduler,
+            fresh=options.fresh,
+            progress=lambda outcome: count(outcome.name, outcome),
+        )
     names = write_study_report(found)
     if options.json:
         print(json.dumps({**found.as_dict(), "files": names}, allow_nan=False))
     else:
         print(_study_text(found))
         print(f"written       {escaped(str(cohort.output))}: {', '.join(names)}")
+    _print_reasons((outcome.name, outcome) for outcome in found.failed)
     return FAILED if found.failed else DONE
+
+
+@contextlib.contextmanager
+def _counted(cases: int, *, quiet: bool) -> Iterator[Callable[[str, CaseOutcome], None]]:
+    """What is called with the name and outcome of each case: a line each, or on a terminal one."""
+    done = 0
+    with StageProgress(sys.stderr, quiet=quiet, expected={COMPARING: ONE_CASE * cases}) as progress:
+
+        def count(name: str, outcome: CaseOutcome) -> None:
+            nonlocal done, cases
+            if outcome.status == "kept":
+                # It took no time: nothing follows from it for the others.
+                cases -= 1
+            else:
+                done += 1
+            progress.line(f"{name}: {outcome.status}, {outcome.seconds:.0f} s")
+            progress.stage(f"{COMPARING} ({min(done + 1, cases)} of {cases})")
+
+        progress.stage(f"{COMPARING} (1 of {cases})")
+        yield count
+
+
+def _print_reasons(failed: Iterable[tuple[str, CaseOutcome]]) -> None:
+    """Prints why cases failed."""
+    for name, outcome in failed:
+        print(f"cmfsim: error: {escaped(name)}:", file=sys.stderr)
+        for line in outcome.error.splitlines():
+            print(f"  {escaped(line)}", file=sys.stderr)
 
 
 def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
     """Runs a cohort as given and under each variant; failed if a case of one failed."""
     variants = Variants.load(options.variants, cohort.models)
 
-    def say(variant: str, outcome: CaseOutcome) -> None:
-        if not options.quiet:
-            done = f"{outcome.status}, {outcome.seconds:.0f} s"
-            print(f"{variant}, {outcome.name}: {done}", file=sys.stderr)
-
     where = StudyOptions(options.workers, options.scheduler, options.fresh)
-    found = run_variants(cohort, variants, options=where, progress=say)
+    # Cases in which a variant changes nothing are not repeated, so there may be fewer.
+    cases = len(cohort.cases) * len(variants.variants)
+    with _counted(cases, quiet=options.quiet) as count:
+        found = run_variants(
+            cohort,
+            variants,
+            options=where,
+            progress=lambda variant, case: count(f"{variant}, {case.name}", case),
+        )
     names = write_variants_report(found)
     if options.json:
         more = {"output": str(found.output), "files": names}
@@ -285,10 +326,7 @@ def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
     else:
         print("\n".join(escaped(line) for line in found.text().split("\n")))
         print(f"written       {escaped(str(found.output))}: {', '.join(names)}")
-    for variant, outcome in found.failed:
-        print(f"cmfsim: error: {escaped(f'{variant}, {outcome.name}')}:", file=sys.stderr)
-        for line in outcome.error.splitlines():
-            print(f"  {escaped(line)}", file=sys.stderr)
+    _print_reasons((f"{variant}, {outcome.name}", outcome) for variant, outcome in found.failed)
     return FAILED if found.failed else DONE
 
 

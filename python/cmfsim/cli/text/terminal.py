@@ -7,10 +7,12 @@ import shutil
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from types import TracebackType
 from typing import TextIO
 
 from cmfsim.errors import error_text
+from cmfsim.values.progress import COUNT, TimeLeft
 
 # Back to the start of the line and erase it.
 CLEAR_LINE = "\r\x1b[K"
@@ -46,20 +48,27 @@ class StageProgress:
     """The stage of a long command: one line that counts seconds, or in a pipe a line per stage.
 
     Use it as a context; `stage` names what begins. Its own thread counts, so that a stage that
-    takes a minute is seen to be alive.
+    takes a minute is seen to be alive. Where the stages to come are known, the line begins with the
+    share that is done and the time left. Log lines of what the stages do are not shown meanwhile.
     """
 
-    def __init__(self, stream: TextIO, *, quiet: bool = False) -> None:
+    def __init__(
+        self, stream: TextIO, *, quiet: bool = False, expected: Mapping[str, float] | None = None
+    ) -> None:
         self._stream = stream
         self._quiet = quiet
         self._live = not quiet and stream.isatty()
         self._stage = ""
+        self._left = TimeLeft(expected) if expected else None
+        self._logger = logging.getLogger("cmfsim")
+        self._level = self._logger.level
         self._begun = time.perf_counter()
         self._stopped = threading.Event()
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._tick, daemon=True)
 
     def __enter__(self) -> "StageProgress":
+        self._logger.setLevel(logging.WARNING)
         if self._live:
             self._thread.start()
         return self
@@ -71,19 +80,28 @@ class StageProgress:
         traceback: TracebackType | None,
     ) -> None:
         self._stopped.set()
+        self._logger.setLevel(self._level)
         if self._live:
             self._thread.join()
             self._write(CLEAR_LINE)
 
     def stage(self, name: str) -> None:
-        """Reports the start of a stage, and the time of the previous one."""
+        """Reports the start of a stage, or of another step of it."""
+        plain = COUNT.sub("", name)
         with self._lock:
-            now = time.perf_counter()
-            self._stage, self._begun = name, now
+            is_new = plain != COUNT.sub("", self._stage)
+            self._stage, self._begun = name, time.perf_counter()
+            if self._left is not None:
+                self._left.begin(name)
         if self._live:
             self._show()
-        elif not self._quiet:
-            self._write(f"cmfsim: {escaped(name)}\n")
+        elif is_new and not self._quiet:
+            self._write(f"cmfsim: {escaped(plain)}\n")
+
+    def line(self, text: str) -> None:
+        """Prints what has ended: in a pipe, since on a terminal the line of the stage counts it."""
+        if not (self._live or self._quiet):
+            self._write(f"{escaped(text)}\n")
 
     def _tick(self) -> None:
         while not self._stopped.wait(TICK):
@@ -92,8 +110,9 @@ class StageProgress:
     def _show(self) -> None:
         with self._lock:
             name, seconds = self._stage, time.perf_counter() - self._begun
+            left = "" if self._left is None else f"{self._left.text()}: "
         if name:
-            text = f"cmfsim: {escaped(name)} {seconds:.1f} s"
+            text = f"cmfsim: {left}{escaped(name)} {seconds:.1f} s"
             # A line that wraps could not be erased.
             self._write(f"{CLEAR_LINE}{text[: columns() - 1]}")
 

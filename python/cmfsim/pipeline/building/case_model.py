@@ -42,15 +42,16 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.progress import Progress, no_progress
+from cmfsim.values.progress import BUILDING, ProgressOrBar, shown_progress
 
 _log = logging.getLogger(__name__)
+WRITING = "writing the model"
 
 
 def build_case(
     case: CaseOrPath,
     *,
-    progress: Progress | None = None,
+    progress: ProgressOrBar = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
     on_findings: OnFindings | None = None,
@@ -60,8 +61,9 @@ def build_case(
     Parameters
     ----------
     case : Case, or path of its file or folder
-    progress : callable, optional
-        Called with the name of each stage as it begins.
+    progress : callable or bool, optional
+        Called with the name of each stage as it begins; True shows a bar of tqdm with the share
+        that is done and the time left.
     check : bool
         Whether the doctor checks the case first; an error that it finds ends the work.
     findings : iterable of Finding
@@ -89,14 +91,14 @@ def build_case(
     """
     case = as_case(case)
     check_output(case)
-    model = build_model(
-        case, progress=progress, check=check, findings=findings, on_findings=on_findings
-    )
-    stage = progress or no_progress
-    stage("writing the model")
-    begun = time.perf_counter()
-    names = write_model(case.output, model, partial(_draw, model))
-    timings = {**model.summary["timings"], "writing the model": time.perf_counter() - begun}
+    with shown_progress(progress, {**BUILDING, WRITING: 4.0}) as shown:
+        model = build_model(
+            case, progress=shown, check=check, findings=findings, on_findings=on_findings
+        )
+        shown(WRITING)
+        begun = time.perf_counter()
+        names = write_model(case.output, model, partial(_draw, model))
+    timings = {**model.summary["timings"], WRITING: time.perf_counter() - begun}
     more = {"timings": timings, "output": str(case.output), "files": names}
     return replace(model, summary={**model.summary, **more})
 
@@ -104,7 +106,7 @@ def build_case(
 def build_model(
     case: CaseOrPath,
     *,
-    progress: Progress | None = None,
+    progress: ProgressOrBar = None,
     check: bool = True,
     findings: Iterable[Finding] = (),
     anatomy: Anatomy | None = None,
@@ -116,7 +118,7 @@ def build_model(
     Parameters
     ----------
     case : Case, or path of its file or folder
-    progress : callable, optional
+    progress : callable or bool, optional
     check : bool
     findings : iterable of Finding
         As for `build_case`.
@@ -142,15 +144,16 @@ def build_model(
     >>> import cmfsim
     >>> model = cmfsim.build_model(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     """
-    options = BuildOptions(
-        progress=progress,
-        check=check,
-        findings=findings,
-        anatomy=anatomy,
-        after=after,
-        on_findings=on_findings,
-    )
-    return model_of(as_case(case), options)
+    with shown_progress(progress, BUILDING) as shown:
+        options = BuildOptions(
+            progress=shown,
+            check=check,
+            findings=findings,
+            anatomy=anatomy,
+            after=after,
+            on_findings=on_findings,
+        )
+        return model_of(as_case(case), options)
 
 
 def model_of(case: Case, options: BuildOptions) -> PatientModel:

@@ -1,7 +1,7 @@
 """A planning model whose operator is corrected by exact solutions of plans around the reference."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -17,7 +17,9 @@ from cmfsim.planning.replanning.expected_error import (
 )
 from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
+CORRECTING = "solving nearby plans to correct the operator"
 # Plans that are solved for a correction.
 CORRECTIONS = 96
 # With fewer solved plans, interpolation between them is meaningless.
@@ -33,7 +35,7 @@ def corrected_planning(
     shift: float = 5.0,
     turn: float = 5.0,
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
+    progress: ProgressOrBar = None,
 ) -> PlanningModel:
     """The planning model with its operator corrected by exact solutions, if this lowers the error.
 
@@ -51,8 +53,9 @@ def corrected_planning(
     turn : float, degrees
         The range of the plans: along each axis, and about any axis.
     seed : int
-    progress : callable, optional
-        Called with the name of each stage as it begins.
+    progress : callable or bool, optional
+        Called with the name of each stage as it begins; True shows a bar of tqdm with the share
+        that is done and the time left.
 
     Returns
     -------
@@ -84,13 +87,14 @@ def corrected_planning(
     rng = np.random.default_rng((seed, 1))
     drawn = [plan_near(bare, rng, shift, turn) for _ in range(plans)]
     places, distances, errors = [], [], []
-    for number, exact in enumerate(_solved(bare, drawn)):
-        if progress is not None:
-            progress(f"solving nearby plans to correct the operator ({number + 1} of {plans})")
-        if exact is not None:
-            places.append(numbers.of(drawn[number]))
-            distances.append(plan_distance(bare, drawn[number]))
-            errors.append(exact - bare.displacements(drawn[number]))
+    with shown_progress(progress, {CORRECTING: PLANNING[CORRECTING]}) as shown:
+        shown(f"{CORRECTING} (1 of {plans})")
+        for number, exact in enumerate(_solved(bare, drawn)):
+            shown(f"{CORRECTING} ({min(number + 2, plans)} of {plans})")
+            if exact is not None:
+                places.append(numbers.of(drawn[number]))
+                distances.append(plan_distance(bare, drawn[number]))
+                errors.append(exact - bare.displacements(drawn[number]))
     if len(places) < LEAST_PLANS:
         return bare
     correction, pays = fitted_correction(

@@ -11,8 +11,9 @@ from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.motion import rigid_motion
-from cmfsim.values.progress import Progress
+from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
+TRYING = "solving a nearby plan exactly"
 # Plans are tried at these shares of the range, one after the other.
 SHARES = (1.0, 0.5)
 # The usual error is the one that this percentage of the plans stays within.
@@ -163,7 +164,7 @@ def expected_error(
     shift: float = 5.0,
     turn: float = 5.0,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: ProgressOrBar = None,
 ) -> ExpectedError:
     """The deviation of the product from exact solutions at plans around the reference.
 
@@ -180,8 +181,9 @@ def expected_error(
     shift : float, mm
     turn : float, degrees
     seed : int
-    progress : callable, optional
-        Called with the name of each stage as it begins.
+    progress : callable or bool, optional
+        Called with the name of each stage as it begins; True shows a bar of tqdm with the share
+        that is done and the time left.
 
     Returns
     -------
@@ -204,12 +206,13 @@ def expected_error(
         raise CaseInputError(f"trials is {trials!r}: a whole number of 1 or more is needed")
     rng = np.random.default_rng(seed)
     found = []
-    for number in range(trials if planning.slides else 1):
-        if progress is not None:
-            progress(f"solving a nearby plan exactly ({number + 1})")
-        share = SHARES[number % len(SHARES)]
-        plan = plan_near(planning, rng, share * shift, share * turn)
-        found.append(_trial(planning, plan))
+    count = trials if planning.slides else 1
+    with shown_progress(progress, {TRYING: PLANNING[TRYING]}) as shown:
+        for number in range(count):
+            shown(f"{TRYING} ({number + 1} of {count})")
+            share = SHARES[number % len(SHARES)]
+            plan = plan_near(planning, rng, share * shift, share * turn)
+            found.append(_trial(planning, plan))
     correction = planning.correction
     left_out = np.zeros((0, 3))
     if correction is not None:
