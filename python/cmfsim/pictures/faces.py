@@ -1,14 +1,29 @@
 """Pictures of a plan and of the face that it is predicted to give."""
 
+import base64
+import html
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cmfsim.errors import CaseInputError
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
-from cmfsim.pictures.canvas import SIZE, Picture, Shown, View, add_scale_bar, bounds, draw, polydata
+from cmfsim.pictures.canvas import (
+    SIZE,
+    Picture,
+    Shown,
+    View,
+    add_scale_bar,
+    bounds,
+    draw,
+    polydata,
+    pyvista_module,
+)
 from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction
@@ -16,6 +31,8 @@ from cmfsim.values.surface_data import SurfaceData
 
 # Of six views in two rows, pixels.
 TWO_ROWS = (1650, 1240)
+# The same in a notebook.
+NOTEBOOK = (990, 744)
 # Skin shines a little.
 SKIN_SHADING = {"smooth_shading": True, "ambient": 0.12, "specular": 0.12, "specular_power": 12}
 # Movement that fills the colour scale at least, mm.
@@ -104,6 +121,40 @@ def picture_faces(
     corners = bounds([before.vertices, after.vertices])
     corners = ends.within(corners)
     draw(path, views, corners, size, paint, columns=len(names))
+
+
+def prediction_html(prediction: Prediction) -> str:
+    """What a notebook shows of a prediction: its lines, and below them its picture.
+
+    The picture is left out where PyVista or OpenGL is missing.
+    """
+    lines = f"<pre>{html.escape(repr(prediction))}</pre>"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "prediction.png"
+        try:
+            picture_prediction(path, prediction, size=NOTEBOOK)
+        except CaseInputError:
+            return lines
+        encoded = base64.b64encode(path.read_bytes()).decode()
+    return (
+        f'{lines}<img alt="prediction" width="{NOTEBOOK[0]}" src="data:image/png;base64,{encoded}">'
+    )
+
+
+def prediction_blocks(prediction: Prediction) -> Any:
+    """The surfaces and the tissue of a prediction as PyVista has them; see `to_pyvista`."""
+    pv, result = pyvista_module(), prediction.result
+    blocks = pv.MultiBlock()
+    for parts in prediction.parts.values():
+        for name, (surface, after) in parts.items():
+            blocks[name] = polydata(after, surface.triangles)
+            blocks[name].point_data["displacement"] = after - surface.vertices
+    moved = result.nodes + result.displacements
+    tissue = pv.UnstructuredGrid({pv.CellType.TETRA: result.tets.astype(np.int64)}, moved)
+    tissue.point_data["displacement"] = result.displacements
+    tissue.point_data["force"] = result.forces
+    blocks["tissue"] = tissue
+    return blocks
 
 
 def picture_plan(

@@ -3,7 +3,7 @@
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError
+from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
 from cmfsim.pictures.canvas import (
     View,
     bounds,
@@ -22,11 +23,14 @@ from cmfsim.pictures.canvas import (
     write_picture,
 )
 from cmfsim.values.checks import Floats, as_positive
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, joined_surface
 
 WINDOW = (1300, 900)
 # Of the letter that shows and hides each part, and its place in the window, pixels.
 ROW, LEFT = 30, 12
+MUSCLE_COLOUR, GHOST_COLOUR = "#b8564b", "#7f8c9a"
+# Bones show through the skin.
+OVER_BONES = 0.45
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +57,37 @@ class ViewPart:
     opacity: float = 1.0
     values: Floats | None = None
     shown: bool = True
+
+
+def prediction_parts(
+    found: Mapping[str, Mapping[str, tuple[SurfaceData, Floats]]],
+) -> list[ViewPart]:
+    """The surfaces of a prediction as a window shows them.
+
+    Parameters
+    ----------
+    found : mapping of str to mapping of str to (SurfaceData, (v, 3) float64)
+        As `read_parts` gives them, or `Prediction.parts`.
+    """
+    before, after = found["skin"]["skin"]
+    moved = np.linalg.norm(after - before.vertices, axis=1)
+    parts = [
+        ViewPart("skin after", SurfaceData(after, before.triangles), SKIN_COLOUR, OVER_BONES),
+        ViewPart("skin before", before, SKIN_COLOUR, OVER_BONES, shown=False),
+        ViewPart(
+            "movement", SurfaceData(after, before.triangles), "#21918c", values=moved, shown=False
+        ),
+    ]
+    bones = found.get("bones", {})
+    colours = segment_colours(list(bones))
+    for name, (surface, place) in bones.items():
+        parts.append(ViewPart(name, SurfaceData(place, surface.triangles), colours[name]))
+        if not np.array_equal(place, surface.vertices):
+            parts.append(ViewPart(f"{name} before", surface, GHOST_COLOUR, 0.4, shown=False))
+    muscles = [surface for surface, _ in found.get("muscles", {}).values()]
+    if muscles:
+        parts.append(ViewPart("muscles", joined_surface(muscles), MUSCLE_COLOUR, shown=False))
+    return parts
 
 
 def view_parts(
@@ -92,7 +127,8 @@ def view_parts(
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     if path is None and not has_screen():
         raise CaseInputError(
-            "there is no screen for a window: write a picture instead (--screenshot FILE.png)"
+            "there is no screen for a window: write a picture instead (--screenshot FILE.png; in "
+            "Python, screenshot=)"
         )
     width, height = (int(as_positive("window size", n)) for n in size)
     pv = pyvista_module()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +19,7 @@ from cmfsim.values.checks import Floats, Frozen, check_one_of, listing
 from cmfsim.values.finding import Finding, counted_findings
 from cmfsim.values.model_names import MODELS
 from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.progress import no_progress
 from cmfsim.values.scene import Scene, SceneResult
 from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
@@ -25,6 +29,14 @@ if TYPE_CHECKING:
     from cmfsim.values.skin_band import SkinBand
 
 __all__ = ["MODELS", "Prediction"]
+
+
+def _above(room: str) -> Any:
+    """A room above the values, loaded when a method is called that draws or writes.
+
+    At a prompt methods are found where functions are not; no value needs a room to be made.
+    """
+    return import_module(f"cmfsim.{room}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +193,91 @@ class Prediction(Frozen):
                 vertices = vertices @ motion[:3, :3].T + motion[:3, 3]
             found[segment.name] = (surface, vertices)
         return found
+
+    @property
+    def parts(self) -> dict[str, dict[str, tuple[SurfaceData, Floats]]]:
+        """The surfaces by kind and name, each with its vertices after the operation, (v, 3) mm.
+
+        "skin" is the face; "bones" are the segments; "muscles", where the model has some, stay.
+        """
+        found = {"skin": {"skin": (self.face_before, self.face.vertices)}, "bones": self.bones}
+        if self.muscles is not None:
+            still = {m.name: (m.surface, m.surface.vertices) for m in self.muscles}
+            found["muscles"] = still
+        return found
+
+    def save(self, folder: str | os.PathLike[str]) -> list[str]:
+        """The names of the files that `cmfsim predict` writes, written to a folder.
+
+        Results in several formats, pictures and `report.html`, as `write_prediction` lists them;
+        `cmfsim view`, `report` and `plan` work on the folder. All take their places together, and
+        results of another plan in the folder are removed.
+
+        Parameters
+        ----------
+        folder : path
+            Created if necessary.
+
+        Raises
+        ------
+        OSError
+            The folder cannot be created or written to.
+
+        Examples
+        --------
+        >>> prediction.save("out")  # doctest: +SKIP
+        """
+        write = _above("pipeline.outputs").write_results
+        written = write(Path(folder), [self], [self.model], stage=no_progress)
+        names = [*written.predictions[0].files]
+        return names if written.report is None else [*names, written.report]
+
+    def plot(self, screenshot: str | os.PathLike[str] | None = None) -> None:
+        """Opens a window with skin, bones and muscles, as `cmfsim view` does, or writes a picture.
+
+        A notebook shows a prediction that is the last line of a cell as a picture by itself.
+
+        Parameters
+        ----------
+        screenshot : path, optional
+            Ends in `.png`: nothing is opened.
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) PyVista, OpenGL or a screen is missing; another ending.
+
+        Examples
+        --------
+        >>> prediction.plot()  # doctest: +SKIP
+        >>> prediction.plot("face.png")  # doctest: +SKIP
+        """
+        pictures = _above("pictures")
+        parts = pictures.prediction_parts(self.parts)
+        title = f"{self.name}, {self.model} - cmfsim"
+        pictures.view_parts(parts, title=title, screenshot=screenshot)
+
+    def to_pyvista(self) -> Any:
+        """The prediction as a `pyvista.MultiBlock`, in LPS mm, after the operation.
+
+        Blocks: "skin", bone segments and muscles by name, and "tissue" (tets). Each has the point
+        data `displacement`, (n, 3) mm: subtract it for the place before. The tissue has `force`,
+        (n, 3) N, as well.
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) PyVista is missing.
+
+        Examples
+        --------
+        >>> blocks = prediction.to_pyvista()  # doctest: +SKIP
+        >>> blocks["skin"].plot(scalars="displacement")  # doctest: +SKIP
+        """
+        return _above("pictures").prediction_blocks(self)
+
+    def _repr_html_(self) -> str:
+        return str(_above("pictures").prediction_html(self))
 
     @property
     def muscles(self) -> Musculature | None:

@@ -13,13 +13,18 @@ from cmfsim.cli.exit_codes import DONE
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
 from cmfsim.io.results.predictions import predictions_of
-from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
-from cmfsim.values.surface_data import SurfaceData, joined_surface
+from cmfsim.pictures import (
+    KIND_COLOURS,
+    OVER_BONES,
+    SKIN_COLOUR,
+    ViewPart,
+    prediction_parts,
+    segment_colours,
+    view_parts,
+)
+from cmfsim.values.surface_data import SurfaceData
 
-MUSCLE_COLOUR = "#b8564b"
 SURFACES = (".stl", ".ply", ".obj", ".vtp")
-# Bones show through the skin.
-OVER_BONES = 0.45
 
 
 def view(options: argparse.Namespace) -> int:
@@ -51,7 +56,7 @@ def parts_of(path: Path, model: str | None = None) -> list[ViewPart]:
     if path.is_dir():
         return _of_folder(path, model)
     if path.name == "prediction.json":
-        return _of_prediction(path.parent)
+        return prediction_parts(read_parts(path.parent))
     if path.suffix == ".toml" and "cmfsim-case" in path.read_text(encoding="utf-8"):
         output = Case.load(path).output
         if not output.is_dir():
@@ -76,7 +81,7 @@ def _of_folder(folder: Path, model: str | None) -> list[ViewPart]:
             raise CaseInputError(f"{folder}: contains the models {', '.join(found)}, not {model}")
         # The case's own prediction before those in folders by model.
         own = next((name for name, place in found.items() if place == folder), None)
-        return _of_prediction(found[model or own or [*found][-1]])
+        return prediction_parts(read_parts(found[model or own or [*found][-1]]))
     if (folder / "build.json").exists():
         return _of_model(folder)
     if (folder / "case.toml").exists():
@@ -85,29 +90,6 @@ def _of_folder(folder: Path, model: str | None) -> list[ViewPart]:
         f"{folder}: contains no prediction.json, build.json or case.toml, so there is nothing to "
         "display"
     )
-
-
-def _of_prediction(folder: Path) -> list[ViewPart]:
-    found = read_parts(folder)
-    before, after = found["skin"]["skin"]
-    moved = np.linalg.norm(after - before.vertices, axis=1)
-    parts = [
-        ViewPart("skin after", SurfaceData(after, before.triangles), SKIN_COLOUR, OVER_BONES),
-        ViewPart("skin before", before, SKIN_COLOUR, OVER_BONES, shown=False),
-        ViewPart(
-            "movement", SurfaceData(after, before.triangles), "#21918c", values=moved, shown=False
-        ),
-    ]
-    bones = found.get("bones", {})
-    colours = segment_colours(list(bones))
-    for name, (surface, place) in bones.items():
-        parts.append(ViewPart(name, SurfaceData(place, surface.triangles), colours[name]))
-        if not np.array_equal(place, surface.vertices):
-            parts.append(ViewPart(f"{name} before", surface, "#7f8c9a", 0.4, shown=False))
-    muscles = [surface for surface, _ in found.get("muscles", {}).values()]
-    if muscles:
-        parts.append(ViewPart("muscles", joined_surface(muscles), MUSCLE_COLOUR, shown=False))
-    return parts
 
 
 def _of_model(folder: Path) -> list[ViewPart]:

@@ -265,10 +265,8 @@ def write_timings(folder: Path, seconds: Mapping[str, float]) -> None:
 
 def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
     """The names of the parts in the file of each kind: bones, and muscles where there are any."""
-    parts = {"bones": prediction.bones}
-    if prediction.muscles is not None:
-        still = {m.name: (m.surface, m.surface.vertices) for m in prediction.muscles}
-        parts["muscles"] = still
+    # The skin has files of its own.
+    parts = {kind: found for kind, found in prediction.parts.items() if kind != "skin"}
     for kind, surfaces in parts.items():
         before = [surface.vertices for surface, _ in surfaces.values()]
         counts = [len(vertices) for vertices in before]
