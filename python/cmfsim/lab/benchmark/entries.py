@@ -152,6 +152,11 @@ class EntryFolder:
             text = json.dumps({"reason": reason, "made_from": made_from}, indent=1)
             file.write(text.encode())
 
+    def reason(self, method: str, patient: str) -> str | None:
+        """Why there is no prediction, if that was recorded."""
+        path = self.file(method, patient, FAILURE)
+        return str(json.loads(path.read_text("utf-8"))["reason"]) if path.exists() else None
+
     def took(self, method: str, patient: str, seconds: float) -> None:
         """Writes the run time of a prediction to a file of its own, as it differs in every run."""
         path = self.file(method, patient, TIMES)

@@ -1,7 +1,7 @@
 """The scores of one method on all patients of a part."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,7 +34,9 @@ class MethodResult:
     scores : mapping of str to mapping of str to RegionScore
         By patient, then by region.
     missing : tuple of str
-        Patients without a prediction; `failed` lists those for which the method gives a reason.
+        Patients without a prediction.
+    failed : mapping of str to str
+        The reasons that the method gives for some of them, by patient.
     band : MethodBand or None
         Calibration of its standard deviations on the calibration part, where it states any.
     """
@@ -42,7 +44,7 @@ class MethodResult:
     method: str
     scores: Mapping[str, Mapping[str, RegionScore]]
     missing: tuple[str, ...] = ()
-    failed: tuple[str, ...] = ()
+    failed: Mapping[str, str] = field(default_factory=dict)
     band: MethodBand | None = None
 
     def figures(self, region: str, name: str) -> list[float]:

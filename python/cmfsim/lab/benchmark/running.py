@@ -20,7 +20,6 @@ from cmfsim.io.results.populations import (
 from cmfsim.lab.benchmark.bands import calibrated_band
 from cmfsim.lab.benchmark.entries import (
     ENTRIES,
-    FAILURE,
     LEARNED,
     ON_REQUEST,
     EntryFolder,
@@ -230,8 +229,9 @@ def _result(
             scores[patient.name] = score(patient, prediction, factors)
         except CaseInputError as error:
             raise CaseInputError(f"{file}: {error}") from error
-    failed = [name for name in missing if place.file(method, name, FAILURE).exists()]
-    return MethodResult(method, scores, tuple(missing), tuple(failed), band)
+    reasons = {name: place.reason(method, name) for name in missing}
+    failed = {name: reason for name, reason in reasons.items() if reason is not None}
+    return MethodResult(method, scores, tuple(missing), failed, band)
 
 
 def _write(folder: Path, table: BenchmarkTable, predictions: Path) -> tuple[Path, ...]:

@@ -164,6 +164,7 @@ class BenchmarkTable:
                 result.method: {
                     "missing": list(result.missing),
                     "failed": list(result.failed),
+                    "reasons": dict(result.failed),
                     "band": None if result.band is None else result.band.as_dict(),
                     "patients": {
                         name: {region: found.as_dict() for region, found in scores.items()}
@@ -256,4 +257,9 @@ class BenchmarkTable:
                     f"{', '.join(result.missing)}{reason}: its figures are from fewer patients "
                     "than those of the other methods and cannot be compared with them."
                 )
+                alike: dict[str, list[str]] = {}
+                for name, why in result.failed.items():
+                    alike.setdefault(why, []).append(name)
+                reasons = [f"- {', '.join(of)}: {why}" for why, of in alike.items()]
+                found += ["\n".join(reasons)] if reasons else []
         return found

@@ -260,9 +260,11 @@ def test_a_model_that_fails_stays_in_the_table(folder):
     """These patients have no CT that can be read: H says so for each, and has no figures."""
     found = cmfsim.run_benchmark(folder, entries=["no-change", "H"])
     failed = next(r for r in found.table.results if r.method == "H")
-    assert failed.failed == found.table.patients
+    assert tuple(failed.failed) == found.table.patients
     assert "it failed on D003" in found.table.markdown()
     reason = json.loads((folder / "predictions" / "H" / "D003.failed.json").read_text())["reason"]
+    assert f"\n- {', '.join(found.table.patients)}: {reason}\n" in found.table.markdown()
+    assert found.table.as_dict()["methods"]["H"]["reasons"]["D003"] == reason
     assert "ct.nrrd" in reason
 
 
