@@ -212,12 +212,16 @@ def surface_as_stored(path: Path, crease_angle: float = 60.0) -> SurfaceFile:
     Vertices in the same place are made one: STL repeats them for each triangle.
     """
     mesh = read_mesh(path)
-    triangles = _triangles(mesh, path)
-    points = mesh.points
-    kept, number = _welded(points)
-    surface = SurfaceData(points[kept], number[triangles], crease_angle)
+    surface = surface_of(mesh, path, crease_angle)
     findings = tuple(replace(finding, where=path.name) for finding in mesh.findings)
     return SurfaceFile(surface, mesh.frame, findings)
+
+
+def surface_of(mesh: PlainMesh, path: Path, crease_angle: float = 60.0) -> SurfaceData:
+    """The triangles of a mesh, with vertices in the same place made one; `path` names it."""
+    triangles = _triangles(mesh, path)
+    kept, number = _welded(mesh.points)
+    return SurfaceData(mesh.points[kept], number[triangles], crease_angle)
 
 
 def _numbered(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], str | None]:

@@ -29,13 +29,7 @@ from cmfsim.pictures.faces import (
 )
 from cmfsim.pictures.landmarks import picture_landmarks
 from cmfsim.pictures.muscles import picture_muscles
-from cmfsim.pictures.window import (
-    OVER_BONES,
-    ViewPart,
-    has_screen,
-    prediction_parts,
-    view_parts,
-)
+from cmfsim.pictures.window import OVER_BONES, ViewPart, has_screen, prediction_parts, view_parts
 
 __all__ = [
     "DISTANCE_LIMIT",

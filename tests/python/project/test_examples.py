@@ -47,6 +47,7 @@ MADE_BY_STAGES = {
     "PlanTrial",
     "PlanningModel",
     "Prediction",
+    "RepairedTets",
     "RigidFit",
     "RigidMotion",
     "SceneResult",

@@ -116,7 +116,7 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
     # A DICOM file may begin with anything.
     if begin[128:132] != b"DICM":
         if begin.startswith(GZIP) or is_nifti(begin):
-            return _placed(path, *read_nifti(path))
+            return placed(path, *read_nifti(path))
         if begin.startswith(b"NRRD000"):
             return _read_file(path, nrrd_header(path))
         if is_meta(begin):
@@ -202,7 +202,7 @@ def _read_file(path: Path, header: ImageHeader) -> ImageFile:
             f"position ({affine.round(4).tolist()} and {theirs.round(4).tolist()}): export the "
             "image again"
         )
-    return _placed(path, values, affine, header.findings)
+    return placed(path, values, affine, header.findings)
 
 
 @contextmanager
@@ -218,7 +218,7 @@ def _unpacked(path: Path, header: ImageHeader) -> Iterator[Path]:
         yield copy
 
 
-def _placed(
+def placed(
     path: Path, values: NDArray[Any], affine: NDArray[np.float64], findings: tuple[Finding, ...]
 ) -> ImageFile:
     """The image of voxels with their map to LPS, on axes of the patient."""

@@ -17,10 +17,11 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import check_readable, named, utf8_path
 from cmfsim.io.meshes.msh import read_msh
 from cmfsim.io.meshes.obj import read_obj
-from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
+from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, in_space
 from cmfsim.io.meshes.ply import read_ply
 from cmfsim.io.meshes.stated_frames import stated_frame
 from cmfsim.io.meshes.stl import read_stl
+from cmfsim.io.meshes.tets import oriented
 from cmfsim.io.meshes.vtk.legacy import read_vtk_legacy
 from cmfsim.io.meshes.vtk.xml import read_vtk_xml
 from cmfsim.processes.child import ReaderError, read_in_child
@@ -128,11 +129,8 @@ def _by_meshio(path: Path) -> PlainMesh:
     blocks = tuple(
         Cells(name, _as_indices(arrays[f"cells.{i}"])) for i, name in enumerate(values["types"])
     )
-    points = np.asarray(arrays["points"], dtype=np.float64)
-    if points.ndim == 2 and points.shape[1] == 2:
-        points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
     return PlainMesh(
-        points,
+        in_space(arrays["points"]),
         blocks,
         {values["point_data"][i]: arrays[f"point_data.{i}"] for i in range(n_points)},
         {
@@ -203,13 +201,8 @@ def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], ND
     """
     path = Path(path)
     mesh = read_mesh(path)
-    nodes = mesh.points
-    tets = read_tets(mesh, path)[0].copy()
-    # Programs differ in the order of nodes: which one a file has, its volumes say.
-    corners = nodes[tets]
-    negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0.0
-    tets[negative] = tets[negative][:, [0, 1, 3, 2]]
-    return nodes, tets.astype(np.uint32)
+    tets = read_tets(mesh, path)[0].astype(np.uint32)
+    return mesh.points, oriented(mesh.points, tets)[0]
 
 
 def read_tets(mesh: PlainMesh, path: Path) -> tuple[NDArray[np.int64], dict[str, NDArray[Any]]]:
