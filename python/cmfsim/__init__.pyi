@@ -83,12 +83,8 @@ from cmfsim.imaging import undeformed_mask as undeformed_mask
 from cmfsim.io import Case as Case
 from cmfsim.io import CaseChanges as CaseChanges
 from cmfsim.io import Cohort as Cohort
-from cmfsim.io import RepairedTets as RepairedTets
 from cmfsim.io import Variant as Variant
 from cmfsim.io import Variants as Variants
-from cmfsim.io import from_meshio as from_meshio
-from cmfsim.io import from_nibabel as from_nibabel
-from cmfsim.io import from_pyvista as from_pyvista
 from cmfsim.io import read_image as read_image
 from cmfsim.io import read_landmarks as read_landmarks
 from cmfsim.io import read_moved_surface as read_moved_surface
@@ -98,7 +94,6 @@ from cmfsim.io import read_scene as read_scene
 from cmfsim.io import read_surface as read_surface
 from cmfsim.io import read_tet_mesh as read_tet_mesh
 from cmfsim.io import read_transform as read_transform
-from cmfsim.io import repair_tets as repair_tets
 from cmfsim.io import write_image as write_image
 from cmfsim.io import write_landmarks as write_landmarks
 from cmfsim.io import write_metrics as write_metrics
@@ -110,6 +105,11 @@ from cmfsim.io import write_scene as write_scene
 from cmfsim.io import write_slicer_bundle as write_slicer_bundle
 from cmfsim.io import write_surface as write_surface
 from cmfsim.io import write_transform as write_transform
+from cmfsim.io.meshes.tets import RepairedTets as RepairedTets
+from cmfsim.io.meshes.tets import repair_tets as repair_tets
+from cmfsim.io.objects import from_meshio as from_meshio
+from cmfsim.io.objects import from_nibabel as from_nibabel
+from cmfsim.io.objects import from_pyvista as from_pyvista
 from cmfsim.io.results.calibrations import read_calibration as read_calibration
 from cmfsim.io.results.calibrations import write_calibration as write_calibration
 from cmfsim.io.results.populations import Population as Population

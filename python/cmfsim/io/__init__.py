@@ -13,8 +13,6 @@ from cmfsim.io.images.image_files import read_image, write_image
 from cmfsim.io.landmark_files import read_landmark_file, read_landmarks, write_landmarks
 from cmfsim.io.meshes import ply
 from cmfsim.io.meshes.mesh_files import read_tet_mesh
-from cmfsim.io.meshes.tets import RepairedTets, repair_tets
-from cmfsim.io.objects import from_meshio, from_nibabel, from_pyvista
 from cmfsim.io.results.metrics import write_metrics
 from cmfsim.io.results.models import write_model
 from cmfsim.io.results.predictions import read_parts, write_prediction
@@ -38,14 +36,10 @@ __all__ = [
     "CaseChanges",
     "CaseOrPath",
     "Cohort",
-    "RepairedTets",
     "Variant",
     "Variants",
     "as_case",
     "finish_writing",
-    "from_meshio",
-    "from_nibabel",
-    "from_pyvista",
     "read_bone_pair",
     "read_image",
     "read_landmark_file",
@@ -59,7 +53,6 @@ __all__ = [
     "read_surface_file",
     "read_tet_mesh",
     "read_transform",
-    "repair_tets",
     "replacing",
     "replacing_files",
     "result_suffixes",

@@ -19,23 +19,15 @@ from cmfsim.pictures.distances import (
     picture_distance_grid,
     picture_distances,
 )
-from cmfsim.pictures.faces import (
-    picture_plan,
-    picture_prediction,
-    plan_picture,
-    prediction_blocks,
-    prediction_html,
-    prediction_picture,
-)
+from cmfsim.pictures.faces import picture_plan, picture_prediction, plan_picture, prediction_picture
 from cmfsim.pictures.landmarks import picture_landmarks
 from cmfsim.pictures.muscles import picture_muscles
-from cmfsim.pictures.window import OVER_BONES, ViewPart, has_screen, prediction_parts, view_parts
+from cmfsim.pictures.window import ViewPart, has_screen, view_parts
 
 __all__ = [
     "DISTANCE_LIMIT",
     "KIND_COLOURS",
     "MODEL_COLOURS",
-    "OVER_BONES",
     "SEGMENT_COLOURS",
     "SKIN_COLOUR",
     "Picture",
@@ -55,9 +47,6 @@ __all__ = [
     "picture_prediction",
     "picture_segments",
     "plan_picture",
-    "prediction_blocks",
-    "prediction_html",
-    "prediction_parts",
     "prediction_picture",
     "segment_colours",
     "view_parts",

@@ -13,17 +13,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
-from cmfsim.pictures.canvas import (
-    SIZE,
-    Picture,
-    Shown,
-    View,
-    add_scale_bar,
-    bounds,
-    draw,
-    polydata,
-    pyvista_module,
-)
+from cmfsim.pictures.canvas import SIZE, Picture, Shown, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction
@@ -124,10 +114,7 @@ def picture_faces(
 
 
 def prediction_html(prediction: Prediction) -> str:
-    """What a notebook shows of a prediction: its lines, and below them its picture.
-
-    The picture is left out where PyVista or OpenGL is missing.
-    """
+    """What a notebook shows of a prediction: its lines, and its picture if one can be drawn."""
     lines = f"<pre>{html.escape(repr(prediction))}</pre>"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "prediction.png"
@@ -135,26 +122,8 @@ def prediction_html(prediction: Prediction) -> str:
             picture_prediction(path, prediction, size=NOTEBOOK)
         except CaseInputError:
             return lines
-        encoded = base64.b64encode(path.read_bytes()).decode()
-    return (
-        f'{lines}<img alt="prediction" width="{NOTEBOOK[0]}" src="data:image/png;base64,{encoded}">'
-    )
-
-
-def prediction_blocks(prediction: Prediction) -> Any:
-    """The surfaces and the tissue of a prediction as PyVista has them; see `to_pyvista`."""
-    pv, result = pyvista_module(), prediction.result
-    blocks = pv.MultiBlock()
-    for parts in prediction.parts.values():
-        for name, (surface, after) in parts.items():
-            blocks[name] = polydata(after, surface.triangles)
-            blocks[name].point_data["displacement"] = after - surface.vertices
-    moved = result.nodes + result.displacements
-    tissue = pv.UnstructuredGrid({pv.CellType.TETRA: result.tets.astype(np.int64)}, moved)
-    tissue.point_data["displacement"] = result.displacements
-    tissue.point_data["force"] = result.forces
-    blocks["tissue"] = tissue
-    return blocks
+        data = base64.b64encode(path.read_bytes()).decode()
+    return f'{lines}<img alt="prediction" src="data:image/png;base64,{data}">'
 
 
 def picture_plan(

@@ -23,6 +23,7 @@ from cmfsim.pictures.canvas import (
     write_picture,
 )
 from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
 WINDOW = (1300, 900)
@@ -62,13 +63,7 @@ class ViewPart:
 def prediction_parts(
     found: Mapping[str, Mapping[str, tuple[SurfaceData, Floats]]],
 ) -> list[ViewPart]:
-    """The surfaces of a prediction as a window shows them.
-
-    Parameters
-    ----------
-    found : mapping of str to mapping of str to (SurfaceData, (v, 3) float64)
-        As `read_parts` gives them, or `Prediction.parts`.
-    """
+    """The surfaces of `read_parts` or of `Prediction.parts`, as a window shows them."""
     before, after = found["skin"]["skin"]
     moved = np.linalg.norm(after - before.vertices, axis=1)
     parts = [
@@ -88,6 +83,22 @@ def prediction_parts(
     if muscles:
         parts.append(ViewPart("muscles", joined_surface(muscles), MUSCLE_COLOUR, shown=False))
     return parts
+
+
+def prediction_blocks(prediction: Prediction) -> Any:
+    """The surfaces and the tissue of a prediction as PyVista has them; see `to_pyvista`."""
+    pv, result = pyvista_module(), prediction.result
+    blocks = pv.MultiBlock()
+    for parts in prediction.parts.values():
+        for name, (surface, after) in parts.items():
+            blocks[name] = polydata(after, surface.triangles)
+            blocks[name].point_data["displacement"] = after - surface.vertices
+    moved = result.nodes + result.displacements
+    tissue = pv.UnstructuredGrid({pv.CellType.TETRA: result.tets.astype(np.int64)}, moved)
+    tissue.point_data["displacement"] = result.displacements
+    tissue.point_data["force"] = result.forces
+    blocks["tissue"] = tissue
+    return blocks
 
 
 def view_parts(
@@ -127,8 +138,7 @@ def view_parts(
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     if path is None and not has_screen():
         raise CaseInputError(
-            "there is no screen for a window: write a picture instead (--screenshot FILE.png; in "
-            "Python, screenshot=)"
+            "there is no screen for a window: write a picture instead (screenshot FILE.png)"
         )
     width, height = (int(as_positive("window size", n)) for n in size)
     pv = pyvista_module()

@@ -34,7 +34,7 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding, OnFindings, grouped
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.progress import ProgressOrBar, comparing_stages, shown_progress
+from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
 from cmfsim.values.surface_data import SurfaceData
 
 WILCOXON_NOTE = (
@@ -199,7 +199,8 @@ def evaluate(
     1.21
     """
     case, models = as_case(case), named_models(models)
-    with shown_progress(progress, comparing_stages(models)) as shown:
+    expected = expected_stages(*(f"solving {m}" for m in models), "comparing the faces")
+    with shown_progress(progress, expected) as shown:
         shown("reading the face after the operation")
         key = evaluation_key(case, models)
         # First, for it fails at once where the case has none.

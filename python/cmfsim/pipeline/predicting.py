@@ -18,7 +18,7 @@ from cmfsim.values.checks import check_one_of
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.progress import ProgressOrBar, shown_progress, solving_stages
+from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
 
 _log = logging.getLogger(__name__)
 
@@ -42,8 +42,7 @@ def predict(
         "H", "M", "H+S" or "M+S" (Kim et al. 2010, section 3.2): homogeneous or with muscles,
         without or with sliding at teeth and mucosa.
     progress : callable or bool, optional
-        Called with the name of each stage as it begins; True shows a bar of tqdm with the share
-        that is done and the time left.
+        Called with the name of each stage as it begins; True shows a bar (tqdm).
     check : bool
         Whether the doctor checks the case first; an error that it finds ends the work.
     band : BandOptions, optional
@@ -127,7 +126,8 @@ def predict_models(  # noqa: PLR0913 (options by name)
     ...     print(prediction.model, prediction.result.summary["residual"])
     """
     case, models = as_case(case), named_models(models)
-    with shown_progress(progress, solving_stages(models)) as shown:
+    expected = expected_stages(*(f"solving {model}" for model in models))
+    with shown_progress(progress, expected) as shown:
         options = BuildOptions(
             progress=shown,
             check=check,

@@ -20,7 +20,7 @@ from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
-from cmfsim.values.progress import ProgressOrBar, shown_progress, solving_stages
+from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
 
 # Standard deviation of a landmark's place along each axis that moves the masseter by the 2 mm of
 # the paper's three trials, mm.
@@ -193,7 +193,7 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     if (trials if isinstance(trials, int) else len(trials)) < 1:
         raise CaseInputError("no trial was given: at least one is needed")
     case = as_case(case)
-    with shown_progress(progress, {**solving_stages([model]), "trial": 30.0}) as shown:
+    with shown_progress(progress, expected_stages(f"solving {model}", "trial")) as shown:
         options = BuildOptions(
             progress=shown, check=check, findings=findings, on_findings=on_findings
         )

@@ -32,10 +32,7 @@ __all__ = ["MODELS", "Prediction"]
 
 
 def _above(room: str) -> Any:
-    """A room above the values, loaded when a method is called that draws or writes.
-
-    At a prompt methods are found where functions are not; no value needs a room to be made.
-    """
+    """A room above the values, loaded when a method that draws or writes is called."""
     return import_module(f"cmfsim.{room}")
 
 
@@ -201,41 +198,27 @@ class Prediction(Frozen):
         "skin" is the face; "bones" are the segments; "muscles", where the model has some, stay.
         """
         found = {"skin": {"skin": (self.face_before, self.face.vertices)}, "bones": self.bones}
-        if self.muscles is not None:
-            still = {m.name: (m.surface, m.surface.vertices) for m in self.muscles}
-            found["muscles"] = still
+        if (muscles := self.muscles) is not None:
+            found["muscles"] = {m.name: (m.surface, m.surface.vertices) for m in muscles}
         return found
 
     def save(self, folder: str | os.PathLike[str]) -> list[str]:
         """The names of the files that `cmfsim predict` writes, written to a folder.
 
-        Results in several formats, pictures and `report.html`, as `write_prediction` lists them;
-        `cmfsim view`, `report` and `plan` work on the folder. All take their places together, and
-        results of another plan in the folder are removed.
-
-        Parameters
-        ----------
-        folder : path
-            Created if necessary.
+        Those of `write_prediction`, with pictures and `report.html`. The folder is created if
+        necessary; results of another plan in it are removed.
 
         Raises
         ------
         OSError
             The folder cannot be created or written to.
-
-        Examples
-        --------
-        >>> prediction.save("out")  # doctest: +SKIP
         """
         write = _above("pipeline.outputs").write_results
         written = write(Path(folder), [self], [self.model], stage=no_progress)
-        names = [*written.predictions[0].files]
-        return names if written.report is None else [*names, written.report]
+        return [*written.predictions[0].files, *filter(None, [written.report])]
 
     def plot(self, screenshot: str | os.PathLike[str] | None = None) -> None:
         """Opens a window with skin, bones and muscles, as `cmfsim view` does, or writes a picture.
-
-        A notebook shows a prediction that is the last line of a cell as a picture by itself.
 
         Parameters
         ----------
@@ -246,16 +229,9 @@ class Prediction(Frozen):
         ------
         CaseError
             (also `ValueError`) PyVista, OpenGL or a screen is missing; another ending.
-
-        Examples
-        --------
-        >>> prediction.plot()  # doctest: +SKIP
-        >>> prediction.plot("face.png")  # doctest: +SKIP
         """
-        pictures = _above("pictures")
-        parts = pictures.prediction_parts(self.parts)
-        title = f"{self.name}, {self.model} - cmfsim"
-        pictures.view_parts(parts, title=title, screenshot=screenshot)
+        window, title = _above("pictures.window"), f"{self.name}, {self.model} - cmfsim"
+        window.view_parts(window.prediction_parts(self.parts), title=title, screenshot=screenshot)
 
     def to_pyvista(self) -> Any:
         """The prediction as a `pyvista.MultiBlock`, in LPS mm, after the operation.
@@ -271,13 +247,12 @@ class Prediction(Frozen):
 
         Examples
         --------
-        >>> blocks = prediction.to_pyvista()  # doctest: +SKIP
-        >>> blocks["skin"].plot(scalars="displacement")  # doctest: +SKIP
+        >>> prediction.to_pyvista()["skin"].plot(scalars="displacement")  # doctest: +SKIP
         """
-        return _above("pictures").prediction_blocks(self)
+        return _above("pictures.window").prediction_blocks(self)
 
     def _repr_html_(self) -> str:
-        return str(_above("pictures").prediction_html(self))
+        return str(_above("pictures.faces").prediction_html(self))
 
     @property
     def muscles(self) -> Musculature | None:

@@ -3,7 +3,7 @@
 import contextlib
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 
 from cmfsim.errors import third_party
@@ -14,41 +14,23 @@ ProgressOrBar = Progress | bool | None
 
 # A stage of equal steps names the one that begins: "solving nearby plans (3 of 96)".
 COUNT = re.compile(r" \(?(\d+) of (\d+)\)?$")
-# Typical seconds of each stage of a build, in order: the CT phantom and the demo on one thread
-# (timings.json). Once some stages have passed, only ratios count.
-BUILDING: Mapping[str, float] = MappingProxyType(
-    {
-        "reading the face after the operation": 2.0,
-        "checking the case": 5.0,
-        "reading the image": 2.0,
-        "segmenting the head": 25.0,
-        "reading surface": 2.0,
-        "measuring distances from the surfaces": 7.0,
-        "finding the landmarks": 8.0,
-        "cutting the bones": 3.0,
-        "reading the achieved plan": 2.0,
-        "finding the soft tissue": 1.5,
-        "making the contact sheets": 1.0,
-        "filling the tissue with tets": 2.0,
-        "finding the seam between the lips": 1.0,
-        "classifying nodes": 4.0,
-        "separating the lips": 1.0,
-        "assembling the scene": 1.0,
-        "placing and sampling the muscles": 5.0,
-    }
-)
+# Typical seconds of the longer stages of a build, in order: the CT phantom and the demo on one
+# thread (timings.json). Once some stages have passed, only ratios count.
+BUILDING: Mapping[str, float] = MappingProxyType({
+    "reading the face after the operation": 2.0, "checking the case": 5.0,
+    "reading the image": 2.0, "segmenting the head": 25.0, "reading surface": 2.0,
+    "measuring distances from the surfaces": 7.0, "finding the landmarks": 8.0,
+    "cutting the bones": 3.0, "finding the soft tissue": 1.5, "filling the tissue with tets": 2.0,
+    "classifying nodes": 4.0, "placing and sampling the muscles": 5.0,
+})  # fmt: skip
 # The same of the planning page, for its usual options.
-PLANNING: Mapping[str, float] = MappingProxyType(
-    {
-        "computing the plan operator": 8.0,
-        "solving the case's plan": 3.0,
-        "solving nearby plans to correct the operator": 100.0,
-        "solving a nearby plan exactly": 8.0,
-        "making the page": 4.0,
-    }
-)
-# Of a solution by one model, and of writing one result.
-SOLVING, WRITING = 5.0, 3.0
+PLANNING: Mapping[str, float] = MappingProxyType({
+    "computing the plan operator": 8.0, "solving the case's plan": 3.0,
+    "solving nearby plans to correct the operator": 100.0, "solving a nearby plan exactly": 8.0,
+    "making the page": 4.0,
+})  # fmt: skip
+# Of a solution by one model, of comparing faces, and of writing one result.
+AFTER = 4.0
 # How long the typical seconds weigh against those that this machine takes, s.
 PRIOR = 5.0
 # After so many steps of a stage, their time weighs as much as the typical one: some come at once.
@@ -62,31 +44,20 @@ def no_progress(stage: str) -> None:
     del stage
 
 
-def solving_stages(models: Iterable[str]) -> dict[str, float]:
-    """The stages of a case that is built and solved by some models, with their typical seconds."""
-    return {**BUILDING, **{f"solving {model}": SOLVING for model in models}}
-
-
-def comparing_stages(models: Iterable[str]) -> dict[str, float]:
-    """Those of a comparison with the face after the operation, with all that is written of it."""
-    models = tuple(models)
-    written = ("comparing the faces", *(f"writing {model}" for model in models))
-    written = (*written, "writing the comparison", "writing the report")
-    return {**solving_stages(models), **dict.fromkeys(written, WRITING)}
+def expected_stages(*after: str) -> dict[str, float]:
+    """The stages of a build and those after it, with their typical seconds."""
+    return {**BUILDING, **dict.fromkeys(after, AFTER)}
 
 
 class TimeLeft:
     """The time that a work of known stages still takes, estimated as its stages begin.
 
-    Parameters
-    ----------
-    expected : mapping of str to float, s
-        The stages in order with their typical time; those that do not occur count as skipped when a
-        later one begins.
+    `expected` are the stages in order with their typical seconds; those that do not occur count as
+    skipped when a later one begins.
     """
 
     def __init__(self, expected: Mapping[str, float]) -> None:
-        self._left = dict(expected)
+        self._expected, self._left = expected, dict(expected)
         self._stage, self._typical, self._passed = "", 0.0, 0.0
         self._begun = self._since = time.perf_counter()
         self._done, self._whole = 0, 0.0
@@ -107,25 +78,23 @@ class TimeLeft:
             self._done = int(count[1]) - 1
             self._whole = (now - self._since) * int(count[2]) / self._done
 
-    def seconds(self) -> float:
-        """The seconds that are left."""
+    def estimate(self) -> tuple[float, float]:
+        """The share of the time that has passed, from 0 to below 1, and the seconds left."""
         now = time.perf_counter()
         pace = (self._since - self._begun + PRIOR) / (self._passed + PRIOR)
         known = self._done / (self._done + FEW_STEPS)
         whole = known * self._whole + (1.0 - known) * pace * self._typical
         took = now - self._since
-        return max(whole - took, LEAST_LEFT * took) + pace * sum(self._left.values())
-
-    def share(self) -> float:
-        """How much of the work is done, from 0 to below 1: its time so far, of all its time."""
-        took = time.perf_counter() - self._begun
-        return took / max(took + self.seconds(), 1e-9)
+        left = max(whole - took, LEAST_LEFT * took) + pace * sum(self._left.values())
+        return (now - self._begun) / max(now - self._begun + left, 1e-9), left
 
     def text(self) -> str:
-        """Both in words: "43 %, 20 s left"."""
-        seconds = self.seconds()
+        """Both in words, "43 %, 20 s left: "; empty if no stage was expected."""
+        if not self._expected:
+            return ""
+        share, seconds = self.estimate()
         left = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
-        return f"{100.0 * self.share():.0f} %, about {left} left"
+        return f"{100.0 * share:.0f} %, about {left} left: "
 
 
 def _stage_of(name: str) -> str:
@@ -136,13 +105,7 @@ def _stage_of(name: str) -> str:
 
 @contextlib.contextmanager
 def shown_progress(progress: ProgressOrBar, expected: Mapping[str, float]) -> Iterator[Progress]:
-    """What is called with each stage: the function given, for True a bar of tqdm, or nothing.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) True, and tqdm is not installed.
-    """
+    """What is called with each stage: the function given, for True a bar of tqdm, or nothing."""
     if progress is not True:
         yield progress or no_progress
         return
@@ -153,8 +116,8 @@ def shown_progress(progress: ProgressOrBar, expected: Mapping[str, float]) -> It
 
         def show(stage: str) -> None:
             left.begin(stage)
-            bar.n = left.share()
-            bar.set_postfix_str(f"about {left.seconds():.0f} s left: {stage}")
+            bar.n = left.estimate()[0]
+            bar.set_postfix_str(left.text().partition(", ")[2] + stage)
 
         yield show
         bar.n = 1.0

@@ -126,17 +126,15 @@ def test_a_pipe_gets_a_line_per_stage_and_none_per_step_or_log_line(caplog):
             progress.stage(f"solving nearby plans ({step + 1} of 96)")
             logger.info("solved")
             logger.warning("a warning is shown")
-        progress.line("P1: done")
-    assert stream.getvalue() == "cmfsim: meshing\ncmfsim: solving nearby plans\nP1: done\n"
+    assert stream.getvalue() == "cmfsim: meshing\ncmfsim: solving nearby plans\n"
     assert {record.getMessage() for record in caplog.records} == {"a warning is shown"}
 
 
 def test_the_line_of_a_terminal_begins_with_share_and_time_left():
-    """Of the stages that are expected; what ended is on a terminal no line of its own."""
+    """Of the stages that are expected."""
     stream = Terminal()
     with StageProgress(stream, expected={"cutting the bones": 3.0, "solving M": 5.0}) as progress:
         progress.stage("cutting the bones")
-        progress.line("P1: done")
     assert "\n" not in stream.getvalue()
     assert re.match(r"\r\x1b\[Kcmfsim: 0 %, about 8 s left: cutting the bo", stream.getvalue())
 

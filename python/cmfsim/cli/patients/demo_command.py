@@ -13,11 +13,11 @@ from cmfsim.cli.text.notices import Notices
 from cmfsim.cli.text.terminal import StageProgress, escaped
 from cmfsim.lab.virtual.demo import DemoCase, write_demo_case
 from cmfsim.pipeline.evaluating import evaluate
-from cmfsim.pipeline.outputs import WrittenResults, write_results
+from cmfsim.pipeline.outputs import REPORT_STAGE, WrittenResults, write_results
 from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.values.prediction import Prediction
-from cmfsim.values.progress import comparing_stages
+from cmfsim.values.progress import expected_stages
 
 DEMO_FOLDER = Path("cmfsim-demo")
 # Without muscles or sliding, with muscles, with both.
@@ -29,7 +29,8 @@ def demo(options: argparse.Namespace) -> int:
     models: tuple[str, ...] = options.models
     begun = time.perf_counter()
     notices = Notices(quiet=options.quiet)
-    expected = {"making a head": 2.0, **comparing_stages(models)}
+    each = (f"{work} {model}" for work in ("solving", "writing") for model in models)
+    expected = expected_stages(*each, "writing the comparison", REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         progress.stage("making a head")
         made = write_demo_case(options.folder, edge_length=options.edge_length)

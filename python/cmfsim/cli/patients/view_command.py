@@ -13,15 +13,8 @@ from cmfsim.cli.exit_codes import DONE
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
 from cmfsim.io.results.predictions import predictions_of
-from cmfsim.pictures import (
-    KIND_COLOURS,
-    OVER_BONES,
-    SKIN_COLOUR,
-    ViewPart,
-    prediction_parts,
-    segment_colours,
-    view_parts,
-)
+from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
+from cmfsim.pictures.window import OVER_BONES, prediction_parts
 from cmfsim.values.surface_data import SurfaceData
 
 SURFACES = (".stl", ".ply", ".obj", ".vtp")

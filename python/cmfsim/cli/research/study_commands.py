@@ -36,11 +36,10 @@ from cmfsim.study.trials import sensitivity as landmark_sensitivity
 from cmfsim.study.variants import run_variants, write_variants_report
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.progress import BUILDING, SOLVING, WRITING, comparing_stages
+from cmfsim.values.progress import expected_stages
 
-COMPARING = "predicting and comparing the cases"
-# Typical time of one, s, until the first ends.
-ONE_CASE = 60.0
+# What a study counts, and the typical time of one, s, until the first ends.
+COMPARING, ONE_CASE = "predicting and comparing the cases", 60.0
 
 
 def models_of(given: Sequence[str] | None, default: Sequence[str]) -> tuple[str, ...]:
@@ -62,10 +61,8 @@ def predict(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
     failed: dict[str, CmfsimError] = {}
-    expected = dict(BUILDING)
-    for model in models:
-        expected |= {f"solving {model}": SOLVING, f"writing {model}": WRITING}
-    expected[REPORT_STAGE] = WRITING
+    each = (f"{work} {model}" for model in models for work in ("solving", "writing"))
+    expected = expected_stages(*each, REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         predicted = partial(
             predict_models,
@@ -135,7 +132,8 @@ def evaluate(options: argparse.Namespace) -> int:
     prepare(case, report=not options.no_report, evaluation=True)
     notices = Notices(quiet=options.quiet)
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
-    expected = comparing_stages(models)
+    each = (f"{work} {model}" for work in ("solving", "writing") for model in models)
+    expected = expected_stages(*each, "writing the comparison", REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         found = evaluate_case(
             case,
@@ -290,7 +288,8 @@ def _counted(cases: int, *, quiet: bool) -> Iterator[Callable[[str, CaseOutcome]
                 cases -= 1
             else:
                 done += 1
-            progress.line(f"{name}: {outcome.status}, {outcome.seconds:.0f} s")
+            if not (quiet or sys.stderr.isatty()):
+                print(f"{name}: {outcome.status}, {outcome.seconds:.0f} s", file=sys.stderr)
             progress.stage(f"{COMPARING} ({min(done + 1, cases)} of {cases})")
 
         progress.stage(f"{COMPARING} (1 of {cases})")
@@ -308,7 +307,6 @@ def _print_reasons(failed: Iterable[tuple[str, CaseOutcome]]) -> None:
 def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
     """Runs a cohort as given and under each variant; failed if a case of one failed."""
     variants = Variants.load(options.variants, cohort.models)
-
     where = StudyOptions(options.workers, options.scheduler, options.fresh)
     # Cases in which a variant changes nothing are not repeated, so there may be fewer.
     cases = len(cohort.cases) * len(variants.variants)

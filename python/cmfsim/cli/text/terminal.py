@@ -59,7 +59,7 @@ class StageProgress:
         self._quiet = quiet
         self._live = not quiet and stream.isatty()
         self._stage = ""
-        self._left = TimeLeft(expected) if expected else None
+        self._left = TimeLeft(expected or {})
         self._logger = logging.getLogger("cmfsim")
         self._level = self._logger.level
         self._begun = time.perf_counter()
@@ -91,17 +91,11 @@ class StageProgress:
         with self._lock:
             is_new = plain != COUNT.sub("", self._stage)
             self._stage, self._begun = name, time.perf_counter()
-            if self._left is not None:
-                self._left.begin(name)
+            self._left.begin(name)
         if self._live:
             self._show()
         elif is_new and not self._quiet:
             self._write(f"cmfsim: {escaped(plain)}\n")
-
-    def line(self, text: str) -> None:
-        """Prints what has ended: in a pipe, since on a terminal the line of the stage counts it."""
-        if not (self._live or self._quiet):
-            self._write(f"{escaped(text)}\n")
 
     def _tick(self) -> None:
         while not self._stopped.wait(TICK):
@@ -110,7 +104,7 @@ class StageProgress:
     def _show(self) -> None:
         with self._lock:
             name, seconds = self._stage, time.perf_counter() - self._begun
-            left = "" if self._left is None else f"{self._left.text()}: "
+            left = self._left.text()
         if name:
             text = f"cmfsim: {left}{escaped(name)} {seconds:.1f} s"
             # A line that wraps could not be erased.

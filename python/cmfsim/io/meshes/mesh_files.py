@@ -17,7 +17,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import check_readable, named, utf8_path
 from cmfsim.io.meshes.msh import read_msh
 from cmfsim.io.meshes.obj import read_obj
-from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, in_space
+from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
 from cmfsim.io.meshes.ply import read_ply
 from cmfsim.io.meshes.stated_frames import stated_frame
 from cmfsim.io.meshes.stl import read_stl
@@ -129,8 +129,11 @@ def _by_meshio(path: Path) -> PlainMesh:
     blocks = tuple(
         Cells(name, _as_indices(arrays[f"cells.{i}"])) for i, name in enumerate(values["types"])
     )
+    points = np.asarray(arrays["points"], dtype=np.float64)
+    if points.ndim == 2 and points.shape[1] == 2:
+        points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
     return PlainMesh(
-        in_space(arrays["points"]),
+        points,
         blocks,
         {values["point_data"][i]: arrays[f"point_data.{i}"] for i in range(n_points)},
         {

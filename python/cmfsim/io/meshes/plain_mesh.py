@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats
@@ -115,14 +115,6 @@ class PlainMesh:
         return ", ".join(sorted({block.type for block in self.cells if len(block.data)})) or (
             "nothing"
         )
-
-
-def in_space(points: ArrayLike) -> Floats:
-    """Points (n, 3); those of a plane lie at z = 0."""
-    places = np.asarray(points, dtype=np.float64)
-    if places.ndim == 2 and places.shape[1] == 2:
-        places = np.concatenate([places, np.zeros((len(places), 1))], axis=1)
-    return places
 
 
 def _check_block(block: Cells, count: int) -> None:

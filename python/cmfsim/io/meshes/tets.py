@@ -1,38 +1,30 @@
 """Tets of any program: oriented, and without those that enclose no volume."""
 
-from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, Indices, as_index_rows, as_rows
-from cmfsim.values.frozen import Frozen
 from cmfsim.values.renumbering import used_nodes
 
 # The limits of `TetMesh`: volume over longest edge cubed, and the longest edge, mm.
 DEGENERATE_VOLUME, SHORTEST_EDGE = 1e-12, 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class RepairedTets(Frozen):
+class RepairedTets(NamedTuple):
     """A mesh whose tets are oriented and enclose a volume.
 
     Attributes
     ----------
     nodes : (n, 3) float64, mm
-        Those that a tet still uses.
     tets : (m, 4) uint32
-        Positively oriented.
-    kept_nodes : (n,) int64
-        The number that each node had: `values[kept_nodes]` are those of the nodes.
-    kept_tets : (m,) int64
-        The same of each tet.
-    n_turned : int
-        Tets that were negatively oriented; two of their nodes changed places.
-    n_dropped : int
-        Tets without volume, which are gone.
+    kept_nodes, kept_tets : (n,) and (m,) int64
+        The number that each had: `values[kept_nodes]` are the values of these nodes.
+    n_turned, n_dropped : int
+        Tets that were negative, and tets without volume, which are gone.
     """
 
     nodes: Floats
@@ -47,22 +39,16 @@ def repair_tets(nodes: ArrayLike, tets: ArrayLike) -> RepairedTets:
     """Tets as `TetMesh` takes them, from those of another program, with the number of changes.
 
     Negative tets are turned. Tets without volume are dropped, then the nodes that no tet uses.
-    Dropped tets leave no hole as long as they are flat.
 
     Parameters
     ----------
     nodes : (n, 3) float64, mm
     tets : (m, 4) uint32
 
-    Returns
-    -------
-    RepairedTets
-
     Raises
     ------
     CaseError
-        (also `ValueError`) An index that is not there, a node that is not finite, no tet with a
-        volume.
+        (also `ValueError`) An index that is not there, a node that is not finite, no volume.
 
     Examples
     --------
@@ -71,8 +57,6 @@ def repair_tets(nodes: ArrayLike, tets: ArrayLike) -> RepairedTets:
     >>> found = cmfsim.repair_tets(corners, [[0, 2, 1, 3], [0, 1, 2, 4]])
     >>> found.n_turned, found.n_dropped, len(found.nodes)
     (1, 1, 4)
-    >>> float(cmfsim.TetMesh(found.nodes, found.tets).volumes[0])
-    0.16666666666666666
     """
     places = as_rows("nodes", nodes, 3)
     turned, volumes = oriented(places, as_index_rows("tets", tets, 4, len(places), "nodes"))

@@ -257,9 +257,5 @@ class BenchmarkTable:
                     f"{', '.join(result.missing)}{reason}: its figures are from fewer patients "
                     "than those of the other methods and cannot be compared with them."
                 )
-                alike: dict[str, list[str]] = {}
-                for name, why in result.failed.items():
-                    alike.setdefault(why, []).append(name)
-                reasons = [f"- {', '.join(of)}: {why}" for why, of in alike.items()]
-                found += ["\n".join(reasons)] if reasons else []
+                found += [f"- {name}: {why}" for name, why in result.failed.items()]
         return found

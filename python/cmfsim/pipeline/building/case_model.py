@@ -42,7 +42,7 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.progress import BUILDING, ProgressOrBar, shown_progress
+from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
 
 _log = logging.getLogger(__name__)
 WRITING = "writing the model"
@@ -62,8 +62,7 @@ def build_case(
     ----------
     case : Case, or path of its file or folder
     progress : callable or bool, optional
-        Called with the name of each stage as it begins; True shows a bar of tqdm with the share
-        that is done and the time left.
+        Called with the name of each stage as it begins; True shows a bar (tqdm).
     check : bool
         Whether the doctor checks the case first; an error that it finds ends the work.
     findings : iterable of Finding
@@ -91,7 +90,7 @@ def build_case(
     """
     case = as_case(case)
     check_output(case)
-    with shown_progress(progress, {**BUILDING, WRITING: 4.0}) as shown:
+    with shown_progress(progress, expected_stages(WRITING)) as shown:
         model = build_model(
             case, progress=shown, check=check, findings=findings, on_findings=on_findings
         )
@@ -144,7 +143,7 @@ def build_model(
     >>> import cmfsim
     >>> model = cmfsim.build_model(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     """
-    with shown_progress(progress, BUILDING) as shown:
+    with shown_progress(progress, expected_stages()) as shown:
         options = BuildOptions(
             progress=shown,
             check=check,

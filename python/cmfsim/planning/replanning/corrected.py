@@ -54,8 +54,7 @@ def corrected_planning(
         The range of the plans: along each axis, and about any axis.
     seed : int
     progress : callable or bool, optional
-        Called with the name of each stage as it begins; True shows a bar of tqdm with the share
-        that is done and the time left.
+        Called with the name of each stage as it begins; True shows a bar (tqdm).
 
     Returns
     -------

@@ -182,8 +182,7 @@ def expected_error(
     turn : float, degrees
     seed : int
     progress : callable or bool, optional
-        Called with the name of each stage as it begins; True shows a bar of tqdm with the share
-        that is done and the time left.
+        Called with the name of each stage as it begins; True shows a bar (tqdm).
 
     Returns
     -------
