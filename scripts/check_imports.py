@@ -65,12 +65,7 @@ MOST_PYTHON_PAIRS = 125
 # Files and folders in one folder of the package, and the folders that may hold more: plain values,
 # one subject a file, and the modules of one page's script.
 MOST_ENTRIES = 12
-LARGE_FOLDERS: Mapping[str, int] = {
-    "": 26,
-    "values": 35,
-    "planning/page/scripts": 33,
-    "pipeline": 14,
-}
+LARGE_FOLDERS: Mapping[str, int] = {"": 26, "values": 35, "planning/page/scripts": 33}
 # Outside packages that a module may import at its top: `import cmfsim` needs numpy alone.
 PYTHON_PACKAGES = frozenset({"numpy"})
 # A file is called after its subject.

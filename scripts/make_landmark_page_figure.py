@@ -14,7 +14,7 @@ from pathlib import Path
 from playwright.sync_api import sync_playwright
 
 import cmfsim
-from cmfsim.pipeline.landmark_page import head_content, write_landmark_page
+from cmfsim.pipeline.outputs.landmark_page import head_content, write_landmark_page
 from cmfsim.pipeline.proposing import ProposedHead
 from make_planning_figures import DRAWN, save
 

@@ -172,12 +172,12 @@ from cmfsim.phantom import make_head as make_head
 from cmfsim.pipeline.banding import band_regions as band_regions
 from cmfsim.pipeline.banding import band_settings as band_settings
 from cmfsim.pipeline.banding import predict_with_band as predict_with_band
-from cmfsim.pipeline.building.case_model import build_case as build_case
 from cmfsim.pipeline.building.case_model import build_model as build_model
 from cmfsim.pipeline.building.tissue.muscles import with_muscles as with_muscles
 from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
 from cmfsim.pipeline.evaluating import evaluate as evaluate
-from cmfsim.pipeline.planning_page import write_planning_page as write_planning_page
+from cmfsim.pipeline.outputs.model import build_case as build_case
+from cmfsim.pipeline.outputs.planning_page import write_planning_page as write_planning_page
 from cmfsim.pipeline.predicting import predict as predict
 from cmfsim.pipeline.predicting import predict_models as predict_models
 from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks

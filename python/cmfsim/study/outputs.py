@@ -10,7 +10,7 @@ from cmfsim.evaluation import NO_CHANGE, DistanceStatistics, ErrorTable
 from cmfsim.io import replacing_files
 from cmfsim.io.results.metrics import SkinErrors, read_skin_errors
 from cmfsim.pictures import chart_errors, picture_distance_grid
-from cmfsim.pipeline.outputs import optional_pictures, write_report_page
+from cmfsim.pipeline.outputs.results import optional_pictures, write_report_page
 from cmfsim.report import Figure, study_document
 from cmfsim.report.study import table3_text
 from cmfsim.study.cohort import StudyReport

@@ -10,7 +10,7 @@ from cmfsim.doctor import examine, findings_text
 from cmfsim.errors import CmfsimError, error_text
 from cmfsim.io import Case, CaseChanges
 from cmfsim.pipeline.evaluating import evaluate
-from cmfsim.pipeline.outputs import write_results
+from cmfsim.pipeline.outputs.results import write_results
 from cmfsim.pipeline.predicting import case_for_models
 from cmfsim.pipeline.preparation import prepare
 

@@ -213,7 +213,7 @@ class Prediction(Frozen):
         OSError
             The folder cannot be created or written to.
         """
-        write = _above("pipeline.outputs").write_results
+        write = _above("pipeline.outputs.results").write_results
         written = write(Path(folder), [self], [self.model], stage=no_progress)
         return [*written.predictions[0].files, *filter(None, [written.report])]
 

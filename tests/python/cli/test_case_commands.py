@@ -44,9 +44,7 @@ def built(monkeypatch):
         return types.SimpleNamespace(summary=summary)
 
     monkeypatch.setitem(
-        sys.modules,
-        "cmfsim.pipeline.building.case_model",
-        types.SimpleNamespace(build_case=build_case),
+        sys.modules, "cmfsim.pipeline.outputs.model", types.SimpleNamespace(build_case=build_case)
     )
     return cases
 

@@ -10,7 +10,7 @@ from cmfsim.cli import main
 from cmfsim.io.results.predictions import read_prediction
 from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.pipeline import predicting
-from cmfsim.pipeline.outputs import write_results
+from cmfsim.pipeline.outputs.results import write_results
 from cmfsim.surfaces.depth import tissue_depth
 from shared_values import COARSE_EDGE, coarse_demo_patient
 

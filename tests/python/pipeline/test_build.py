@@ -20,6 +20,7 @@ from cmfsim.cli import main
 from cmfsim.io.results import models
 from cmfsim.pipeline.building import assembly, case_model
 from cmfsim.pipeline.building.tissue import tissue_mesh
+from cmfsim.pipeline.outputs import model as model_output
 from head_case import HeadCase
 from shared_values import drawn_levels
 
@@ -46,9 +47,9 @@ def built(path):
         models_built.append(build(case, **options))
         return models_built[-1]
 
-    build = case_model.build_model
+    build = model_output.build_model
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(case_model, "build_model", build_model)
+        patch.setattr(model_output, "build_model", build_model)
         code, out, err = run("build", path)
     assert code == 0, err
     folder = path.parent / "out"
@@ -353,7 +354,7 @@ def small_model(tmp_path_factory):
 @pytest.fixture
 def ready(monkeypatch, small_model):
     """Leaves out all work before the writing."""
-    monkeypatch.setattr(case_model, "build_model", lambda *_, **__: small_model)
+    monkeypatch.setattr(model_output, "build_model", lambda *_, **__: small_model)
 
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -381,8 +382,8 @@ def test_a_stage_that_fails_leaves_the_old_results(
         # The stages before it have been seen to work.
         monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
     if stage == "write_model":
-        monkeypatch.setattr(case_model, "build_model", lambda *_, **__: small_model)
-    owner = assembly if stage == "segment_data" else case_model
+        monkeypatch.setattr(model_output, "build_model", lambda *_, **__: small_model)
+    owner = {"segment_data": assembly, "write_model": model_output}.get(stage, case_model)
     monkeypatch.setattr(owner, stage, fail)
     found, out, err = run("build", ellipsoids, "-q", "--no-doctor")
     assert (found, out) == (code, "")
@@ -405,13 +406,13 @@ def test_writing_that_fails_half_way_leaves_the_old_results(
             raise error
         return real(*arguments, **options)
 
-    owner, name = {"draw": (case_model, "picture_anatomy"), "move": (Path, "replace")}.get(
+    owner, name = {"draw": (model_output, "picture_anatomy"), "move": (Path, "replace")}.get(
         call, (models, call)
     )
     real = getattr(owner, name)
     with monkeypatch.context() as patch:
         if call != "draw":
-            patch.setattr(case_model, "_draw", lambda *_: [])
+            patch.setattr(model_output, "_draw", lambda *_: [])
         if call == "move":
             folder = ellipsoids.parent / "out"
 
@@ -480,7 +481,7 @@ def test_an_output_that_cannot_be_is_found_before_the_work(ellipsoids, monkeypat
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(case_model, "build_model", work)
+    monkeypatch.setattr(model_output, "build_model", work)
     taken = ellipsoids.parent / "taken"
     taken.write_text("", encoding="utf-8")
     words = ("build", ellipsoids, "-q", "--no-doctor", "-o")
@@ -529,7 +530,7 @@ def test_the_doctor_is_asked_once_or_not_at_all(ellipsoids, monkeypatch, small_m
     monkeypatch.setattr(case_model, "diagnose", diagnose)
     monkeypatch.setattr("cmfsim.cli.patients.case_commands.examine", examine)
     monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
-    monkeypatch.setattr(case_model, "_draw", lambda *_: [])
+    monkeypatch.setattr(model_output, "_draw", lambda *_: [])
     for words, times in (((), 1), (("--no-doctor",), 0)):
         asked.clear()
         code, out, err = run("build", ellipsoids, "--json", *words)
@@ -542,7 +543,7 @@ def test_the_doctor_is_asked_once_or_not_at_all(ellipsoids, monkeypatch, small_m
 
 def test_json_is_one_object_and_quiet_is_quiet(ready, ellipsoids, monkeypatch):
     del ready
-    monkeypatch.setattr(case_model, "_draw", lambda *_: [])
+    monkeypatch.setattr(model_output, "_draw", lambda *_: [])
     code, out, err = run("build", ellipsoids, "--json", "-q", "--no-doctor")
     assert code == 0
     assert err == ""
@@ -557,7 +558,7 @@ def test_without_opengl_there_is_a_model_and_a_warning(ready, ellipsoids, before
     def cannot(*_, **__):
         raise cmfsim.CaseError("anatomy.png: the picture cannot be drawn (no OpenGL)")
 
-    monkeypatch.setattr(case_model, "picture_anatomy", cannot)
+    monkeypatch.setattr(model_output, "picture_anatomy", cannot)
     code, _, err = run("build", ellipsoids, "-q", "--no-doctor")
     assert code == 0
     assert "no pictures: anatomy.png: the picture cannot be drawn" in err

@@ -11,7 +11,7 @@ import cmfsim
 import ct_variants as variants
 import phantom_reference
 from cmfsim.cli import main
-from cmfsim.pipeline.building import case_model
+from cmfsim.pipeline.outputs import model as model_output
 from real_heads import data_folder
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
@@ -120,15 +120,15 @@ def built(folder):
     """
     out, err = io.StringIO(), io.StringIO()
     models = []
-    build = case_model.build_model
+    build = model_output.build_model
 
     def build_model(case, **options):
         models.append(build(case, **options))
         return models[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(case_model, "build_model", build_model)
-        patch.setattr(case_model, "_draw", lambda *_: [])
+        patch.setattr(model_output, "build_model", build_model)
+        patch.setattr(model_output, "_draw", lambda *_: [])
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = main(["build", str(folder / "case.toml"), "--json", "-q"])
     assert code == 0, err.getvalue()

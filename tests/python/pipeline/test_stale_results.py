@@ -20,7 +20,7 @@ from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.results.metrics import read_evaluation
 from cmfsim.io.results.predictions import predictions_of, read_prediction
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
-from cmfsim.pipeline.outputs import write_case_report, write_results
+from cmfsim.pipeline.outputs.results import write_case_report, write_results
 from head_case import HeadCase
 
 pytest.importorskip("meshio")
@@ -65,9 +65,11 @@ def replanned(prediction):
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     """They take most of the time."""
-    monkeypatch.setattr("cmfsim.pipeline.outputs._pictures_of", lambda _: iter(()))
+    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda _: iter(()))
     for name in ("picture_distances", "chart_errors"):
-        monkeypatch.setattr(f"cmfsim.pipeline.outputs.{name}", lambda path, *_, **__: draw(path))
+        monkeypatch.setattr(
+            f"cmfsim.pipeline.outputs.results.{name}", lambda path, *_, **__: draw(path)
+        )
 
 
 def draw(path):

@@ -22,10 +22,11 @@ HIDDEN = "of the reader alone"
 def originals(prediction, evaluation, tmp_path_factory):  # noqa: F811
     """A folder of results with two models and a comparison, and its two summaries."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cmfsim.pipeline.outputs._pictures_of", lambda _: iter(()))
+        patch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda _: iter(()))
         for name in ("picture_distances", "chart_errors"):
             patch.setattr(
-                f"cmfsim.pipeline.outputs.{name}", lambda path, *_, **__: path.write_bytes(PNG)
+                f"cmfsim.pipeline.outputs.results.{name}",
+                lambda path, *_, **__: path.write_bytes(PNG),
             )
         folder = tmp_path_factory.mktemp("results")
         noticed = dataclasses.asdict(

@@ -68,7 +68,7 @@ def build(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     seconds = time.perf_counter() - begun
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        build_case = import_module("cmfsim.pipeline.building.case_model").build_case
+        build_case = import_module("cmfsim.pipeline.outputs.model").build_case
         built = build_case(
             case, progress=progress.stage, check=False, findings=findings, on_findings=notices.add
         )

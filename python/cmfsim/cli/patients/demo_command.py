@@ -13,7 +13,7 @@ from cmfsim.cli.text.notices import Notices
 from cmfsim.cli.text.terminal import StageProgress, escaped
 from cmfsim.lab.virtual.demo import DemoCase, write_demo_case
 from cmfsim.pipeline.evaluating import evaluate
-from cmfsim.pipeline.outputs import REPORT_STAGE, WrittenResults, write_results
+from cmfsim.pipeline.outputs.results import REPORT_STAGE, WrittenResults, write_results
 from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.values.prediction import Prediction

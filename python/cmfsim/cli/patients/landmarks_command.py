@@ -21,7 +21,7 @@ from cmfsim.io.landmark_files import write_landmarks
 from cmfsim.pictures import picture_landmarks
 from cmfsim.pipeline.building.inputs import read_anatomy, read_case_landmarks, read_placed_sites
 from cmfsim.pipeline.filling import filled_landmarks
-from cmfsim.pipeline.landmark_page import PAGE_FILE, head_content, write_landmark_page
+from cmfsim.pipeline.outputs.landmark_page import PAGE_FILE, head_content, write_landmark_page
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.pipeline.proposing import BY_SHAPE, ProposedHead, proposed_head, unproposed_head
 from cmfsim.planning.landmark_page import LandmarkContent

@@ -22,7 +22,7 @@ from cmfsim.cli.text.terminal import StageProgress, escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_plan
 from cmfsim.pipeline.building.stages import BuildOptions
-from cmfsim.pipeline.planning_page import PAGE_FILE, write_planning_page
+from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, write_planning_page
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.pipeline.preparation import prepare
 from cmfsim.planning.face_planning import FacePlan, FaceSearch, plan_for_face

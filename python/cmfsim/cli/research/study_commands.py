@@ -21,7 +21,7 @@ from cmfsim.cli.text.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
-from cmfsim.pipeline.outputs import (
+from cmfsim.pipeline.outputs.results import (
     REPORT_STAGE,
     WrittenPrediction,
     WrittenResults,

@@ -51,7 +51,7 @@ from cmfsim.pictures import (
 from cmfsim.pictures.painting import Painter
 from cmfsim.pipeline.building.stages import OnMuscles
 from cmfsim.pipeline.evaluating import CaseEvaluation
-from cmfsim.pipeline.planning_page import PAGE_FILE, page_state
+from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, page_state
 from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.musculature import Musculature

@@ -1,0 +1,1 @@
+"""Files that commands on cases write: models, predictions, reports and pages."""
