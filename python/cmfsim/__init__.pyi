@@ -173,6 +173,7 @@ from cmfsim.pipeline.banding import band_regions as band_regions
 from cmfsim.pipeline.banding import band_settings as band_settings
 from cmfsim.pipeline.banding import predict_with_band as predict_with_band
 from cmfsim.pipeline.building.case_model import build_model as build_model
+from cmfsim.pipeline.building.stages import BuildOptions as BuildOptions
 from cmfsim.pipeline.building.tissue.muscles import with_muscles as with_muscles
 from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
 from cmfsim.pipeline.evaluating import evaluate as evaluate
@@ -261,6 +262,7 @@ from cmfsim.values.motion import rigid_motion as rigid_motion
 from cmfsim.values.musculature import MuscleSurface as MuscleSurface
 from cmfsim.values.musculature import Musculature as Musculature
 from cmfsim.values.node_kinds import NodeKinds as NodeKinds
+from cmfsim.values.observer import Observer as Observer
 from cmfsim.values.patient_model import PatientModel as PatientModel
 from cmfsim.values.prediction import MODELS as MODELS
 from cmfsim.values.prediction import Prediction as Prediction

@@ -2,14 +2,14 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cmfsim.errors import CaseInputError, CmfsimError, RegistrationError
+from cmfsim.errors import CaseInputError, RegistrationError
 from cmfsim.evaluation import (
     NO_CHANGE,
     WHOLE,
@@ -24,18 +24,20 @@ from cmfsim.evaluation import (
 )
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.building.inputs import case_key
-from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.building.stages import BuildKeywords, build_options
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative, read_postoperative
 from cmfsim.pipeline.face_after import check_face_after, refuse_other_face
 from cmfsim.pipeline.face_regions import face_landmarks
 from cmfsim.pipeline.predicting import named_models, predictions_of
 from cmfsim.surfaces.depth import tissue_depth
-from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
-from cmfsim.values.finding import Finding, OnFindings, grouped
+from cmfsim.values.finding import Finding, grouped
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
+from cmfsim.values.progress import expected_stages
 from cmfsim.values.surface_data import SurfaceData
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 WILCOXON_NOTE = (
     "Wilcoxon's signed-rank test vertex by vertex, as the paper has it: neighbouring vertices "
@@ -153,12 +155,8 @@ def evaluate(
     case: CaseOrPath,
     models: str | Sequence[str] = MODELS,
     *,
-    progress: ProgressOrBar = None,
-    check: bool = True,
-    findings: Iterable[Finding] = (),
-    anatomy: Anatomy | None = None,
-    on_findings: OnFindings | None = None,
     fit_thickness: bool = False,
+    **options: "Unpack[BuildKeywords]",
 ) -> CaseEvaluation:
     """The predictions of several models for a case, compared with the post-operative face.
 
@@ -170,15 +168,11 @@ def evaluate(
     case : Case, or path of its file or folder
         With [postoperative].
     models : str or sequence of str
-    progress : callable or bool, optional
-    check : bool
-    findings : iterable of Finding
-    anatomy : Anatomy, optional
-    on_findings : callable, optional
-        As for `predict_models`.
     fit_thickness : bool
         Whether one change of the soft tissue's thickness is fitted where nothing was operated on,
         and every prediction is compared with it applied as well.
+    **options
+        As for `predict`.
 
     Returns
     -------
@@ -199,30 +193,24 @@ def evaluate(
     1.21
     """
     case, models = as_case(case), named_models(models)
-    expected = expected_stages(*(f"solving {m}" for m in models), "comparing the faces")
-    with shown_progress(progress, expected) as shown:
-        shown("reading the face after the operation")
+    failed = options.get("failed")
+    if failed is None:
+        failed = options["failed"] = {}
+    expected = expected_stages(*(f"solving {model}" for model in models), "comparing the faces")
+    with build_options(options, expected) as asked:
+        asked.observer.stage("reading the face after the operation")
         key = evaluation_key(case, models)
         # First, for it fails at once where the case has none.
-        postoperative = read_postoperative(case)
+        postoperative = options.get("after") or read_postoperative(case)
         if postoperative.skin is None:
             raise CaseInputError(
                 f"{case.where('postoperative')}: the case has no face to compare with: add skin or "
                 "image"
             )
-        options = BuildOptions(
-            progress=shown,
-            check=check,
-            findings=findings,
-            anatomy=anatomy,
-            after=postoperative,
-            on_findings=on_findings,
-        )
-        failed: dict[str, CmfsimError] = {}
-        predictions = tuple(predictions_of(case, models, options, failed))
+        predictions = tuple(predictions_of(case, models, replace(asked, after=postoperative)))
         if not predictions:
             raise next(iter(failed.values()))
-        shown("comparing the faces")
+        asked.observer.stage("comparing the faces")
         landmarks = face_landmarks(predictions[0].patient)
         compared = _Compared(
             predictions, postoperative.skin, postoperative.landmarks, landmarks.points
@@ -247,8 +235,8 @@ def evaluate(
         found = CaseEvaluation(
             predictions, postoperative, comparison, key, reasons, unmoved, thickness, fitted, notes
         )
-        if on_findings is not None and found.findings:
-            on_findings(found.findings)
+        if found.findings:
+            asked.observer.found(found.findings)
     return found
 
 

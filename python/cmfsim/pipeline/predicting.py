@@ -1,24 +1,25 @@
 """One case from its files to the predicted face."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from cmfsim.errors import CaseInputError, CmfsimError, ContactError, SolverError
+from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.building.case_model import model_of
 from cmfsim.pipeline.building.inputs import case_key, input_hashes, plan_key
-from cmfsim.pipeline.building.stages import BuildOptions, OnMuscles
-from cmfsim.pipeline.building.surgery.postoperative import Postoperative
+from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, build_options
 from cmfsim.solving.models import predict_patient
-from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.band_options import BandOptions
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.checks import check_one_of
-from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
-from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
+from cmfsim.values.progress import expected_stages
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _log = logging.getLogger(__name__)
 
@@ -27,9 +28,8 @@ def predict(
     case: CaseOrPath,
     *,
     model: str = "M+S",
-    progress: ProgressOrBar = None,
-    check: bool = True,
     band: BandOptions | None = None,
+    **options: "Unpack[BuildKeywords]",
 ) -> Prediction:
     """The face that a model predicts for a case; nothing is written.
 
@@ -41,12 +41,11 @@ def predict(
     model : str
         "H", "M", "H+S" or "M+S" (Kim et al. 2010, section 3.2): homogeneous or with muscles,
         without or with sliding at teeth and mucosa.
-    progress : callable or bool, optional
-        Called with the name of each stage as it begins; True shows a bar (tqdm).
-    check : bool
-        Whether the doctor checks the case first; an error that it finds ends the work.
     band : BandOptions, optional
         Adds a band around the face, as the prediction's `band`.
+    **options
+        Those of `BuildOptions`: `progress`, called with the name of each stage as it begins,
+        or True for a bar; `check`, whether the doctor checks the case first; and others.
 
     Returns
     -------
@@ -65,23 +64,17 @@ def predict(
     (19840, 3)
     """
     # To its end: a bar then ends full.
-    (found,) = predict_models(case, model, progress=progress, check=check, band=band)
-    return found
+    for found in [*predict_models(case, model, band=band, **options)]:
+        return found
+    raise SolverError(f"model {model} could not be solved, as the observer was told")
 
 
-def predict_models(  # noqa: PLR0913 (options by name)
+def predict_models(
     case: CaseOrPath,
     models: str | Sequence[str] = MODELS,
     *,
-    progress: ProgressOrBar = None,
-    check: bool = True,
-    findings: Iterable[Finding] = (),
-    anatomy: Anatomy | None = None,
-    after: Postoperative | None = None,
-    failed: dict[str, CmfsimError] | None = None,
-    on_findings: OnFindings | None = None,
-    on_muscles: OnMuscles | None = None,
     band: BandOptions | None = None,
+    **options: "Unpack[BuildKeywords]",
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, which is built once.
 
@@ -89,24 +82,8 @@ def predict_models(  # noqa: PLR0913 (options by name)
     ----------
     case : Case, or path of its file or folder
     models : str or sequence of str
-    progress : callable or bool, optional
-    check : bool
-        As for `predict`.
-    findings : iterable of Finding
-        What is known of the case already.
-    anatomy : Anatomy, optional
-        The head, where it is known; the image or surfaces of the case are then not read.
-    after : Postoperative, optional
-        The post-operative data, if they were already read.
-    failed : dict, optional
-        If given, a model that cannot be solved (for example, because contact does not converge) is
-        recorded here with its error, and the others continue.
-    on_findings : callable, optional
-        Called with new findings of each stage and each solution.
-    on_muscles : callable, optional
-        Called with the muscles and the segments of bone once both are known, and perhaps again
-        before any model is solved.
     band : BandOptions, optional
+    **options
         As for `predict`.
 
     Yields
@@ -127,38 +104,23 @@ def predict_models(  # noqa: PLR0913 (options by name)
     """
     case, models = as_case(case), named_models(models)
     expected = expected_stages(*(f"solving {model}" for model in models))
-    with shown_progress(progress, expected) as shown:
-        options = BuildOptions(
-            progress=shown,
-            check=check,
-            findings=findings,
-            anatomy=anatomy,
-            after=after,
-            on_findings=on_findings,
-            on_muscles=on_muscles,
-        )
-        yield from predictions_of(case, models, options, failed, band=band)
+    with build_options(options, expected) as asked:
+        yield from predictions_of(case, models, asked, band=band)
 
 
 def predictions_of(
-    case: Case,
-    models: Sequence[str],
-    options: BuildOptions,
-    failed: dict[str, CmfsimError] | None = None,
-    *,
-    band: BandOptions | None = None,
+    case: Case, models: Sequence[str], options: BuildOptions, *, band: BandOptions | None = None
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, as `predict_models` makes them."""
     if band is not None:
         # Before a case is built for a minute.
         band.check(models)
     patient = build_patient(case, models, options)
-    if options.on_muscles is not None and patient.muscles is not None:
-        options.on_muscles(patient.muscles, patient.segments)
+    if patient.muscles is not None:
+        options.observer.muscles(patient.muscles, patient.segments)
     known = set(patient.findings)
     for model in models:
-        if options.progress is not None:
-            options.progress(f"solving {model}")
+        options.observer.stage(f"solving {model}")
         try:
             if band is None:
                 prediction = predict_patient(patient, model)
@@ -168,14 +130,12 @@ def predictions_of(
 
                 prediction = predict_with_band(patient, model, band)
         except (ContactError, SolverError) as error:
-            if failed is None:
-                raise
+            options.observer.failed(model, error)
             _log.warning("model %s: %s", model, error)
-            failed[model] = error
         else:
             new = [finding for finding in prediction.findings if finding not in known]
-            if new and options.on_findings is not None:
-                options.on_findings(new)
+            if new:
+                options.observer.found(new)
             known.update(new)
             yield prediction
 
@@ -221,8 +181,7 @@ def build_patient(
     hashes = input_hashes(case)
     key, about = case_key(case, hashes), plan_key(case)
     patient = model_of(case_for_models(case, models), options)
-    if options.on_findings is not None:
-        options.on_findings(patient.findings)
+    options.observer.found(patient.findings)
     for name, found in patient.summary["inputs"].items():
         if hashes.get(name, found) != found:
             raise CaseInputError(

@@ -1,26 +1,28 @@
 """The dependence of a prediction on the placement of skull landmarks (Kim et al. 2010, 3.3)."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case
-from cmfsim.pipeline.building.stages import BuildOptions
+from cmfsim.pipeline.building.stages import BuildKeywords, build_options
 from cmfsim.pipeline.building.tissue.muscles import with_muscles
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.checks import Floats, as_positive, as_rows
-from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
-from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
+from cmfsim.values.progress import expected_stages
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 # Standard deviation of a landmark's place along each axis that moves the masseter by the 2 mm of
 # the paper's three trials, mm.
@@ -138,17 +140,14 @@ def landmark_trials(
         yield dict(zip(names, points + drawn, strict=True))
 
 
-def sensitivity(  # noqa: PLR0913 (options by name)
+def sensitivity(
     case: CaseOrPath,
     *,
     trials: int | Sequence[Mapping[str, ArrayLike]] = 3,
     std: float = LANDMARK_SD,
     seed: int = 0,
     model: str = "M+S",
-    progress: ProgressOrBar = None,
-    check: bool = True,
-    findings: Iterable[Finding] = (),
-    on_findings: OnFindings | None = None,
+    **options: "Unpack[BuildKeywords]",
 ) -> SensitivityReport:
     """The effect of errors of skull landmarks on muscles and predicted face.
 
@@ -164,11 +163,8 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     seed : int
     model : str
         "M" or "M+S".
-    progress : callable or bool, optional
-    check : bool
-    findings : iterable of Finding
-    on_findings : callable, optional
-        As for `predict_models`.
+    **options
+        As for `predict`.
 
     Returns
     -------
@@ -193,19 +189,16 @@ def sensitivity(  # noqa: PLR0913 (options by name)
     if (trials if isinstance(trials, int) else len(trials)) < 1:
         raise CaseInputError("no trial was given: at least one is needed")
     case = as_case(case)
-    with shown_progress(progress, expected_stages(f"solving {model}", "trial")) as shown:
-        options = BuildOptions(
-            progress=shown, check=check, findings=findings, on_findings=on_findings
-        )
-        patient = build_patient(case, (model,), options)
+    with build_options(options, expected_stages(f"solving {model}", "trial")) as asked:
+        patient = build_patient(case, (model,), asked)
         skull = patient.landmarks.get("skull", {})
         if isinstance(trials, int):
             trials = list(landmark_trials(skull, count=trials, std=std, seed=seed))
-        shown(f"solving {model}")
+        asked.observer.stage(f"solving {model}")
         prediction = predict_patient(patient, model)
         done = []
         for number, landmarks in enumerate(trials):
-            shown(f"trial {number + 1} of {len(trials)}")
+            asked.observer.stage(f"trial {number + 1} of {len(trials)}")
             done.append(_trial(prediction, case.muscles or CaseMuscles(), landmarks, model))
     moved = np.linalg.norm(prediction.skin_displacements, axis=1)
     return SensitivityReport(prediction, tuple(done), moved >= 0.1 * moved.max())

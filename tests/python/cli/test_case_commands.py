@@ -24,7 +24,7 @@ def built(monkeypatch):
     """The cases that a stand-in for the build stage was given."""
     cases = []
 
-    def build_case(case, *, progress, check, findings, on_findings):  # noqa: ARG001
+    def build_case(case, *, progress, check, findings, observer):  # noqa: ARG001
         # The command has asked the doctor itself, and shows all that he finds.
         assert not check
         cases.append(case)

@@ -56,13 +56,13 @@ def test_different_facts_of_one_code_are_each_stated():
 
 def test_warnings_are_printed_once_as_they_come_and_once_at_the_end(capsys):
     notices = Notices(quiet=True)
-    notices.add(MUSCLES)
-    notices.add([*MUSCLES, Finding("x", "a note", severity="note")])
+    notices.found(MUSCLES)
+    notices.found([*MUSCLES, Finding("x", "a note", severity="note")])
     first = capsys.readouterr()
     assert first.out == ""
     assert first.err.count("warning") == 1
     assert "a note" not in first.err
-    notices.add([Finding("y", "evil \x1b[2Jname", severity="warning", fix="rename it")])
+    notices.found([Finding("y", "evil \x1b[2Jname", severity="warning", fix="rename it")])
     notices.summarise("out/report.html")
     err = capsys.readouterr().err
     assert err.count("4 muscles partly outside the tissue") == 1
@@ -74,7 +74,7 @@ def test_warnings_are_printed_once_as_they_come_and_once_at_the_end(capsys):
 def test_nothing_doubtful_prints_nothing(capsys):
     Notices().summarise("out")
     quiet = Notices(quiet=True)
-    quiet.add([Finding("x", "a note", severity="note")])
+    quiet.found([Finding("x", "a note", severity="note")])
     quiet.summarise("out")
     assert capsys.readouterr() == ("", "")
 
@@ -88,8 +88,7 @@ def noticed(tmp_path, monkeypatch):
 
     def model_of(case, options):
         found = build(case, options)
-        if options.on_findings is not None:
-            options.on_findings(MUSCLES)
+        options.observer.found(MUSCLES)
         findings = [*found.summary["findings"], *map(dataclasses.asdict, MUSCLES)]
         summary = {**found.summary, "findings": findings}
         return dataclasses.replace(found, findings=(*found.findings, *MUSCLES), summary=summary)

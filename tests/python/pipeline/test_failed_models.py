@@ -59,3 +59,28 @@ def test_a_model_alone_that_fails_is_an_error(unsettled, capsys):
     assert "contact does not settle" in capsys.readouterr().err
     with pytest.raises(cmfsim.ContactError):
         cmfsim.predict(cmfsim.Case.load(unsettled), model="H+S", check=False)
+
+
+def test_an_observer_learns_of_stages_and_of_models_that_fail(unsettled):
+    class Watch(cmfsim.Observer):
+        def __init__(self):
+            self.stages, self.models = [], []
+
+        def stage(self, name):
+            self.stages.append(name)
+
+        def failed(self, model, error):
+            self.models.append((model, type(error)))
+
+    watch, failed = Watch(), {}
+    asked = {"check": False, "observer": watch}
+    found = cmfsim.predict_models(unsettled, ["H", "H+S"], **asked)
+    assert [prediction.model for prediction in found] == ["H"]
+    assert watch.stages[-1] == "solving H+S"
+    assert watch.models == [("H+S", cmfsim.ContactError)]
+    with pytest.raises(cmfsim.SolverError, match=r"model H\+S could not be solved"):
+        cmfsim.predict(unsettled, model="H+S", **asked)
+    # A callback is called in place of the observer's method.
+    assert not list(cmfsim.predict_models(unsettled, "H+S", failed=failed, **asked))
+    assert list(failed) == ["H+S"]
+    assert len(watch.models) == 2

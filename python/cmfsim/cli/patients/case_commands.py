@@ -70,11 +70,11 @@ def build(options: argparse.Namespace) -> int:
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         build_case = import_module("cmfsim.pipeline.outputs.model").build_case
         built = build_case(
-            case, progress=progress.stage, check=False, findings=findings, on_findings=notices.add
+            case, progress=progress.stage, check=False, findings=findings, observer=notices
         )
     summary = dict(built.summary)
     # Those of muscles are noticed after the last stage.
-    notices.add(Finding.from_values(entry) for entry in summary["findings"])
+    notices.found(Finding.from_values(entry) for entry in summary["findings"])
     if not options.no_doctor:
         summary["timings"] = {"checking the case": seconds, **summary["timings"]}
     if options.json:
@@ -135,7 +135,7 @@ def checked(
             print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
     if _has_errors(found.findings):
         raise FindingsError(found.findings)
-    notices.add(found.findings)
+    notices.found(found.findings)
     return found.findings
 
 

@@ -73,7 +73,7 @@ def _work(
             progress=progress.stage,
             check=False,
             anatomy=made.anatomy,
-            on_findings=notices.add,
+            on_findings=notices.found,
         )
     else:
         found = evaluate(
@@ -82,7 +82,7 @@ def _work(
             progress=progress.stage,
             check=False,
             anatomy=made.anatomy,
-            on_findings=notices.add,
+            on_findings=notices.found,
         )
         predictions = found.predictions
     return write_results(

@@ -118,7 +118,7 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
     expected = {**BUILDING, **PLANNING}
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         asked = BuildOptions(
-            progress=progress.stage, check=False, findings=findings, on_findings=notices.add
+            progress=progress.stage, check=False, findings=findings, observer=notices
         )
         patient = build_patient(case, models, asked)
         progress.stage("computing the plan operator")
@@ -145,7 +145,7 @@ def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
         progress.stage("making the page")
         wished = {} if found is None else {TOWARDS: found.plan}
         content = page_content(planning, reference, errors, variants=wished, band=band)
-    notices.add(content.findings)
+    notices.found(content.findings)
     return _Made(planning, content, errors, found)
 
 

@@ -30,7 +30,7 @@ def solve(options: argparse.Namespace) -> int:
     write_result(options.output, result)
     logging.getLogger("cmfsim").info("wrote %s", options.output)
     summary = dict(result.summary)
-    Notices(quiet=options.quiet).add(Finding.from_values(entry) for entry in summary["findings"])
+    Notices(quiet=options.quiet).found(Finding.from_values(entry) for entry in summary["findings"])
     size = np.linalg.norm(result.displacements, axis=1)
     if options.json:
         extra = {"output": str(options.output), "seconds": seconds, "largest": float(size.max())}

@@ -60,7 +60,6 @@ def predict(options: argparse.Namespace) -> int:
     begun = time.perf_counter()
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
-    failed: dict[str, CmfsimError] = {}
     each = (f"{work} {model}" for model in models for work in ("solving", "writing"))
     expected = expected_stages(*each, REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
@@ -71,24 +70,23 @@ def predict(options: argparse.Namespace) -> int:
             progress=progress.stage,
             check=False,
             findings=findings,
-            failed=failed,
-            on_findings=notices.add,
+            observer=notices,
             band=band,
         )
         written = write_results(
             case.output,
             lambda on_muscles: _timed(
-                _at_least_one(predicted(on_muscles=on_muscles), failed), before
+                _at_least_one(predicted(on_muscles=on_muscles), notices.failures), before
             ),
             models,
             stage=progress.stage,
             with_report=not options.no_report,
             slicer=options.slicer,
         )
+    failed = {model: str(error) for model, error in notices.failures.items()}
     if options.json:
         entries = [_figures(entry, case.output) for entry in written.predictions]
-        reasons = {model: str(error) for model, error in failed.items()}
-        answer = {"case": case.name, "predictions": entries, "failed": reasons}
+        answer = {"case": case.name, "predictions": entries, "failed": failed}
         more = {"findings": notices.as_dicts(), "left_out": written.left_out}
         print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
         return FAILED if failed else DONE
@@ -100,7 +98,7 @@ def predict(options: argparse.Namespace) -> int:
         print(_prediction_text(_figures(entry, case.output)))
     _print_report(case.output, written.report)
     _end(notices, case.output, written)
-    _print_failed({model: str(error) for model, error in failed.items()})
+    _print_failed(failed)
     return FAILED if failed else DONE
 
 
@@ -141,7 +139,7 @@ def evaluate(options: argparse.Namespace) -> int:
             progress=progress.stage,
             check=False,
             findings=findings,
-            on_findings=notices.add,
+            observer=notices,
             fit_thickness=options.fit_thickness,
         )
         written = write_results(
@@ -207,7 +205,7 @@ def sensitivity(options: argparse.Namespace) -> int:
             progress=progress.stage,
             check=False,
             findings=findings,
-            on_findings=notices.add,
+            observer=notices,
         )
     values = {**found.as_dict(), "findings": notices.as_dicts()}
     text = json.dumps(values, indent=1, allow_nan=False)

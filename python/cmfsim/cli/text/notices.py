@@ -6,7 +6,9 @@ from dataclasses import asdict
 from typing import Any
 
 from cmfsim.cli.text.terminal import CLEAR_LINE, escaped, in_colour
+from cmfsim.errors import CmfsimError
 from cmfsim.values.finding import Finding, FindingGroup, counted, grouped
+from cmfsim.values.observer import Observer
 
 # ANSI colours of what is printed.
 COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}
@@ -23,29 +25,35 @@ class FindingsError(Exception):
         self.findings = tuple(findings)
 
 
-class Notices:
+class Notices(Observer):
     """The findings of a command, without duplicates.
 
     Warnings and errors are printed on standard error as they come, grouped by kind, and again by
-    `summarise`; notes are counted there. Use `add` as `on_findings` of the stages.
+    `summarise`; notes are counted there. Use it
+    as the observer of the work: models that cannot be solved are recorded in `failures`.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
         self._found: dict[Finding, None] = {}
+        self.failures: dict[str, CmfsimError] = {}
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """All so far, in the order in which they came."""
         return tuple(self._found)
 
-    def add(self, findings: Iterable[Finding]) -> None:
+    def found(self, findings: Iterable[Finding]) -> None:
         """Adds findings, and prints the new ones except notes."""
         new = [finding for finding in dict.fromkeys(findings) if finding not in self._found]
         self._found.update(dict.fromkeys(new))
         for group in grouped(new):
             if group.severity != "note":
                 _print(f"cmfsim: {_head(group)}: {escaped(group.line)}")
+
+    def failed(self, model: str, error: CmfsimError) -> None:
+        """Records the error: the other models continue."""
+        self.failures[model] = error
 
     def summarise(self, where: str | None) -> None:
         """Prints the list at the end: nothing if there are no findings.

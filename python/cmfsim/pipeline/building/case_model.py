@@ -1,8 +1,9 @@
 """Builds the patient's model of a case."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 from cmfsim._core import TetMesh
 from cmfsim.bones import (
@@ -27,47 +28,31 @@ from cmfsim.pipeline.building.sites.landmarks import found_landmarks, is_to_be_f
 from cmfsim.pipeline.building.sites.site_checks import check_bones_of_sites, check_pieces
 from cmfsim.pipeline.building.skin.lips import find_seam
 from cmfsim.pipeline.building.skin.skin_check import check_skin
-from cmfsim.pipeline.building.stages import BuildOptions, Stages
+from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, Stages, build_options
 from cmfsim.pipeline.building.surgery.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative
 from cmfsim.pipeline.building.tissue.contacts import mean_edge
 from cmfsim.pipeline.building.tissue.nodes import made_contacts, nodes_of
 from cmfsim.pipeline.building.tissue.tissue_mesh import region_of, tissue_mesh
-from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
-from cmfsim.values.finding import Finding, OnFindings
+from cmfsim.values.finding import Finding
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
+from cmfsim.values.progress import expected_stages
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _log = logging.getLogger(__name__)
 
 
-def build_model(
-    case: CaseOrPath,
-    *,
-    progress: ProgressOrBar = None,
-    check: bool = True,
-    findings: Iterable[Finding] = (),
-    anatomy: Anatomy | None = None,
-    after: Postoperative | None = None,
-    on_findings: OnFindings | None = None,
-) -> PatientModel:
+def build_model(case: CaseOrPath, **options: "Unpack[BuildKeywords]") -> PatientModel:
     """The model of a case: read, segmented, cut, meshed and classified; nothing is written.
 
     Parameters
     ----------
     case : Case, or path of its file or folder
-    progress : callable or bool, optional
-    check : bool
-    findings : iterable of Finding
-        As for `build_case`.
-    anatomy : Anatomy, optional
-        The head, if it is already known; the image or surfaces of the case are then not read.
-    after : Postoperative, optional
-        The result of `read_postoperative`, if it is already known; an achieved plan is measured on
-        it.
-    on_findings : callable, optional
-        Called with new findings at the end of each stage.
+    **options
+        Those of `BuildOptions`.
 
     Returns
     -------
@@ -83,16 +68,8 @@ def build_model(
     >>> import cmfsim
     >>> model = cmfsim.build_model(cmfsim.Case.load("case.toml"))  # doctest: +SKIP
     """
-    with shown_progress(progress, expected_stages()) as shown:
-        options = BuildOptions(
-            progress=shown,
-            check=check,
-            findings=findings,
-            anatomy=anatomy,
-            after=after,
-            on_findings=on_findings,
-        )
-        return model_of(as_case(case), options)
+    with build_options(options, expected_stages()) as asked:
+        return model_of(as_case(case), asked)
 
 
 def model_of(case: Case, options: BuildOptions) -> PatientModel:
@@ -127,10 +104,10 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         placing = beside.submit(placed_muscles, case.muscles, head.skull, head.anatomy)
 
         def show(bones: PlannedBones) -> None:
-            if options.on_muscles is not None and placing.done():
+            if placing.done():
                 placed = placing.result()
                 if not isinstance(placed, NoMuscles):
-                    options.on_muscles(placed.muscles, bones.segments)
+                    options.observer.muscles(placed.muscles, bones.segments)
 
         patient, mesh = _without_muscles(head, stages, kinds, options, tissue, show=show)
         stages.begin("placing and sampling the muscles")

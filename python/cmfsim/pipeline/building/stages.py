@@ -1,14 +1,17 @@
 """The options of a build, and its stages as they run."""
 
+import contextlib
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import InitVar, dataclass
+from typing import TYPE_CHECKING, TypedDict
 
+from cmfsim.errors import CmfsimError
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding, OnFindings
-from cmfsim.values.progress import Progress, no_progress
+from cmfsim.values.observer import Observer
+from cmfsim.values.progress import ProgressOrBar, shown_progress
 
 if TYPE_CHECKING:
     # A case without muscles loads nothing of them.
@@ -18,14 +21,36 @@ if TYPE_CHECKING:
 OnMuscles = Callable[["Musculature", Sequence[BoneSegment]], None]
 
 
+class _Callbacks(Observer):
+    """An observer with functions in place of some of its methods."""
+
+    def __init__(self, observer: Observer, **functions: Callable[..., None] | None) -> None:
+        for name, function in functions.items():
+            setattr(self, name, function or getattr(observer, name))
+
+
+class BuildKeywords(TypedDict, total=False):
+    """The attributes of `BuildOptions` as keywords of the functions that build a case."""
+
+    observer: Observer
+    check: bool
+    findings: Iterable[Finding]
+    anatomy: Anatomy | None
+    after: Postoperative | None
+    progress: ProgressOrBar
+    on_findings: OnFindings | None
+    on_muscles: OnMuscles | None
+    failed: dict[str, CmfsimError] | None
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BuildOptions:
     """The options of the functions that build a case.
 
     Attributes
     ----------
-    progress : callable or None
-        Called with the name of each stage as it begins.
+    observer : Observer
+        Learns of stages, findings, muscles, and models that cannot be solved.
     check : bool
         Whether the doctor checks the case first; an error that it finds ends the work.
     findings : iterable of Finding
@@ -34,28 +59,70 @@ class BuildOptions:
         The head, where it is known; the image or surfaces of the case are then not read.
     after : Postoperative or None
         What `read_postoperative` gives, where it is known already.
-    on_findings : callable or None
-        Called with new findings at the end of each stage.
-    on_muscles : callable or None
-        Called with the muscles and the segments of bone once both are known, and perhaps again
-        before any model is solved.
+
+    Parameters
+    ----------
+    progress : callable or bool, optional
+        Called in place of the method `stage` of the observer; True shows a bar (tqdm), where a
+        function is given it.
+    on_findings, on_muscles : callable, optional
+        Called in place of the methods `found` and `muscles` of the observer.
+    failed : dict, optional
+        If given, a model that cannot be solved (for example, because contact does not converge) is
+        recorded here with its error, and the others continue.
     """
 
-    progress: Progress | None = None
+    observer: Observer = Observer()  # noqa: RUF009 (it has no state)
     check: bool = True
     findings: Iterable[Finding] = ()
     anatomy: Anatomy | None = None
     after: Postoperative | None = None
-    on_findings: OnFindings | None = None
-    on_muscles: OnMuscles | None = None
+    progress: InitVar[ProgressOrBar] = None
+    on_findings: InitVar[OnFindings | None] = None
+    on_muscles: InitVar[OnMuscles | None] = None
+    failed: InitVar[dict[str, CmfsimError] | None] = None
+
+    def __post_init__(
+        self,
+        progress: ProgressOrBar,
+        on_findings: OnFindings | None,
+        on_muscles: OnMuscles | None,
+        failed: dict[str, CmfsimError] | None,
+    ) -> None:
+        record = None if failed is None else failed.__setitem__
+        observer = _Callbacks(
+            self.observer,
+            stage=progress if callable(progress) else None,
+            found=on_findings,
+            muscles=on_muscles,
+            failed=record,
+        )
+        object.__setattr__(self, "observer", observer)
+
+
+@contextlib.contextmanager
+def build_options(given: BuildKeywords, expected: Mapping[str, float]) -> Iterator[BuildOptions]:
+    """The options that a function was given; meanwhile `progress=True` shows a bar.
+
+    Parameters
+    ----------
+    given : mapping
+        The keywords of the function.
+    expected : mapping of str to float, s
+        Its stages with their typical seconds.
+    """
+    if given.get("progress") is not True:
+        yield BuildOptions(**given)
+        return
+    with shown_progress(given["progress"], expected) as given["progress"]:
+        yield BuildOptions(**given)
 
 
 class Stages:
     """The stages as they pass: the seconds that each took, and what was found so far."""
 
     def __init__(self, options: BuildOptions) -> None:
-        self._progress = options.progress or no_progress
-        self._on_findings = options.on_findings
+        self._observer = options.observer
         self.findings: list[Finding] = [*options.findings]
         self._known = set(self.findings)
         self._name: str | None = None
@@ -66,7 +133,7 @@ class Stages:
         """Ends the stage before, and begins another."""
         self.end()
         self._name, self._begun = name, time.perf_counter()
-        self._progress(name)
+        self._observer.stage(name)
 
     def end(self) -> None:
         """Ends the stage, and hands over what is new of the findings."""
@@ -76,8 +143,8 @@ class Stages:
             self._name = None
         new = [finding for finding in self.findings if finding not in self._known]
         self._known.update(new)
-        if new and self._on_findings is not None:
-            self._on_findings(new)
+        if new:
+            self._observer.found(new)
 
     def add(self, findings: Iterable[Finding]) -> None:
         """Takes what a stage noticed."""

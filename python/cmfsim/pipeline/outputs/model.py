@@ -2,45 +2,35 @@
 
 import logging
 import time
-from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cmfsim.errors import CmfsimError
 from cmfsim.io import CaseOrPath, as_case, write_model
 from cmfsim.pictures import picture_anatomy, picture_node_kinds
 from cmfsim.pipeline.building.case_model import build_model
 from cmfsim.pipeline.building.inputs import check_output
-from cmfsim.values.finding import Finding, OnFindings
+from cmfsim.pipeline.building.stages import BuildKeywords, build_options
 from cmfsim.values.patient_model import PatientModel
-from cmfsim.values.progress import ProgressOrBar, expected_stages, shown_progress
+from cmfsim.values.progress import expected_stages
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _log = logging.getLogger(__name__)
 WRITING = "writing the model"
 
 
-def build_case(
-    case: CaseOrPath,
-    *,
-    progress: ProgressOrBar = None,
-    check: bool = True,
-    findings: Iterable[Finding] = (),
-    on_findings: OnFindings | None = None,
-) -> PatientModel:
+def build_case(case: CaseOrPath, **options: "Unpack[BuildKeywords]") -> PatientModel:
     """The model of a case, written to its output folder.
 
     Parameters
     ----------
     case : Case, or path of its file or folder
-    progress : callable or bool, optional
-        Called with the name of each stage as it begins; True shows a bar (tqdm).
-    check : bool
-        Whether the doctor checks the case first; an error that it finds ends the work.
-    findings : iterable of Finding
-        Findings on the case so far; the model keeps them.
-    on_findings : callable, optional
-        Called with new findings at the end of each stage.
+    **options
+        Those of `BuildOptions`.
 
     Returns
     -------
@@ -62,11 +52,9 @@ def build_case(
     """
     case = as_case(case)
     check_output(case)
-    with shown_progress(progress, expected_stages(WRITING)) as shown:
-        model = build_model(
-            case, progress=shown, check=check, findings=findings, on_findings=on_findings
-        )
-        shown(WRITING)
+    with build_options(options, expected_stages(WRITING)) as asked:
+        model = build_model(case, **options)
+        asked.observer.stage(WRITING)
         begun = time.perf_counter()
         names = write_model(case.output, model, partial(_draw, model))
     timings = {**model.summary["timings"], WRITING: time.perf_counter() - begun}
