@@ -21,7 +21,7 @@ from cmfsim.cli.research.population_commands import add_population_commands
 from cmfsim.io import result_suffixes
 from cmfsim.lab.frontier import EDGES, FACTORS
 from cmfsim.muscles.template import WHERE
-from cmfsim.planning.replanning import CORRECTIONS
+from cmfsim.planning.replanning import CORRECTIONS, TRIALS
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
@@ -270,8 +270,8 @@ def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
         "--trials",
         metavar="N",
         type=int,
-        default=plan_command.TRIALS,
-        help=f"exact solutions for measuring the error of the page (default {plan_command.TRIALS})",
+        default=TRIALS,
+        help=f"exact solutions for measuring the error of the page (default {TRIALS})",
     )
     plan.add_argument(
         "--corrections",

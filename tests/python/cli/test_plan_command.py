@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import io
 import json
 import re
@@ -65,6 +66,26 @@ def test_plan_writes_the_page_of_the_case(case, answer):
     # Nothing slides in model H: the page is exact, as one solution shows.
     assert not answer["expected_error"]["slides"]
     assert answer["expected_error"]["trials"][0]["largest_mm"] < 1e-6
+
+
+def test_python_makes_the_page_of_the_command(case, answer, wished, tmp_path):
+    loaded = cmfsim.Case.load(case)
+    mesh = dataclasses.replace(loaded.mesh, edge_length=9.0)
+    loaded = dataclasses.replace(loaded, mesh=mesh, output=tmp_path)
+    stages = []
+    page = cmfsim.make_planning_page(
+        loaded, model="H", trials=2, towards=wished[0], check=False, progress=stages.append
+    )
+    assert stages[-1] == "making the page"
+    for name in ("plan.html", "towards.toml"):
+        made, command = (
+            re.sub(r'"seconds": ?[^,}]+', "", (folder / name).read_text("utf-8"))
+            for folder in (tmp_path, case.parent / "out")
+        )
+        assert made == command
+    assert page.as_dict()["towards"] == answer["towards"]
+    with pytest.raises(cmfsim.CaseError, match="trials is 0"):
+        cmfsim.make_planning_page(loaded, trials=0)
 
 
 def test_a_served_page_ends_with_ctrl_c(case, tmp_path):

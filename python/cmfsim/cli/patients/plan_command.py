@@ -6,9 +6,6 @@ import socket
 import sys
 import time
 import webbrowser
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,141 +13,65 @@ from cmfsim.cli.band_options import band_options
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.opening import can_open, open_page
 from cmfsim.cli.patients.case_commands import case_of, checked
-from cmfsim.cli.patients.desired_faces import TARGET_STD, read_targets
 from cmfsim.cli.text.notices import Notices
 from cmfsim.cli.text.terminal import StageProgress, escaped
-from cmfsim.errors import CaseInputError
-from cmfsim.io import Case, write_plan
-from cmfsim.pipeline.building.stages import BuildOptions
-from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, write_planning_page
-from cmfsim.pipeline.predicting import build_patient
-from cmfsim.pipeline.preparation import prepare
-from cmfsim.planning.face_planning import FacePlan, FaceSearch, plan_for_face
-from cmfsim.planning.page import PageContent, page_content
-from cmfsim.planning.replanning import (
-    USUAL,
-    ExpectedError,
-    PlanCorrection,
-    PlanningModel,
-    corrected_planning,
-    expected_error,
-    plan_band,
-    planning_model,
-)
+from cmfsim.pipeline.outputs.planning_page import PLAN_FILE
+from cmfsim.pipeline.planning import TARGET_STD, PlanningPage, make_planning_page
+from cmfsim.planning.face_planning import FacePlan
+from cmfsim.planning.replanning import USUAL, ExpectedError, PlanCorrection
 from cmfsim.planning.server import open_port, serve_planning
 from cmfsim.values.progress import BUILDING, PLANNING
-
-# Name of the plan for a desired face, and the file to which it is saved.
-TOWARDS, PLAN_FILE = "Towards", "towards.toml"
-# Plans that are solved exactly to measure the error of the page.
-TRIALS = 6
-
-
-@dataclass(frozen=True, eq=False)
-class _Made:
-    """The results of the command."""
-
-    planning: PlanningModel
-    content: PageContent
-    errors: ExpectedError
-    found: FacePlan | None
 
 
 def plan(options: argparse.Namespace) -> int:
     """Builds a case and writes its planning page."""
     case = case_of(options)
-    prepare(case, {PAGE_FILE, PLAN_FILE}.__contains__)
-    for name, least in (("trials", 1), ("corrections", 0)):
-        if getattr(options, name) < least:
-            raise CaseInputError(
-                f"--{name} is {getattr(options, name)}: a whole number of {least} or more is needed"
-            )
+    band = band_options(options, case)
     # Before the work: a port that is taken is not reported a minute later.
     listener = open_port(options.port) if options.serve else None
     begun = time.perf_counter()
     notices = Notices(quiet=options.quiet)
-    made = _made(options, case, notices)
-    case.output.mkdir(parents=True, exist_ok=True)
-    path = case.output / PAGE_FILE
-    size = write_planning_page(path, made.content, case_file=case.file.name)
-    if made.found is not None:
-        made_for = str(made.planning.patient.summary.get("plan_key", ""))
-        write_plan(case.output / PLAN_FILE, made.found.plan, made_for=made_for)
+    models = (options.model,)
+    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
+    expected = {**BUILDING, **PLANNING}
+    with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
+        made = make_planning_page(
+            case,
+            model=options.model,
+            trials=options.trials,
+            corrections=options.corrections,
+            towards=options.towards or (),
+            keep_bite=options.keep_bite,
+            band=band,
+            check=False,
+            findings=findings,
+            observer=notices,
+            progress=progress.stage,
+        )
     seconds = time.perf_counter() - begun
     if listener is not None:
         _serve(options, made, case.file.name, listener)
         return DONE
     if options.json:
-        answer = {
-            "case": case.name,
-            "page": str(path),
-            "bytes": size,
-            "seconds": seconds,
-            "expected_error": made.errors.as_dict(),
-            "correction": _correction_values(made.planning.correction),
-            "towards": None if made.found is None else _towards_values(made.found),
-            "findings": notices.as_dicts(),
-        }
+        found = {"findings": notices.as_dicts()}
+        answer = {"case": case.name, "seconds": seconds, **made.as_dict(), **found}
         print(json.dumps(answer, allow_nan=False))
         return DONE
-    print(f"page   {escaped(str(path))} ({size / 1e6:.1f} MB)")
+    print(f"page   {escaped(str(made.path))} ({made.path.stat().st_size / 1e6:.1f} MB)")
     print(f"error  {_error_text(made.errors)}")
     if made.planning.correction is not None:
         print(f"       {_correction_text(made.planning.correction)}")
     if made.found is not None:
-        print(_towards_text(made.found, case.output / PLAN_FILE))
+        print(_towards_text(made.found, str(made.path.with_name(PLAN_FILE))))
     print(f"time   {seconds:.0f} s")
     # The page lists no findings.
     notices.summarise(None)
-    open_page(path, wanted=not options.no_open)
+    open_page(made.path, wanted=not options.no_open)
     return DONE
 
 
-def _made(options: argparse.Namespace, case: Case, notices: Notices) -> _Made:
-    """Everything that the page contains."""
-    # Before any work, so that an invalid file is not reported a minute later.
-    targets = None if options.towards is None else read_targets(options.towards)
-    models = (options.model,)
-    wanted = band_options(options, case)
-    if wanted is not None:
-        wanted.check(models)
-    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
-    expected = {**BUILDING, **PLANNING}
-    with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
-        asked = BuildOptions(
-            progress=progress.stage, check=False, findings=findings, observer=notices
-        )
-        patient = build_patient(case, models, asked)
-        progress.stage("computing the plan operator")
-        planning = planning_model(patient, options.model)
-        progress.stage("solving the case's plan")
-        band = None
-        if wanted is None:
-            reference = planning.solve(planning.reference)
-        else:
-            # Regions and proposed landmarks: a page without a band does not load them.
-            from cmfsim.pipeline.banding import predict_with_band  # noqa: PLC0415
-
-            reference = predict_with_band(
-                planning.patient, planning.model, wanted, solver=planning.solver
-            )
-            progress.stage("computing how far to trust the face")
-            band = plan_band(planning, reference)
-        planning = corrected_planning(planning, options.corrections, progress=progress.stage)
-        errors = expected_error(planning, trials=options.trials, progress=progress.stage)
-        found = None
-        if targets is not None:
-            progress.stage("searching for the plan of the desired face")
-            found = plan_for_face(planning, targets(planning), _search(options, planning))
-        progress.stage("making the page")
-        wished = {} if found is None else {TOWARDS: found.plan}
-        content = page_content(planning, reference, errors, variants=wished, band=band)
-    notices.found(content.findings)
-    return _Made(planning, content, errors, found)
-
-
 def _serve(
-    options: argparse.Namespace, made: _Made, case_file: str, listener: socket.socket
+    options: argparse.Namespace, made: PlanningPage, case_file: str, listener: socket.socket
 ) -> None:
     """Serves the page until it is interrupted; its address is printed first."""
 
@@ -193,49 +114,12 @@ def _correction_text(correction: PlanCorrection) -> str:
     )
 
 
-def _correction_values(correction: PlanCorrection | None) -> dict[str, Any] | None:
-    """The figures of the correction; None if there is none."""
-    if correction is None:
-        return None
-    return {
-        "plans": len(correction.plans),
-        "shapes": correction.weights.shape[1],
-        "length_mm": correction.length,
-        "largest_before_mm": correction.before.tolist(),
-        "largest_left_out_mm": correction.left_out.tolist(),
-    }
-
-
-def _search(options: argparse.Namespace, planning: PlanningModel) -> FaceSearch:
-    """The options of the search for the plan of a desired face."""
-    if not options.keep_bite:
-        return FaceSearch()
-    upper = next((n for n in ("maxilla", "midface") if n in planning.segments), None)
-    lower = next((n for n in ("mandible_body", "mandible") if n in planning.segments), None)
-    if upper is None or lower is None:
-        raise CaseInputError(
-            "--keep-bite needs a maxilla and a mandible that move; segments are: "
-            + ", ".join(planning.segments)
-        )
-    return FaceSearch(follows={lower: upper})
-
-
-def _towards_values(found: FacePlan) -> dict[str, Any]:
-    return {
-        "plan": {name: motion.as_dict() for name, motion in found.motions.items()},
-        "std": {name: row.tolist() for name, row in found.std.items()},
-        "undetermined": list(found.undetermined),
-        "at_bounds": list(found.at_bounds),
-        "rms": [float(np.sqrt((row**2).mean())) for row in found.exact_residuals],
-        "converged": found.converged,
-    }
-
-
-def _towards_text(found: FacePlan, path: Path) -> str:
+def _towards_text(found: FacePlan, path: str) -> str:
     """The plan that was found, its error, and what the desired face leaves undetermined."""
     lines = [f"wish   {name}: {motion.text}" for name, motion in found.motions.items()]
-    rms = [float(np.sqrt((row**2).mean())) for row in found.exact_residuals]
-    lines.append(f"       the exact solution is off by {TARGET_STD * max(rms):.2f} mm RMS")
+    lines.append(
+        f"       the exact solution is off by {TARGET_STD * max(found.exact_rms):.2f} mm RMS"
+    )
     if found.at_bounds:
         lines.append(f"       at its bound: {', '.join(found.at_bounds)}")
     if found.undetermined:

@@ -7,7 +7,8 @@ from pathlib import Path
 from cmfsim.io import replacing
 from cmfsim.planning.page import PageContent, page_text
 
-PAGE_FILE = "plan.html"
+# The page, and the plan for a desired face that is saved next to it.
+PAGE_FILE, PLAN_FILE = "plan.html", "towards.toml"
 STATE = re.compile(rb'<meta name="cmfsim-made-for" content="([0-9a-f]{64})">')
 # The state stands before the style and scripts.
 HEAD_BYTES = 2048

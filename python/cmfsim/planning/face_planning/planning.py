@@ -12,6 +12,7 @@ inside.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,6 +206,22 @@ class FacePlan:
     exact_residuals: tuple[Floats, ...]
     steps: int
     converged: bool
+
+    @property
+    def exact_rms(self) -> list[float]:
+        """Root mean square of the exact residuals of each target."""
+        return [float(np.sqrt((row**2).mean())) for row in self.exact_residuals]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "plan": {name: motion.as_dict() for name, motion in self.motions.items()},
+            "std": {name: row.tolist() for name, row in self.std.items()},
+            "undetermined": list(self.undetermined),
+            "at_bounds": list(self.at_bounds),
+            "rms": self.exact_rms,
+            "converged": self.converged,
+        }
 
 
 def plan_for_face(

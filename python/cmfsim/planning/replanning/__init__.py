@@ -3,6 +3,7 @@
 from cmfsim.planning.replanning.corrected import CORRECTIONS, corrected_planning
 from cmfsim.planning.replanning.correction import PlanCorrection
 from cmfsim.planning.replanning.expected_error import (
+    TRIALS,
     USUAL,
     ExpectedError,
     PlanTrial,
@@ -15,6 +16,7 @@ from cmfsim.planning.replanning.plan_band import PlanBand, plan_band
 
 __all__ = [
     "CORRECTIONS",
+    "TRIALS",
     "USUAL",
     "ExpectedError",
     "Motions",

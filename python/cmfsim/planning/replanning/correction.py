@@ -16,6 +16,7 @@ with the least error in cross-validation.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,6 +123,16 @@ class PlanCorrection:
     def displacements(self, plan: Mapping[str, ArrayLike]) -> Floats:
         """The correction of the operator's displacements under a plan, (k, 3) mm."""
         return self.shapes @ self.amounts(plan)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON: how many plans and shapes, and errors at these plans."""
+        return {
+            "plans": len(self.plans),
+            "shapes": self.weights.shape[1],
+            "length_mm": self.length,
+            "largest_before_mm": self.before.tolist(),
+            "largest_left_out_mm": self.left_out.tolist(),
+        }
 
     def at(self, nodes: NDArray[np.integer]) -> "PlanCorrection":
         """The correction restricted to some nodes, by their positions in the operator."""

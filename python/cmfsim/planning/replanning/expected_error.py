@@ -13,6 +13,8 @@ from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
+# Plans that are solved to measure the error.
+TRIALS = 6
 TRYING = "solving a nearby plan exactly"
 # Plans are tried at these shares of the range, one after the other.
 SHARES = (1.0, 0.5)
@@ -160,7 +162,7 @@ def segment_boxes(planning: PlanningModel) -> dict[str, Floats]:
 def expected_error(
     planning: PlanningModel,
     *,
-    trials: int = 6,
+    trials: int = TRIALS,
     shift: float = 5.0,
     turn: float = 5.0,
     seed: int = 0,
