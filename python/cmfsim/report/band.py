@@ -10,8 +10,8 @@ Values = Mapping[str, Any]
 MOST_SOURCES = 12
 
 UNCALIBRATED = (
-    "UNCALIBRATED. The half widths below are {factor:.2f} standard deviations of the sources "
-    "listed below, for each point separately. They are intended to cover {percent} of faces but "
+    "UNCALIBRATED. The half widths are {factor:.2f} standard deviations of the sources that "
+    "were considered, for each point separately. They are intended to cover {percent} of faces but "
     "have not been checked on cases with a known outcome, so the true face may be outside more "
     "often. Use a calibration ([band] in the case, or --calibration)."
 )
@@ -32,6 +32,29 @@ def band_section(band: Values, figures: list[Figure]) -> Section:
     figures : list of Figure
         Its picture, where there is one.
     """
+    missing = Note("Not covered by the sources: " + "; ".join(band["not_covered"]) + ".")
+    notes = [Note(f"{text}.") for text in band["notes"]]
+    statement, widths = band_blocks(band)
+    blocks: tuple[Note | Table | Figure, ...] = (
+        statement,
+        *notes,
+        *figures,
+        widths,
+        _effects(band),
+        _priors(band),
+        missing,
+    )
+    return Section(f"How far to trust it ({band['state']})", blocks)
+
+
+def band_blocks(band: Values) -> tuple[Note, Table]:
+    """What the band is worth, and half widths by region, with the calibration of each.
+
+    Parameters
+    ----------
+    band : mapping
+        `SkinBand.as_dict()`.
+    """
     percent = f"{100 * band['coverage']:g} %"
     if band["state"] == "uncalibrated":
         text = UNCALIBRATED.format(factor=band["factor_uncalibrated"], percent=percent)
@@ -40,15 +63,6 @@ def band_section(band: Values, figures: list[Figure]) -> Section:
         used = band["calibration"]
         note = f" ({used['note']})" if used["note"] else ""
         statement = Note(CALIBRATED.format(percent=percent, file=used["file"], note=note))
-    missing = Note("Not covered by the sources: " + "; ".join(band["not_covered"]) + ".")
-    notes = [Note(f"{text}.") for text in band["notes"]]
-    tables = (_widths(band), _effects(band), _priors(band))
-    blocks: tuple[Note | Table | Figure, ...] = (statement, *notes, *figures, *tables, missing)
-    return Section(f"How far to trust it ({band['state']})", blocks)
-
-
-def _widths(band: Values) -> Table:
-    """Half widths by region, with the calibration of each."""
     columns = ("region", "mean", "95 %", "largest", "factor", "n", "holds")
     rows = []
     for name, entry in band["regions"].items():
@@ -64,7 +78,7 @@ def _widths(band: Values) -> Table:
         "calibration cases; and the share of further cases within the band that n cases can "
         "guarantee (90 % interval)."
     )
-    return Table(columns, tuple(rows), caption)
+    return statement, Table(columns, tuple(rows), caption)
 
 
 def _effects(band: Values) -> Table:

@@ -209,7 +209,14 @@ def _band_sections(shown: Values, pictures: Mapping[str, bytes]) -> list[Section
     return [band_section(shown["band"], _picture("band", pictures))] if "band" in shown else []
 
 
-def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
+def motion_blocks(prediction: Values) -> list[Note | Table]:
+    """The motion of each segment, and how well it was measured where it was.
+
+    Parameters
+    ----------
+    prediction : mapping
+        What `prediction.json` holds.
+    """
     rows, bent = [], []
     for name, motion in prediction["plan"].items():
         if "translation" in motion:
@@ -235,22 +242,18 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
                 f"residual): {', '.join(bent)}."
             )
         )
+    return [table, *notes, *_achieved(prediction.get("achieved"))]
+
+
+def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
     words = [
         Note(line) for line in plan_lines({n: m["clinical"] for n, m in prediction["plan"].items()})
     ]
-    return Section(
-        "Plan",
-        (
-            *words,
-            *_picture("plan", pictures),
-            table,
-            *notes,
-            *_achieved(prediction.get("achieved")),
-        ),
-    )
+    blocks = (*words, *_picture("plan", pictures), *motion_blocks(prediction))
+    return Section("Plan", blocks)
 
 
-def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
+def _achieved(achieved: Values | None) -> list[Table]:
     """The table of how well each segment was registered to the post-operative bone."""
     if achieved is None:
         return []
@@ -267,19 +270,21 @@ def _achieved(achieved: Values | None) -> list[Note | Table | Figure]:
         "The plan was measured on the post-operative bones: remaining distance between each "
         "segment and the bone, mm, and the share of its vertices that are on the bone. RMS and "
         "maximum refer to these vertices, median and 95th percentile to all. Size: "
-        "post-operative relative to pre-operative size, with its 95 % interval; it is not part "
-        "of the motion. Empty: the motion follows from paired vertices alone."
+        "post-operative relative to pre-operative size, with its 95 % interval, which is not part "
+        "of the motion; and of the 6 directions of the motion, those that the shape leaves open. "
+        "Empty: the motion follows from paired vertices alone."
     )
     heads = ("segment", "RMS", "largest", "median", "P95", "share", "size")
     return [Table(heads, rows, caption)]
 
 
 def _size(shape: Values | None) -> str:
-    """The size of a segment after the operation, with its interval."""
+    """The size of a segment after the operation, with its interval; directions left open."""
     if shape is None:
         return ""
     low, high = shape["scale_interval"]
-    return f"{shape['scale']:.3f} ({low:.3f} to {high:.3f})"
+    left = f", {len(shape['open'])} of 6 open" if shape.get("open") else ""
+    return f"{shape['scale']:.3f} ({low:.3f} to {high:.3f}){left}"
 
 
 def _evaluation_sections(evaluation: Values | None, figures: Sequence[Figure]) -> list[Section]:

@@ -66,16 +66,33 @@ def thickness_blocks(evaluation: Values) -> list[Note | Table]:
     ]
 
 
-def statistics_table(regions: Mapping[str, Values], caption: str) -> Table:
+def summary_blocks(evaluation: Values) -> list[Note | Table]:
+    """The errors of each model over the whole face, and those of no model.
+
+    Parameters
+    ----------
+    evaluation : mapping
+    """
+    entries = {**evaluation["models"], "no change": evaluation["no_change"]}
+    whole = {name: entry["regions"]["whole"] for name, entry in entries.items()}
+    return [
+        *not_operated_blocks(evaluation)[:1],
+        statistics_table(whole, "Distance from the post-operative face, mm.", of="model"),
+        *thickness_blocks(evaluation),
+    ]
+
+
+def statistics_table(regions: Mapping[str, Values], caption: str, of: str = "region") -> Table:
     """Statistics of signed distances by region.
 
     Parameters
     ----------
     regions : mapping of str to mapping
-        `DistanceStatistics.as_dict()` by region.
+        `DistanceStatistics.as_dict()` by region, or by what `of` calls it.
     caption : str
+    of : str
     """
-    columns = ("region", "mean", "SD", "median", "RMS", "90 %", "95 %", "max", "signed", "< 2 mm")
+    columns = (of, "mean", "SD", "median", "RMS", "90 %", "95 %", "max", "signed", "< 2 mm")
     keys = ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm")
     rows = tuple(
         (

@@ -66,6 +66,24 @@ class Table:
         rows = tuple((name, number(value)) for name, value in pairs.items())
         return cls(("", ""), rows, caption, numeric=False)
 
+    @property
+    def text(self) -> str:
+        """Caption and columns as plain text."""
+        rows = [self.columns, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [self.caption]
+        for first, *others in rows:
+            cells = [c.rjust(w) for c, w in zip(others, widths[1:], strict=True)]
+            lines.append("  ".join(["", first.ljust(widths[0]), *cells]))
+        return "\n".join(lines)
+
+    @property
+    def markdown(self) -> str:
+        """The columns in Markdown, without the caption."""
+        others = ["---:" if self.numeric else "---"] * (len(self.columns) - 1)
+        head, *rows = [map(plain_line, row) for row in (self.columns, *self.rows)]
+        return "\n".join(f"| {' | '.join(row)} |" for row in (head, ("---", *others), *rows))
+
 
 @dataclass(frozen=True)
 class Figure:

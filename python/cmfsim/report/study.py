@@ -40,7 +40,7 @@ def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document
     sections = []
     if study["note"]:
         sections.append(Section("Patients", (Note(study["note"], "warning"),)))
-    sections.append(Section("Error of each model", _error_blocks(done, models, figures)))
+    sections.append(Section("Error of each model", (*_error_blocks(done, models), *figures)))
     sections.append(Section("Regions", _region_blocks(done, models)))
     sections.append(Section("The paper's patients", (_paper_table(models), Note(PAPER_NOTE))))
     sections.append(Section("Cases", _case_blocks(study["cases"], failed)))
@@ -76,11 +76,24 @@ def table3_text(study: Values, table: ErrorTable) -> str:
     if absent:
         blocks.append(f"Failed, and not included in any figure of this table: {', '.join(absent)}.")
     paper = _paper_table(models)
-    rows = [paper.columns, ("---", *["---:"] * len(models)), *paper.rows]
-    blocks.append(f"## The paper's patients\n\n{paper.caption}")
-    blocks.append("\n".join("| " + " | ".join(row) + " |" for row in rows))
-    blocks.append(PAPER_NOTE)
+    blocks += [f"## The paper's patients\n\n{paper.caption}", paper.markdown, PAPER_NOTE]
     return "\n\n".join(blocks) + "\n"
+
+
+def study_text(study: Values) -> str:
+    """The errors of a study and its doubtful cases, as plain text.
+
+    Parameters
+    ----------
+    study : mapping
+        `StudyReport.as_dict()`.
+    """
+    done = [case for case in study["cases"] if case["status"] != "failed"]
+    blocks = [study["note"]] if study["note"] else []
+    parts = (*_error_blocks(done, tuple(study["models"])), _case_table(study["cases"]))
+    blocks += [part.text for part in parts]
+    blocks += ["\n  ".join((alert.line, *alert.details)) for alert in _alerts(study["cases"])]
+    return "\n".join(blocks)
 
 
 def _measures(cases: Sequence[Values]) -> list[str]:
@@ -138,9 +151,7 @@ PAPER_NOTE = (
 )
 
 
-def _error_blocks(
-    done: Sequence[Values], models: tuple[str, ...], figures: Sequence[Figure]
-) -> tuple[Note | Table | Figure, ...]:
+def _error_blocks(done: Sequence[Values], models: tuple[str, ...]) -> tuple[Note | Table, ...]:
     rows = []
     for case in done:
         entries = case["evaluation"]["models"]
@@ -156,7 +167,7 @@ def _error_blocks(
         "Mean ± SD over the whole face, mm (as the paper's Table 3); the last column takes the "
         "face before the operation as the prediction.",
     )
-    return (table, *(Note(line.replace("**", "")) for line in _measures(done)), *figures)
+    return (table, *(Note(line.replace("**", "")) for line in _measures(done)))
 
 
 def _region_blocks(done: Sequence[Values], models: tuple[str, ...]) -> tuple[Note | Table, ...]:
@@ -204,9 +215,15 @@ def _paper_table(models: tuple[str, ...]) -> Table:
 
 
 def _case_blocks(cases: Sequence[Values], failed: Sequence[Values]) -> tuple[Note | Table, ...]:
+    return (
+        _case_table(cases),
+        *(Note(f"{case['name']} failed: {case['error']}", "error") for case in failed),
+    )
+
+
+def _case_table(cases: Sequence[Values]) -> Table:
     rows = tuple((case["name"], case["status"], number(case["seconds"], 0)) for case in cases)
-    table = Table(("case", "outcome", "time, s"), rows)
-    return (table, *(Note(f"{case['name']} failed: {case['error']}", "error") for case in failed))
+    return Table(("case", "outcome", "time, s"), rows, "How each case ended.")
 
 
 def _mean_sd(entry: Values | None) -> str:

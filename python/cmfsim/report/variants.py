@@ -182,14 +182,7 @@ def variants_text(values: Values) -> str:
     """
     blocks = [note for note in (values["note"], values["description"]) if note]
     regions, patients = _tables(values)
-    for table in (*patients, *regions):
-        rows = [table.columns, *table.rows]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(table.columns))]
-        lines = [table.caption]
-        for first, *others in rows:
-            cells = [c.rjust(w) for c, w in zip(others, widths[1:], strict=True)]
-            lines.append("  ".join(["", first.ljust(widths[0]), *cells]))
-        blocks.append("\n".join(lines))
+    blocks += [table.text for table in (*patients, *regions)]
     return "\n\n".join([*blocks, METHOD])
 
 
@@ -203,19 +196,10 @@ def variants_markdown(values: Values) -> str:
     """
     blocks = [f"# {plain_line(values['cohort'])}: variants"]
     blocks += [plain_line(note) for note in (values["note"], values["description"]) if note]
-    blocks.append(_markdown(_variants_table(values)))
+    blocks.append(_variants_table(values).markdown)
     regions, patients = _tables(values)
     for table in (*regions, *patients):
-        blocks += [f"{plain_line(table.caption)}:", _markdown(table)]
+        blocks += [f"{plain_line(table.caption)}:", table.markdown]
     blocks.append(METHOD)
     blocks += [f"{plain_line(where)} failed: {plain_line(e)}" for where, e in _failures(values)]
     return "\n\n".join(blocks) + "\n"
-
-
-def _markdown(table: Table) -> str:
-    others = ["---:" if table.numeric else "---"] * (len(table.columns) - 1)
-    rows = [table.columns, ("---", *others), *table.rows]
-    return "\n".join(
-        "| " + " | ".join(cell if row is rows[1] else plain_line(cell) for cell in row) + " |"
-        for row in rows
-    )

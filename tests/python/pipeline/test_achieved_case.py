@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.cli.research.study_commands import achieved_text
 from cmfsim.pipeline.building.surgery.motions import planned_bones
 from cmfsim.pipeline.building.surgery.postoperative import read_postoperative
+from cmfsim.report.case import motion_blocks
 from head_case import HeadCase, ellipsoid, icosphere
 from pebbles import slid
 
@@ -71,9 +71,10 @@ def test_bones_of_other_triangles_tell_the_plan(tmp_path):
     assert off(model.scene.plan["mandible"], JAW)[0] < 0.3
     assert off(model.scene.plan["mandible"], JAW)[1] < 0.5
     np.testing.assert_array_equal(model.scene.plan["cranium"], np.eye(4))
-    text = achieved_text(model.summary["achieved"])
-    assert re.search(r"mandible +\+[01]\.\d\d +-[45]\.\d\d", text)
-    moved = cmfsim.predict_patient(model, "H").skin_displacements
+    prediction = cmfsim.predict_patient(model, "H")
+    text = "\n".join(block.text for block in motion_blocks(prediction.summary))
+    assert re.search(r"mandible +[01]\.\d\d +-[45]\.\d\d", text)
+    moved = prediction.skin_displacements
     assert 2.0 < np.linalg.norm(moved, axis=1).max() < 8.0
 
 
@@ -87,10 +88,9 @@ def test_bones_of_the_same_triangles_tell_it_vertex_by_vertex(tmp_path):
         "mandible": "vertices",
     }
     assert found["mandible"]["angle_degrees"] == pytest.approx(4.0, abs=1e-3)
-    assert "vertex by vertex, 0.00 mm rms from a rigid motion" in achieved_text(
-        model.summary["achieved"]
-    )
-    result = cmfsim.predict_patient(model, "H").result
+    prediction = cmfsim.predict_patient(model, "H")
+    assert "Moved vertex by vertex" in motion_blocks(prediction.summary)[1].text
+    result = prediction.result
     joined = np.asarray(model.scene.segments["mandible"].joined)
     nodes = np.asarray(model.scene.nodes)[joined]
     went = nodes @ JAW[:3, :3].T + JAW[:3, 3]
@@ -171,7 +171,8 @@ def test_bones_of_other_triangles_take_no_motion_from_their_size(ratio, tmp_path
     assert "the skull" not in finding.why
     shape = found.achieved.motions["mandible"].fit
     assert shape.scale_interval[0] < ratio < shape.scale_interval[1]
-    size = re.search(r"mandible .* size (\d\.\d{3}) \(", achieved_text(found.achieved.as_dict()))
+    text = motion_blocks({"plan": {}, "achieved": found.achieved.as_dict()})[1].text
+    size = re.search(r"mandible .* (\d\.\d{3}) \(", text)
     assert float(size[1]) == pytest.approx(ratio, abs=0.01)
 
 
@@ -265,7 +266,8 @@ def test_a_smooth_bone_leaves_a_turn_open_and_is_a_warning(tmp_path):
     assert len(opened) == 3
     assert all(f.severity == "warning" for f in opened)
     assert "this part of the motion may be wrong" in opened[0].why
-    assert "3 of 6 directions open" in achieved_text(found.achieved.as_dict())
+    text = motion_blocks({"plan": {}, "achieved": found.achieved.as_dict()})[1].text
+    assert "3 of 6 open" in text
 
 
 @pytest.mark.parametrize("rounds", [3, 4])

@@ -12,6 +12,7 @@ from cmfsim.cli.opening import open_page
 from cmfsim.cli.text.notices import Notices
 from cmfsim.cli.text.terminal import StageProgress, escaped
 from cmfsim.lab.virtual.demo import DemoCase, write_demo_case
+from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import evaluate
 from cmfsim.pipeline.outputs.results import REPORT_STAGE, WrittenResults, write_results
 from cmfsim.pipeline.predicting import predict_models
@@ -66,24 +67,16 @@ def _work(
     """Predicts by each model, compares where the truth is known, and writes everything."""
     case, found = made.case, None
     predictions: Iterable[Prediction]
+    asked: BuildKeywords = {
+        "progress": progress.stage,
+        "check": False,
+        "anatomy": made.anatomy,
+        "on_findings": notices.found,
+    }
     if made.truth is None:
-        predictions = predict_models(
-            case,
-            models,
-            progress=progress.stage,
-            check=False,
-            anatomy=made.anatomy,
-            on_findings=notices.found,
-        )
+        predictions = predict_models(case, models, **asked)
     else:
-        found = evaluate(
-            case,
-            models,
-            progress=progress.stage,
-            check=False,
-            anatomy=made.anatomy,
-            on_findings=notices.found,
-        )
+        found = evaluate(case, models, **asked)
         predictions = found.predictions
     return write_results(
         case.output,

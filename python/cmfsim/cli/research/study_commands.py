@@ -14,8 +14,6 @@ from typing import Any
 from cmfsim.cli.band_options import band_options
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.patients.case_commands import case_of, checked
-from cmfsim.cli.text.band_text import band_lines
-from cmfsim.cli.text.causes_text import not_operated_line, thickness_lines
 from cmfsim.cli.text.notices import Notices
 from cmfsim.cli.text.terminal import StageProgress, escaped
 from cmfsim.errors import CmfsimError
@@ -30,7 +28,12 @@ from cmfsim.pipeline.outputs.results import (
 )
 from cmfsim.pipeline.predicting import predict_models
 from cmfsim.pipeline.preparation import prepare
-from cmfsim.study.cohort import CaseOutcome, StudyOptions, StudyReport, run_study
+from cmfsim.report import Note, Table
+from cmfsim.report.band import band_blocks
+from cmfsim.report.case import motion_blocks
+from cmfsim.report.causes import summary_blocks
+from cmfsim.report.study import study_text
+from cmfsim.study.cohort import CaseOutcome, StudyOptions, run_study
 from cmfsim.study.outputs import write_study_report
 from cmfsim.study.trials import sensitivity as landmark_sensitivity
 from cmfsim.study.variants import run_variants, write_variants_report
@@ -91,8 +94,6 @@ def predict(options: argparse.Namespace) -> int:
         print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
         return FAILED if failed else DONE
     summary = written.predictions[0].summary
-    if summary.get("achieved") is not None:
-        print(achieved_text(summary["achieved"]))
     print(_plan_text(summary))
     for entry in written.predictions:
         print(_prediction_text(_figures(entry, case.output)))
@@ -158,22 +159,8 @@ def evaluate(options: argparse.Namespace) -> int:
         more = {"findings": notices.as_dicts(), "left_out": written.left_out}
         print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
         return code
-    achieved = found.predictions[0].patient.summary.get("achieved")
-    if achieved is not None:
-        print(achieved_text(achieved))
     print(_plan_text(found.predictions[0].summary))
-    print(not_operated_line(values["not_operated"]))
-    print(f"{escaped(case.name)}: distance from the post-operative face, mm")
-    print("  model        mean     SD   95 %    max   < 2 mm")
-    for name, entry in [*values["models"].items(), ("no change", values["no_change"])]:
-        figures = entry["regions"]["whole"]
-        print(
-            f"  {name:<10} {figures['mean_mm']:6.2f} {figures['std_mm']:6.2f} "
-            f"{figures['p95_mm']:6.2f} {figures['max_mm']:6.2f} "
-            f"{100 * figures['within']['2 mm']:6.0f} %"
-        )
-    for line in thickness_lines(values.get("thickness")):
-        print(line)
+    print(_text_of(summary_blocks(values)))
     _print_report(case.output, written.report)
     _end(notices, case.output, written)
     _print_failed(found.failed)
@@ -267,7 +254,7 @@ def study(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({**found.as_dict(), "files": names}, allow_nan=False))
     else:
-        print(_study_text(found))
+        print(_shown(study_text(found.as_dict())))
         print(f"written       {escaped(str(cohort.output))}: {', '.join(names)}")
     _print_reasons((outcome.name, outcome) for outcome in found.failed)
     return FAILED if found.failed else DONE
@@ -320,7 +307,7 @@ def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
         more = {"output": str(found.output), "files": names}
         print(json.dumps({**found.as_dict(), **more}, allow_nan=False))
     else:
-        print("\n".join(escaped(line) for line in found.text().split("\n")))
+        print(_shown(found.text()))
         print(f"written       {escaped(str(found.output))}: {', '.join(names)}")
     _print_reasons((f"{variant}, {outcome.name}", outcome) for variant, outcome in found.failed)
     return FAILED if found.failed else DONE
@@ -365,7 +352,20 @@ def _plan_text(summary: Mapping[str, Any]) -> str:
     lines = plan_lines(plan)
     if "plan_digits" in summary:
         lines.append(f"{summary['plan_digits']} (digits of its motions, as in a saved plan's name)")
-    return "\n".join(f"plan: {escaped(line)}" for line in lines)
+    lines = [f"plan: {escaped(line)}" for line in lines]
+    if summary.get("achieved") is not None:
+        lines.append(_text_of(motion_blocks(summary)))
+    return "\n".join(lines)
+
+
+def _text_of(blocks: Iterable[Note | Table]) -> str:
+    """Parts of a report as lines for the terminal."""
+    return _shown("\n".join(block.text for block in blocks))
+
+
+def _shown(text: str) -> str:
+    """The lines of a text without control characters."""
+    return "\n".join(escaped(line) for line in text.split("\n"))
 
 
 def _prediction_text(entry: dict[str, Any]) -> str:
@@ -379,34 +379,12 @@ def _prediction_text(entry: dict[str, Any]) -> str:
         gap = "unknown" if entry["contact_gap"] is None else f"{entry['contact_gap']:.1e} mm"
         lines.append(f"  contact     {entry['contact_iterations']} iterations, largest gap {gap}")
     lines += [
-        *band_lines(entry["band"]),
         f"  skin moves  {skin['mean']:.2f} mm on average, {skin['largest']:.2f} mm at most",
         f"  time        {sum(entry['timings'].values()):.1f} s from the files to the face",
         f"  written     {escaped(entry['output'])}: {', '.join(entry['files'])}",
     ]
-    return "\n".join(lines)
-
-
-def _study_text(found: StudyReport) -> str:
-    models = found.cohort.models
-    lines = [f"{escaped(found.cohort.name)}: mean error over the face, mm"]
-    if found.cohort.note:
-        lines.append(escaped(found.cohort.note))
-    lines.append("  case         " + "".join(f"{m:>8}" for m in (*models, "still")) + "  outcome")
-    for outcome in found.outcomes:
-        cells = ""
-        for model in (*models, None):
-            entry = (
-                outcome.evaluation.get("no_change")
-                if model is None
-                else outcome.evaluation.get("models", {}).get(model)
-            )
-            mean = "–" if entry is None else f"{entry['regions']['whole']['mean_mm']:.2f}"
-            cells += f"{mean:>8}"
-        lines.append(f"  {escaped(outcome.name):<12} {cells}  {outcome.status}")
-    for outcome in found.outcomes:
-        warnings = outcome.evaluation.get("warnings", ())
-        lines += [f"  {escaped(outcome.name)}: {escaped(warning)}" for warning in warnings]
+    if entry["band"] is not None:
+        lines.append(_text_of(band_blocks(entry["band"])))
     return "\n".join(lines)
 
 
@@ -414,35 +392,6 @@ def _print_failed(failed: Mapping[str, str]) -> None:
     """Prints which of several models have no result; the others were written."""
     for model, reason in failed.items():
         print(f"cmfsim: error: model {model}: {escaped(reason)}", file=sys.stderr)
-
-
-def achieved_text(achieved: Mapping[str, Any]) -> str:
-    """The motion of each segment in the operation, as in Table 2 of Kim et al. (2010)."""
-    lines = ["achieved plan: motion of each segment's middle, mm (L, P, S), and rotation about it"]
-    for name, found in achieved["segments"].items():
-        shift = " ".join(f"{c:+6.2f}" for c in found["translation_mm"])
-        axis = ", ".join(f"{c:+.2f}" for c in found["axis"])
-        how = (
-            f"vertex by vertex, {found['rms_mm']:.2f} mm rms from a rigid motion"
-            if found["method"] == "vertices"
-            else f"registered to the bone within {found['rms_mm']:.2f} mm rms "
-            f"({found['share']:.0%} of it)"
-        )
-        lines.append(
-            f"  {escaped(name):<14} {shift}  {found['angle_degrees']:5.2f}° about ({axis}), {how}"
-            f"{_size_text(found.get('shape'))}"
-        )
-    return "\n".join(lines)
-
-
-def _size_text(shape: Mapping[str, Any] | None) -> str:
-    """The size after with its interval, and how many directions the shape leaves open."""
-    if shape is None:
-        return ""
-    low, high = shape["scale_interval"]
-    n_open = len(shape["open"])
-    left = f"; {n_open} of 6 directions open" if n_open else ""
-    return f", size {shape['scale']:.3f} ({low:.3f} to {high:.3f}){left}"
 
 
 def _print_report(folder: Path, name: str | None) -> None:

@@ -5,12 +5,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from cmfsim.cli.text.terminal import escaped
+from cmfsim.report import Table
 from cmfsim.values.mesh_report import MeshReport
 
 # Columns of the text in a pipe, and at most on a terminal.
 WIDTH = 100
 # Columns before the values, as in the lines of `MeshReport.as_text`.
 INDENT = 14
+# Distances of a contact surface from the bone beneath.
+AWAY = ("mean", "p95", "max")
 
 
 def build_text(summary: Mapping[str, Any], *, width: int = WIDTH) -> str:
@@ -37,26 +40,18 @@ def build_text(summary: Mapping[str, Any], *, width: int = WIDTH) -> str:
 
 
 def _nodes(summary: Mapping[str, Any]) -> list[str]:
-    counts = summary["nodes"]
-    kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    names = [escaped(name) for name in summary["segments"]]
-    wide = max([len("segment"), *map(len, names)])
-    lines = [f"nodes         {kinds}", f"  {'segment':<{wide}}    joined   sliding"]
-    for name, held in zip(names, summary["segments"].values(), strict=True):
-        lines.append(f"  {name:<{wide}} {held['joined']:9d} {held['sliding']:9d}")
-    return lines + _contacts(summary, wide)
-
-
-def _contacts(summary: Mapping[str, Any], wide: int) -> list[str]:
-    """The surfaces that nodes slide on, and their distance from the bone beneath."""
-    contacts = summary.get("contact", {})
-    if not contacts:
-        return []
-    lines = [f"contact       {'':<{max(wide - 12, 0)}} departure from bone, mm: mean, P95, largest"]
-    for name, contact in contacts.items():
-        away = [f"{contact[f'departure_{key}']:9.2f}" for key in ("mean", "p95", "max")]
-        lines.append(f"  {escaped(name):<{wide}}{''.join(away)}  {contact['surface']}")
-    return lines
+    """Nodes on each segment, and how far contact surfaces are from the bone beneath."""
+    kinds = ", ".join(f"{count} {kind}" for kind, count in summary["nodes"].items())
+    held = tuple((n, str(s["joined"]), str(s["sliding"])) for n, s in summary["segments"].items())
+    tables = [Table(("segment", "joined", "sliding"), held, f"nodes         {kinds}")]
+    if summary.get("contact"):
+        rows = tuple(
+            (name, *(f"{found[f'departure_{key}']:.2f}" for key in AWAY), found["surface"])
+            for name, found in summary["contact"].items()
+        )
+        caption = "contact       departure from bone, mm"
+        tables.append(Table(("segment", *AWAY, "surface"), rows, caption))
+    return [escaped(line) for table in tables for line in table.text.split("\n")]
 
 
 def _times(timings: Mapping[str, float]) -> list[str]:
