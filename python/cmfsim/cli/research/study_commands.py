@@ -107,11 +107,10 @@ def _at_least_one(
     predictions: Iterable[Prediction], failed: Mapping[str, CmfsimError]
 ) -> Iterator[Prediction]:
     """The predictions, or the first error if there are none."""
-    found = False
+    prediction: Prediction | None = None
     for prediction in predictions:
-        found = True
         yield prediction
-    if not found:
+    if prediction is None:
         raise next(iter(failed.values()))
 
 

@@ -17,19 +17,7 @@ AWAY = ("mean", "p95", "max")
 
 
 def build_text(summary: Mapping[str, Any], *, width: int = WIDTH) -> str:
-    """The summary of a model as lines: nodes, mesh, time per stage, files.
-
-    Parameters
-    ----------
-    summary : mapping
-        Of a `PatientModel` that was written.
-    width : int
-        Columns at which names of files wrap.
-
-    Returns
-    -------
-    str
-    """
+    """The summary of a `PatientModel` that was written: nodes, mesh, time per stage, files."""
     parts = [
         [f"case          {escaped(summary['case'])}", *_nodes(summary)],
         MeshReport(**summary["mesh"]).as_text().splitlines(),
