@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Callable, Iterable
 
-from cmfsim.values.finding import SEVERITIES, Finding
+from cmfsim.values.finding import Finding, counted
 
 # ANSI colours of the severities: red, yellow, blue.
 COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}
@@ -33,20 +33,17 @@ def findings_text(
     findings = list(findings)
     lines: list[str] = []
     for finding in findings:
-        head = finding.severity
-        if colour:
-            head = f"\x1b[{COLOURS[finding.severity]}m{head}\x1b[0m"
+        head = severity_text(finding.severity, colour=colour)
         lines.append(f"{head}: {escape(finding.where or 'case')}: [{finding.code}]")
         for label, text in (("", finding.what), ("why: ", finding.why), ("fix: ", finding.fix)):
             if text:
                 lines += _wrapped(label, escape(text), width)
-    counts = [
-        f"{count} {severity}{'' if count == 1 else 's'}"
-        for severity in SEVERITIES
-        if (count := sum(finding.severity == severity for finding in findings))
-    ]
-    lines.append(", ".join(counts) if counts else "nothing found")
-    return "\n".join(lines)
+    return "\n".join([*lines, counted(findings) or "nothing found"])
+
+
+def severity_text(severity: str, *, colour: bool) -> str:
+    """A severity, in its colour if wanted."""
+    return f"\x1b[{COLOURS[severity]}m{severity}\x1b[0m" if colour else severity
 
 
 def _wrapped(label: str, text: str, width: int) -> list[str]:

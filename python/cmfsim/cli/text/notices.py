@@ -6,12 +6,10 @@ from dataclasses import asdict
 from typing import Any
 
 from cmfsim.cli.text.terminal import CLEAR_LINE, escaped, in_colour
+from cmfsim.doctor.report import severity_text
 from cmfsim.errors import CmfsimError
 from cmfsim.values.finding import Finding, FindingGroup, counted, grouped
 from cmfsim.values.observer import Observer
-
-# ANSI colours of what is printed.
-COLOURS = {"error": "31;1", "warning": "33;1", "note": "34"}
 
 
 class FindingsError(Exception):
@@ -81,9 +79,7 @@ class Notices(Observer):
 
 
 def _head(group: FindingGroup) -> str:
-    if in_colour(sys.stderr):
-        return f"\x1b[{COLOURS[group.severity]}m{group.severity}\x1b[0m"
-    return group.severity
+    return severity_text(group.severity, colour=in_colour(sys.stderr))
 
 
 def _print(line: str) -> None:
