@@ -367,8 +367,7 @@ def _ready(
     """The surface and the fibres of a muscle, ready for the core."""
     try:
         if isinstance(muscle, MuscleSurface):
-            surface = muscle.surface.searched
-            return surface, MuscleFibres(surface, muscle.kind, muscle.boxes, muscle.course)
+            return muscle.surface.searched, muscle.fibres()
         surface = muscle if isinstance(muscle, Surface) else muscle.searched
         return surface, MuscleFibres(surface)
     except MeshError as error:

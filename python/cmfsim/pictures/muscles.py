@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cmfsim._core import MuscleFibres, Surface
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, Shown, View, bounds, draw, polydata
 from cmfsim.values.checks import Floats
@@ -135,8 +134,7 @@ def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
     """Fibre strokes and box edges as pairs of points, and the colour of the boxes."""
     vertices = muscle.surface.vertices
     triangles = muscle.surface.triangles.astype(np.int64)
-    surface = Surface(vertices, triangles)
-    fibres = MuscleFibres(surface, muscle.kind, muscle.boxes, muscle.course)
+    fibres = muscle.fibres()
     every = max(1, len(triangles) // STROKES)
     corners = vertices[triangles[::every]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

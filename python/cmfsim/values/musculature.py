@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim._core import MOST_BOXES
+from cmfsim._core import MOST_BOXES, MuscleFibres
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.values.checks import Floats, Frozen, as_rows, as_text, check_instance, check_one_of
 from cmfsim.values.finding import Finding
@@ -83,6 +83,10 @@ class MuscleSurface(Frozen):
                 raise CaseInputError(f"course {i} of {self.name} has one point: two are needed")
             lines.append(points)
         object.__setattr__(self, "course", tuple(lines))
+
+    def fibres(self) -> MuscleFibres:
+        """How its fibres run: by their lines, by boxes, or by its shape."""
+        return MuscleFibres(self.surface.searched, self.kind, self.boxes, self.course)
 
 
 @dataclass(frozen=True, eq=False)
