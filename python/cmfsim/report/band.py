@@ -48,13 +48,7 @@ def band_section(band: Values, figures: list[Figure]) -> Section:
 
 
 def band_blocks(band: Values) -> tuple[Note, Table]:
-    """What the band is worth, and half widths by region, with the calibration of each.
-
-    Parameters
-    ----------
-    band : mapping
-        `SkinBand.as_dict()`.
-    """
+    """What the band is worth, and half widths by region, with the calibration of each."""
     percent = f"{100 * band['coverage']:g} %"
     if band["state"] == "uncalibrated":
         text = UNCALIBRATED.format(factor=band["factor_uncalibrated"], percent=percent)

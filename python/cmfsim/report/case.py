@@ -210,13 +210,7 @@ def _band_sections(shown: Values, pictures: Mapping[str, bytes]) -> list[Section
 
 
 def motion_blocks(prediction: Values) -> list[Note | Table]:
-    """The motion of each segment, and how well it was measured where it was.
-
-    Parameters
-    ----------
-    prediction : mapping
-        What `prediction.json` holds.
-    """
+    """The motion of each segment, and how well it was measured where it was."""
     rows, bent = [], []
     for name, motion in prediction["plan"].items():
         if "translation" in motion:

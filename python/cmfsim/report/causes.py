@@ -67,12 +67,7 @@ def thickness_blocks(evaluation: Values) -> list[Note | Table]:
 
 
 def summary_blocks(evaluation: Values) -> list[Note | Table]:
-    """The errors of each model over the whole face, and those of no model.
-
-    Parameters
-    ----------
-    evaluation : mapping
-    """
+    """The errors of each model over the whole face, and those of no model."""
     entries = {**evaluation["models"], "no change": evaluation["no_change"]}
     whole = {name: entry["regions"]["whole"] for name, entry in entries.items()}
     return [

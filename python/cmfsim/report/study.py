@@ -81,18 +81,13 @@ def table3_text(study: Values, table: ErrorTable) -> str:
 
 
 def study_text(study: Values) -> str:
-    """The errors of a study and its doubtful cases, as plain text.
-
-    Parameters
-    ----------
-    study : mapping
-        `StudyReport.as_dict()`.
-    """
+    """The errors of a study (`StudyReport.as_dict()`) and its doubtful cases, as plain text."""
     done = [case for case in study["cases"] if case["status"] != "failed"]
     blocks = [study["note"]] if study["note"] else []
-    parts = (*_error_blocks(done, tuple(study["models"])), _case_table(study["cases"]))
+    parts = (*_error_blocks(done, tuple(study["models"])), *_case_blocks(study["cases"], ()))
     blocks += [part.text for part in parts]
-    blocks += ["\n  ".join((alert.line, *alert.details)) for alert in _alerts(study["cases"])]
+    doubts = [alert for alert in _alerts(study["cases"]) if alert.kind == "warning"]
+    blocks += ["\n  ".join((alert.line, *alert.details)) for alert in doubts]
     return "\n".join(blocks)
 
 
@@ -215,15 +210,9 @@ def _paper_table(models: tuple[str, ...]) -> Table:
 
 
 def _case_blocks(cases: Sequence[Values], failed: Sequence[Values]) -> tuple[Note | Table, ...]:
-    return (
-        _case_table(cases),
-        *(Note(f"{case['name']} failed: {case['error']}", "error") for case in failed),
-    )
-
-
-def _case_table(cases: Sequence[Values]) -> Table:
-    rows = tuple((case["name"], case["status"], number(case["seconds"], 0)) for case in cases)
-    return Table(("case", "outcome", "time, s"), rows, "How each case ended.")
+    rows = tuple((case["name"], case["status"], f"{case['seconds']:.0f}") for case in cases)
+    table = Table(("case", "outcome", "time, s"), rows, "How each case ended.")
+    return (table, *(Note(f"{case['name']} failed: {case['error']}", "error") for case in failed))
 
 
 def _mean_sd(entry: Values | None) -> str:

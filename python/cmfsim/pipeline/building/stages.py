@@ -102,15 +102,7 @@ class BuildOptions:
 
 @contextlib.contextmanager
 def build_options(given: BuildKeywords, expected: Mapping[str, float]) -> Iterator[BuildOptions]:
-    """The options that a function was given; meanwhile `progress=True` shows a bar.
-
-    Parameters
-    ----------
-    given : mapping
-        The keywords of the function.
-    expected : mapping of str to float, s
-        Its stages with their typical seconds.
-    """
+    """The options that a function was given; `progress=True` shows a bar of expected stages."""
     if given.get("progress") is not True:
         yield BuildOptions(**given)
         return
