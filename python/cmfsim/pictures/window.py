@@ -138,7 +138,8 @@ def view_parts(
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
     if path is None and not has_screen():
         raise CaseInputError(
-            "there is no screen for a window: write a picture instead (screenshot FILE.png)"
+            "there is no screen for a window: write a picture instead (--screenshot FILE.png, or "
+            'screenshot="FILE.png" in Python)'
         )
     width, height = (int(as_positive("window size", n)) for n in size)
     pv = pyvista_module()
