@@ -15,7 +15,7 @@ def names_table() -> str:
     rows = ["| names | point | in cephalometry | in cmfsim |", "|---|---|---|---|"]
     for entry in CEPHALOMETRY:
         labels = SKULL_LANDMARKS if entry.kind == "skull" else SKIN_LANDMARKS
-        site = f"`{entry.site}`" if entry.site else "not used"
+        site = f"`{entry.site}`" if entry.site else "measures only"
         if f"{entry.site}_L" in labels:
             site += ", L and R"
         if entry.kind == "skin":

@@ -184,10 +184,13 @@ from cmfsim.pipeline.planning import make_planning_page as make_planning_page
 from cmfsim.pipeline.predicting import predict as predict
 from cmfsim.pipeline.predicting import predict_models as predict_models
 from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks
+from cmfsim.planning.face_measures import CEPHALOMETRIC_MEASURES as CEPHALOMETRIC_MEASURES
 from cmfsim.planning.face_measures import MEASURES as MEASURES
 from cmfsim.planning.face_measures import BoneSite as BoneSite
 from cmfsim.planning.face_measures import FaceSites as FaceSites
 from cmfsim.planning.face_measures import Measure as Measure
+from cmfsim.planning.face_measures import cephalometry as cephalometry
+from cmfsim.planning.face_measures import clinical_figures as clinical_figures
 from cmfsim.planning.face_measures import face_sites as face_sites
 from cmfsim.planning.face_measures import measure_face as measure_face
 from cmfsim.planning.face_measures import measure_sites as measure_sites

@@ -20,6 +20,7 @@ from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.landmark_sites import is_for_measures
 from cmfsim.values.moduli import FatModuli, moduli_unusual
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
@@ -358,7 +359,7 @@ def _landmarks(
         )
         return {}
     findings.extend(found.findings)
-    return found.points
+    return {name: place for name, place in found.points.items() if not is_for_measures(name)}
 
 
 def _check_motion_files(case: Case, name: str, motion: CaseMotion, findings: list[Finding]) -> None:

@@ -10,6 +10,7 @@ from functools import cache
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cmfsim.errors import LandmarkInputError
 from cmfsim.values.checks import Floats
@@ -201,7 +202,8 @@ class CephalometricSite:
     name : str
         In words.
     site : str
-        Of `SKULL_LANDMARKS` or `SKIN_LANDMARKS` without its side; empty if cmfsim does not use it.
+        Of `SKULL_LANDMARKS` or `SKIN_LANDMARKS` without its side; empty if only `cephalometry`
+        uses it.
     where : str
         Its definition in cephalometry.
     """
@@ -295,6 +297,12 @@ CEPHALOMETRY: tuple[CephalometricSite, ...] = (
         ("L1", "LR1O", "LL1O"), "skull", "lower incisor", "", "edge of the lower central incisor"
     ),
     CephalometricSite(
+        ("U1R", "UR1R", "UL1R"), "skull", "root of the upper incisor", "", "tip of its root"
+    ),
+    CephalometricSite(
+        ("L1R", "LR1R", "LL1R"), "skull", "root of the lower incisor", "", "tip of its root"
+    ),
+    CephalometricSite(
         ("U6", "UR6O", "UL6O", "UR6MB", "UL6MB"),
         "skull",
         "upper first molar",
@@ -346,6 +354,37 @@ def short_name(kind: str, site: str) -> str:
 def site_labels(kind: str, site: str) -> tuple[str, ...]:
     """All labels that stand for a site, as `label_key` spells them."""
     return tuple(key for key, name in _labels(kind).items() if name == site)
+
+
+def profile_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
+    """The sites of a skull as a lateral view shows them: both sides of a pair at their middle.
+
+    Labels are those of `SKULL_LANDMARKS` or any abbreviations of `CEPHALOMETRY`. Sites are named by
+    their first abbreviation ("N", "Go"), or by their label without a side.
+    """
+    short = _short_labels()
+    found: dict[str, list[Floats]] = {}
+    for label, place in landmarks.items():
+        name = short.get(label_key(label), _plain(label))
+        found.setdefault(name, []).append(np.asarray(place, dtype=np.float64))
+    return {name: np.mean(places, axis=0) for name, places in found.items()}
+
+
+def is_for_measures(label: str) -> bool:
+    """Whether a label stands for a site that measures alone use: it may lie off the bone."""
+    short = _short_labels().get(label_key(label))
+    return any(entry.short[0] == short and not entry.site for entry in CEPHALOMETRY)
+
+
+@cache
+def _short_labels() -> Mapping[str, str]:
+    """The first abbreviation of each label of the skull, with a side or without."""
+    found: dict[str, str] = {}
+    for entry in (e for e in CEPHALOMETRY if e.kind == "skull"):
+        for word in filter(None, (entry.site, *entry.short)):
+            for label in (word, *_sided(word, "_L"), *_sided(word, "_R")):
+                found.setdefault(label_key(label), entry.short[0])
+    return MappingProxyType(found)
 
 
 @cache

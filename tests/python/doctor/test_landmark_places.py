@@ -268,3 +268,11 @@ procedure = "le_fort_1"
         (tmp_path / "skull.mrk.json").write_text(json.dumps(markup), encoding="utf-8")
         told = [f.code for f in cmfsim.diagnose(cmfsim.Case.load(path)) if f.severity != "note"]
         assert [c for c in told if c in checks.LANDMARK_CODES - {"landmark-far"}] == expected
+
+
+def test_sites_that_measures_alone_use_may_lie_off_the_bone(tmp_path):
+    made = HeadCase()
+    at_rest = cmfsim.examine(cmfsim.Case.load(made.write(tmp_path))).findings
+    made.skull["S"] = np.array([0.0, 0.0, 20.0])
+    found = cmfsim.examine(cmfsim.Case.load(made.write(tmp_path))).findings
+    assert [finding.code for finding in found] == [finding.code for finding in at_rest]

@@ -180,9 +180,12 @@ def test_what_few_clicks_leave_is_found_and_the_clicks_stay(found, case):
     placed = {name: points[name] + [1.0, 0.0, 0.0] for name in UPPER_ROW}
     assert is_to_be_found(case, {"skull": placed})
     assert not is_to_be_found(case, {"skull": dict(list(points.items())[:12])})
-    head, (finding,) = found(points, case, placed)
+    sella = np.array([0.0, -200.0, 450.0])
+    head, (finding,) = found(points, case, {**placed, "S": sella})
     assert finding.code == "landmarks-filled"
-    assert set(head.skull) == set(points)
+    # A site that measures alone use is neither found nor moved.
+    assert set(head.skull) == {*points, "S"}
+    np.testing.assert_array_equal(head.skull["S"], sella)
     # They are brought onto the bone where they lie beside it.
     assert all(np.linalg.norm(head.skull[n] - place) <= 1.0 for n, place in placed.items())
 

@@ -12,6 +12,7 @@ from cmfsim.values.landmark_sites import (
     SKIN_LANDMARKS,
     SKIN_SITES,
     SKULL_LANDMARKS,
+    is_for_measures,
     named_site,
     short_name,
     site_labels,
@@ -59,6 +60,15 @@ def test_labels_of_cephalometry_are_read(label, kind, site):
 def test_a_paired_site_without_its_side_is_an_error(label):
     with pytest.raises(cmfsim.LandmarkError, match="does not state its side"):
         named_site(label, "skull")
+
+
+@pytest.mark.parametrize(
+    ("label", "alone"),
+    [("S", True), ("po left", True), ("UR1R", True), ("LGo", False), ("x", False)],
+)
+def test_sites_that_measures_alone_use_are_known(label, alone):
+    assert is_for_measures(label) == alone
+    assert not any(is_for_measures(name) for name in SKULL_LANDMARKS)
 
 
 def test_the_sites_of_the_table_are_sites():

@@ -32,6 +32,10 @@ class Measure:
         Arguments of the formula, in order.
     about : str
         Description.
+    norm : str
+        Mean ± standard deviation of adults without deformity, as published; empty if none is given.
+    source : str
+        Author and year of the norm.
 
     Examples
     --------
@@ -46,6 +50,8 @@ class Measure:
     formula: str
     sites: tuple[str, ...]
     about: str
+    norm: str = ""
+    source: str = ""
 
 
 def _angle(a: Floats, vertex: Floats, b: Floats) -> float:
@@ -81,6 +87,8 @@ MEASURES = (
         "angle",
         ("columella", "subnasale", "labiale_superius"),
         "at subnasale, between columella and labiale superius",
+        "102 ± 8",
+        "Legan and Burstone 1980",
     ),
     Measure(
         "mentolabial_angle",
@@ -97,6 +105,8 @@ MEASURES = (
         "angle",
         ("glabella", "subnasale", "pogonion"),
         "at subnasale, between glabella and pogonion; 180° is straight",
+        "168 ± 4",
+        "Legan and Burstone 1980",
     ),
     Measure(
         "upper_lip_to_e_line",
@@ -121,6 +131,8 @@ MEASURES = (
         "height",
         ("stomion_superius", "upper_incisor"),
         "height of the upper lip's edge above the edge of the upper incisors",
+        "2 ± 2",
+        "Legan and Burstone 1980",
     ),
     Measure(
         "interlabial_gap",
@@ -129,6 +141,8 @@ MEASURES = (
         "height",
         ("upper_lip_edge", "lower_lip_edge"),
         "height from the edge of the lower lip to that of the upper lip",
+        "2 ± 2",
+        "Legan and Burstone 1980",
     ),
     Measure(
         "middle_third",

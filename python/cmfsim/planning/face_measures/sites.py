@@ -18,10 +18,13 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
+from cmfsim.values.skin_motion import carried_points
+from cmfsim.values.surface_data import MovedSurface
 
 UPPER_INCISOR = "upper_incisor"
-# Segments that may bear the upper teeth, the smallest first.
+# Segments that may bear the upper and the lower teeth, the smallest first.
 UPPER_BEARERS = ("maxilla", "midface", "cranium", "skull")
+LOWER_BEARERS = ("mandible_body", "mandible")
 # Height of the glabella above the nasion, mm.
 GLABELLA = (8.0, 35.0)
 # Largest distance of menton behind pogonion, mm; range below it in which the throat is found, mm.
@@ -29,14 +32,15 @@ MENTON_BEHIND = 25.0
 THROAT_BELOW = 45.0
 # Shortest profile below menton from which the angle of the throat is determined, mm.
 LEAST_THROAT = 20.0
-# Largest distances of the edge of an incisor from supradentale, mm: sideways, in depth, below.
-INCISOR_SIDE, INCISOR_DEPTH, INCISOR_BELOW = 5.0, 9.0, 14.0
+# Largest distances of the edge of an incisor from the edge of the bone, mm: sideways, in depth,
+# along the crown.
+INCISOR_SIDE, INCISOR_DEPTH, INCISOR_LENGTH = 5.0, 9.0, 14.0
 # The edge of a lip is its furthest point towards the other lip; what lies deeper counts for less by
 # this share of its depth, so that it is not sought inside the mouth.
 LIP_DEPTH = 0.5
 # Lips whose edges are closer than this, mm, are closed: their skin is connected and cannot open.
 LEAST_GAP = 0.3
-# Smallest length of an incisor below the edge of the bone, mm.
+# Smallest length of an incisor from the edge of the bone, mm.
 LEAST_CROWN = 3.0
 
 
@@ -128,7 +132,7 @@ def face_sites(patient: PatientModel) -> FaceSites:
                 absent[name] = str(error)
     found = [name for name in on_profile if name in skin]
     try:
-        bone[UPPER_INCISOR] = _upper_incisor(patient)
+        bone[UPPER_INCISOR] = incisor_edge(patient, "supradentale", UPPER_BEARERS)
         found.append(UPPER_INCISOR)
     except LandmarkInputError as error:
         absent[UPPER_INCISOR] = str(error)
@@ -164,11 +168,23 @@ def measure_face(prediction: Prediction, sites: FaceSites | None = None) -> dict
     if names:
         before = np.array([sites.skin[name] for name in names])
         places.update(zip(names, before + prediction.carried(before), strict=True))
-    for name, site in sites.bone.items():
-        motion = np.asarray(prediction.scene.plan.get(site.segment, np.eye(4)), dtype=np.float64)
-        if motion.shape == (4, 4):
-            places[name] = motion[:3, :3] @ site.place + motion[:3, 3]
+    places.update(moved_bone_sites(prediction, sites.bone))
     return measure_sites(places)
+
+
+def moved_bone_sites(prediction: Prediction, bone: Mapping[str, BoneSite]) -> dict[str, Floats]:
+    """Sites of bone after the operation, (3,) mm each; without those whose motion is not known."""
+    found = {}
+    for name, site in bone.items():
+        motion = prediction.scene.plan.get(site.segment)
+        if motion is None:
+            found[name] = site.place
+        elif isinstance(motion, MovedSurface):
+            shifts = motion.moved_vertices - motion.surface.vertices
+            found[name] = site.place + carried_points(motion.surface, shifts, site.place[None])[0]
+        elif motion.shape == (4, 4):
+            found[name] = motion[:3, :3] @ site.place + motion[:3, 3]
+    return found
 
 
 def _at(profile: Floats, known: Mapping[str, Floats], name: str) -> int:
@@ -303,31 +319,38 @@ _FINDERS: Mapping[str, Callable[[Floats, Mapping[str, Floats]], Floats]] = {
 }
 
 
-def _upper_incisor(patient: PatientModel) -> BoneSite:
-    """The edge of the upper central incisors: the lowest point of the bone below supradentale."""
+def incisor_edge(patient: PatientModel, root: str, bearers: tuple[str, ...]) -> BoneSite:
+    """The edge of the central incisors: the furthest point of the bone along their crown.
+
+    That begins at `root`, "supradentale" or "infradentale"; the bearers are `UPPER_BEARERS` or
+    `LOWER_BEARERS`. LandmarkError (also `ValueError`) if the case or the bone does not show it.
+    """
     skull = patient.landmarks.get("skull", {})
-    if "supradentale" not in skull:
-        raise LandmarkInputError("the case has no skull landmark supradentale")
-    root = skull["supradentale"]
-    bearer = _upper_bearer(patient.segments)
-    vertices = bearer.surface.vertices
-    away = vertices - root
-    near = vertices[
+    if root not in skull:
+        raise LandmarkInputError(f"the case has no skull landmark {root}")
+    upper = bearers == UPPER_BEARERS
+    bearer = _bearer(patient.segments, bearers)
+    away = bearer.surface.vertices - skull[root]
+    along = -away[:, 2] if upper else away[:, 2]
+    near = (
         (np.abs(away[:, 0]) <= INCISOR_SIDE)
         & (np.abs(away[:, 1]) <= INCISOR_DEPTH)
-        & (away[:, 2] <= 0.0)
-        & (away[:, 2] >= -INCISOR_BELOW)
-    ]
-    if not len(near) or root[2] - near[:, 2].min() < LEAST_CROWN:
+        & (along >= 0.0)
+        & (along <= INCISOR_LENGTH)
+    )
+    if along[near].max(initial=0.0) < LEAST_CROWN:
         raise LandmarkInputError(
-            f"the surface of {bearer.name} shows no incisor below supradentale"
+            f"the surface of {bearer.name} shows no incisor {'below' if upper else 'above'} {root}"
         )
-    return BoneSite(near[np.argmin(near[:, 2])], bearer.name)
+    edge = int(np.argmax(np.where(near, along, -np.inf)))
+    return BoneSite(bearer.surface.vertices[edge], bearer.name)
 
 
-def _upper_bearer(segments: tuple[BoneSegment, ...]) -> BoneSegment:
+def _bearer(segments: tuple[BoneSegment, ...], bearers: tuple[str, ...]) -> BoneSegment:
     by_name = {segment.name: segment for segment in segments}
-    for name in UPPER_BEARERS:
+    for name in bearers:
         if name in by_name:
             return by_name[name]
-    raise LandmarkInputError("no segment carries the upper teeth")
+    raise LandmarkInputError(
+        f"no segment carries the {'upper' if bearers == UPPER_BEARERS else 'lower'} teeth"
+    )

@@ -16,7 +16,7 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import FEW_SITES
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
-from cmfsim.values.landmark_sites import is_lower_site
+from cmfsim.values.landmark_sites import is_for_measures, is_lower_site
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 
 # Found sites of which one lies farther than this from where it was placed, mm, are of no use:
@@ -37,7 +37,8 @@ def is_to_be_found(case: Case, placed: Mapping[str, Mapping[str, Floats]]) -> bo
     if case.landmarks.proposed:
         return not placed
     is_needed = case.muscles is not None or any(cut.procedure for cut in case.osteotomies)
-    return is_needed and case.landmarks.is_completed(len(placed.get("skull", {})))
+    count = sum(not is_for_measures(name) for name in placed.get("skull", {}))
+    return is_needed and case.landmarks.is_completed(count)
 
 
 def found_landmarks(
@@ -88,7 +89,8 @@ def found_landmarks(
         stages.add([_not_found(reason, len(skull))])
         return Head(case, placed, anatomy)
     found = filled_landmarks(head, read_placed_sites(case)) if placed else head.landmarks
-    points = dict(found.points)
+    # Sites that only measures use, such as sella, are not among those found.
+    points = {kind: {**placed.get(kind, {}), **sites} for kind, sites in found.points.items()}
     findings = found.findings
     read, anatomy = anatomy, head.anatomy
     if found.impossible_jaw and case.image is not None:

@@ -1,0 +1,170 @@
+"""Cephalometry: angles and distances of the jaws and incisors in the lateral view.
+
+Sites are projected onto the midsagittal plane, pairs at their middle, and named by their
+abbreviations (`cmfsim.values.landmark_sites.CEPHALOMETRY`). Lengths are not enlarged, as those of a
+radiograph are.
+
+The occlusal plane runs through the middle of the edges of upper and lower incisors and the middle
+of the first molars, where these sites are given; otherwise it is estimated from the edges of the
+bone, `supradentale` and `infradentale`, `supra_m2` and `sub_m2`. The Frankfort plane runs through
+porion and orbitale; without porion it is that of the average head, registered to the cranium.
+"""
+
+import contextlib
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim._core import rigid_fit
+from cmfsim.errors import RegistrationError
+from cmfsim.planning.face_measures.definitions import Measure
+from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, profile_sites
+
+# Sites that are constructed: points of the Frankfort plane and of the occlusal plane.
+FRANKFORT, OCCLUSAL = ("FH-back", "FH-front"), ("OP-back", "OP-front")
+# The pairs of sites in whose middle the points of the occlusal plane lie, the best first.
+BITES = ((("U6", "L6"), ("U1", "L1")), (("supra_m2", "sub_m2"), ("Pr", "Id")))
+
+
+def _turn(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
+    """The angle from the direction a→b to c→d, degrees; positive from down to forwards."""
+    u, v = b - a, d - c
+    return float(np.degrees(np.arctan2(u[0] * v[1] - u[1] * v[0], u @ v)))
+
+
+def _along(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
+    """How much further `c` lies along the direction a→b than `d`, mm."""
+    return float((b - a) @ (c - d) / np.hypot(*(b - a)))
+
+
+def _across(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
+    """How far `c` lies to the left of a→b from `d`, mm: ahead of a line that runs down."""
+    (x, y), (v, w) = b - a, c - d
+    return float((x * w - y * v) / np.hypot(x, y))
+
+
+# Of points (forwards, up), (2,) mm, with what they give in words.
+_FORMULAS: Mapping[str, tuple[Callable[[Floats, Floats, Floats, Floats], float], str]] = {
+    "turn": (_turn, "angle from {}–{} to {}–{}"),
+    "along": (_along, "along {}–{}, {} in front of {}"),
+    "across": (_across, "across {0}–{1}, from {3} to {2}; positive in front or above"),
+}
+# Steiner: Am J Orthod 39:729–755; Downs: Am J Orthod 34:812–840; Jacobson: Am J Orthod 67:125–138.
+_STEINER, _DOWNS, _JACOBSON = "Steiner 1953", "Downs 1948", "Jacobson 1975"
+_WITS = "men −1.2 ± 1.9, women −0.1 ± 1.8"
+CEPHALOMETRIC_MEASURES = tuple(
+    Measure(key, label, unit, formula, tuple(sites.split()),
+            _FORMULAS[formula][1].format(*sites.split()), norm, source)
+    for key, label, unit, formula, sites, norm, source in (
+        ("sna", "SNA", "°", "turn", "N S N A", "82", _STEINER),
+        ("snb", "SNB", "°", "turn", "N S N B", "80", _STEINER),
+        ("anb", "ANB", "°", "turn", "N B N A", "2", _STEINER),
+        ("wits", "Wits", "mm", "along", "OP-back OP-front A B", _WITS, _JACOBSON),
+        ("convexity", "Convexity N-A-Pog", "°", "turn", "A Pog N A", "0 ± 5.1", _DOWNS),
+        ("facial_angle", "Facial angle", "°", "turn", "FH-front FH-back N Pog",
+         "87.8 ± 3.6", _DOWNS),
+        ("mandibular_plane", "Mandibular plane to FH", "°", "turn", "Go Me FH-back FH-front",
+         "21.9 ± 3.2", _DOWNS),
+        ("sn_gogn", "Mandibular plane to SN", "°", "turn", "Go Gn S N", "32", _STEINER),
+        ("occlusal_plane", "Occlusal plane to FH", "°", "turn",
+         "OP-back OP-front FH-back FH-front", "9.3 ± 3.8", _DOWNS),
+        ("u1_na", "U1 to NA", "°", "turn", "N A U1R U1", "22", _STEINER),
+        ("u1_na_mm", "U1 to NA", "mm", "across", "N A U1 N", "4", _STEINER),
+        ("l1_nb", "L1 to NB", "°", "turn", "L1R L1 B N", "25", _STEINER),
+        ("l1_nb_mm", "L1 to NB", "mm", "across", "N B L1 N", "4", _STEINER),
+        ("l1_mp", "L1 to mandibular plane", "°", "turn", "L1R L1 Me Go", "91.4 ± 3.8", _DOWNS),
+        ("interincisal", "Interincisal angle", "°", "turn", "U1 U1R L1 L1R",
+         "135.4 ± 5.8", _DOWNS),
+        ("overjet", "Overjet", "mm", "along", "OP-back OP-front U1 L1", "", ""),
+        ("overbite", "Overbite", "mm", "across", "OP-back OP-front L1 U1", "", ""),
+    )
+)  # fmt: skip
+
+
+def cephalometry(
+    landmarks: Mapping[str, ArrayLike], before: Mapping[str, ArrayLike] | None = None
+) -> dict[str, float | None]:
+    """The value of each of `CEPHALOMETRIC_MEASURES`; None if one of its sites is missing.
+
+    Parameters
+    ----------
+    landmarks : mapping of str to (3,) float64, mm, LPS
+        Labels of `SKULL_LANDMARKS`, or abbreviations: "S", "Po_L" and "Po_R" (or "Po"), "Gn", "U1"
+        and "L1" (edges of the central incisors), "U1R" and "L1R" (tips of their roots), "U6", "L6".
+    before : mapping of str to (3,) float64, mm, LPS, optional
+        Those before the operation, which determine the midsagittal plane and the horizontal.
+
+    Returns
+    -------
+    dict of str to float or None
+        By `Measure.key`, mm or degrees.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> sites = {"N": (0, -90, 30), "A": (0, -94, -29), "B": (0, -90, -66)}
+    >>> round(cmfsim.cephalometry(sites)["anb"], 2)
+    3.88
+    """
+    places = _projected(landmarks, before)
+    found: dict[str, float | None] = {}
+    for measure in CEPHALOMETRIC_MEASURES:
+        sites = [places[name] for name in measure.sites if name in places]
+        whole = len(sites) == len(measure.sites)
+        found[measure.key] = _FORMULAS[measure.formula][0](*sites) if whole else None
+    return found
+
+
+def missing_sites(landmarks: Mapping[str, ArrayLike], measure: Measure) -> str:
+    """The sites that a measure lacks, in words; empty if it lacks none."""
+    places = _projected(landmarks)
+    names = [name for name in dict.fromkeys(measure.sites) if name not in places]
+    return f"{', '.join(names)}: not given or found" if names else ""
+
+
+def _head_axes(landmarks: Mapping[str, ArrayLike]) -> Floats:
+    """The directions forwards and up of a head, (2, 3), in its midsagittal plane.
+
+    The plane is normal to the mean direction between the two sides of the cranium, and forwards
+    lies in the Frankfort plane of the average head registered to the cranium. With fewer than three
+    sites of it, both are those of the coordinates.
+    """
+    average = REFERENCE_PLACES["skull"]
+    names = [name for name in average if name in landmarks and not is_lower_site(name)]
+    places = {name: np.asarray(landmarks[name], dtype=np.float64) for name in names}
+    turn = np.eye(3)
+    if len(names) >= 3:
+        # Sites on a line tell no turn.
+        with contextlib.suppress(RegistrationError):
+            turn = rigid_fit([average[name] for name in names], [*places.values()]).matrix[:3, :3]
+    lefts = [name for name in names if name.endswith("_L") and f"{name[:-2]}_R" in places]
+    across = sum((places[n] - places[f"{n[:-2]}_R"] for n in lefts), np.zeros(3))
+    across = across if lefts else turn[:, 0]
+    across = across / np.linalg.norm(across)
+    forwards = -turn[:, 1] + (turn[:, 1] @ across) * across
+    forwards = forwards / np.linalg.norm(forwards)
+    return np.stack([forwards, np.cross(forwards, across)])
+
+
+def _projected(
+    landmarks: Mapping[str, ArrayLike], before: Mapping[str, ArrayLike] | None = None
+) -> dict[str, Floats]:
+    """The sites in the midsagittal plane, (forwards, up), with those that are constructed."""
+    at_rest = landmarks if before is None else before
+    plane = _head_axes(at_rest)
+    rest, places = (
+        {name: plane @ place for name, place in profile_sites(sites).items()}
+        for sites in (at_rest, landmarks)
+    )
+    for ends in BITES:
+        if all(name in places for pair in ends for name in pair):
+            middles = [0.5 * (places[upper] + places[lower]) for upper, lower in ends]
+            places.update(zip(OCCLUSAL, middles, strict=True))
+            break
+    # An orbit that is moved does not turn the horizontal.
+    given = {"Po", "Or"} <= rest.keys()
+    level = (rest["Po"], rest["Or"]) if given else (np.zeros(2), np.array([1.0, 0.0]))
+    places.update(zip(FRANKFORT, level, strict=True))
+    return places

@@ -1,0 +1,102 @@
+"""The clinical figures of a prediction: its measures before and as planned, and how sites move."""
+
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from cmfsim.errors import LandmarkInputError
+from cmfsim.planning.face_measures import sites as face
+from cmfsim.planning.face_measures.cephalometry import (
+    CEPHALOMETRIC_MEASURES,
+    cephalometry,
+    missing_sites,
+)
+from cmfsim.planning.face_measures.definitions import MEASURES, Measure, measure_sites
+from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.landmark_sites import profile_sites
+from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import Prediction
+
+Values = Mapping[str, float | None]
+
+
+def clinical_figures(prediction: Prediction) -> dict[str, Any]:
+    """The clinical figures of a prediction: plain values, ready for JSON.
+
+    Sites of bone move with the segment nearest to them, sites of the skin with the predicted skin.
+
+    Returns
+    -------
+    dict
+        "cephalometry" and "face": measures, each with `label`, `unit`, `norm`, `source`, `before`
+        and `planned`, and where these are None why, as `absent`. "sites": landmarks with `name`,
+        `moves_with` (a segment, or "skin"), `forwards_mm`, `up_mm` and `left_mm`.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.clinical_figures(prediction)["cephalometry"][2]["planned"]  # doctest: +SKIP
+    2.4
+    """
+    patient = prediction.patient
+    bone, sites = _bone_sites(patient), face.face_sites(patient)
+    before = {name: site.place for name, site in bone.items()}
+    after = face.moved_bone_sites(prediction, bone)
+    at_rest = {**sites.skin, **{name: site.place for name, site in sites.bone.items()}}
+    skin = {**patient.landmarks.get("skin", {}), **sites.skin}
+    moved = prediction.carried(np.array([*skin.values()])) if skin else np.zeros((0, 3))
+    shifts = [(name, bone[name].segment, after[name] - before[name]) for name in after]
+    shifts += [(f"{name} (skin)", "skin", m) for name, m in zip(skin, moved, strict=True)]
+    ways = ("forwards_mm", "up_mm", "left_mm")
+    return {
+        "cephalometry": _rows(
+            CEPHALOMETRIC_MEASURES,
+            cephalometry(before),
+            cephalometry(after, before),
+            {m.key: missing_sites(before, m) for m in CEPHALOMETRIC_MEASURES},
+        ),
+        "face": _rows(
+            MEASURES,
+            measure_sites(at_rest),
+            face.measure_face(prediction, sites),
+            {m.key: sites.why_absent(m.sites) for m in MEASURES},
+        ),
+        "sites": [
+            {"name": name, "moves_with": part, **dict(zip(ways, (-y + 0.0, z, x), strict=True))}
+            for name, part, shift in shifts
+            for x, y, z in [shift.tolist()]
+        ],
+    }
+
+
+def _bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
+    """The sites of the skull on their segments, and the edges of incisors that the bone shows."""
+    skull = patient.landmarks.get("skull", {}) if patient.segments else {}
+    sites = {}
+    for name, place in skull.items():
+
+        def away(segment: BoneSegment, place: Any = place) -> float:
+            closest = segment.surface.searched.closest(place[None])[0][0]
+            return float(np.linalg.norm(closest - place))
+
+        sites[name] = face.BoneSite(place, min(patient.segments, key=away).name)
+    for name, root, bearers in (
+        ("U1", "supradentale", face.UPPER_BEARERS),
+        ("L1", "infradentale", face.LOWER_BEARERS),
+    ):
+        if name not in profile_sites(skull):
+            with suppress(LandmarkInputError):
+                sites[name] = face.incisor_edge(patient, root, bearers)
+    return sites
+
+
+def _rows(
+    measures: Iterable[Measure], before: Values, planned: Values, absent: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    return [
+        {name: getattr(m, name) for name in ("label", "unit", "norm", "source")}
+        | {"before": before[m.key], "planned": planned[m.key], "absent": absent[m.key]}
+        for m in measures
+    ]
