@@ -1,11 +1,13 @@
 """The report of one case: plan, pictures, errors, model and files, from its results alone."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from cmfsim.errors import CaseInputError
 from cmfsim.report.band import band_section
 from cmfsim.report.causes import not_operated_blocks, statistics_table, thickness_blocks
+from cmfsim.report.clinical import clinical_sections
 from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
 from cmfsim.report.labels import MEASURES, MESH, MUSCLES, labelled
 from cmfsim.values.clinical_motion import plan_lines
@@ -19,6 +21,8 @@ MODEL_NAMES: Mapping[str, str] = {
     "H+S": "homogeneous, sliding",
     "M+S": "muscles, sliding",
 }
+# The landmark of the soft chin.
+CHIN = "pogonion (skin)"
 # Pictures in the order of a report, with what they show. The names are those of the files.
 PICTURES: Mapping[str, str] = {
     "prediction": "The face before the operation, the predicted face, and how far the skin moves.",
@@ -75,17 +79,22 @@ def case_document(
     _check_together(predictions, evaluation)
     pictures = pictures or {}
     models = ", ".join(entry["model"] for entry in predictions)
-    sections = [
-        *_note_section(entry),
-        _prediction_section(predictions, entry, pictures),
-        *_band_sections(entry, pictures),
-        _plan_section(entry, pictures),
-        *_evaluation_sections(evaluation, figures),
+    appendix = [
+        Section("Motions", tuple(motion_blocks(entry))),
         *_muscle_section(entry, predictions, pictures),
         _model_section(predictions, entry, pictures),
         _time_section(predictions),
-        _finding_section(_findings(predictions, evaluation)),
         _input_section(entry),
+    ]
+    sections = [
+        *_note_section(entry),
+        _plan_section(entry, pictures),
+        _prediction_section(predictions, entry, pictures),
+        *clinical_sections(entry),
+        *_band_sections(entry, pictures),
+        *_evaluation_sections(evaluation, figures),
+        _finding_section(_findings(predictions, evaluation)),
+        *(replace(part, title=f"Appendix: {part.title.lower()}") for part in appendix),
     ]
     versions = ", ".join(f"{name} {version}" for name, version in entry["versions"].items())
     several = "Models" if len(predictions) > 1 else "Model"
@@ -134,13 +143,21 @@ def _named(model: str) -> str:
 
 
 def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
-    """The figures of the model that is shown; errors only where this model was evaluated."""
+    """The plan at teeth and chin, and the figures of the model that is shown.
+
+    Errors only where this model was evaluated.
+    """
     skin, model = prediction["skin"], prediction["model"]
-    facts = {
-        f"{model}: skin moves at most": f"{skin['largest']:.1f} mm",
-        f"{model}: tets": number(prediction["solution"]["n_tets"]),
-        f"{model}: from files to face": f"{sum(prediction['timings'].values()):.0f} s",
-    }
+    facts = {}
+    for name, motion in prediction["plan"].items():
+        shift, _, place = motion["clinical"]["text"].partition(";")[0].partition(" at the ")
+        if shift != "stays" and place:
+            facts[f"{name} at the {place}"] = shift
+    chin = [s for s in prediction.get("clinical", {"sites": ()})["sites"] if s["name"] == CHIN]
+    for site in chin:
+        way = "forwards" if site["forwards_mm"] >= 0.0 else "backwards"
+        facts[f"{model}: soft chin"] = f"{abs(site['forwards_mm']):.1f} mm {way}"
+    facts[f"{model}: skin moves at most"] = f"{skin['largest']:.1f} mm"
     if "band" in prediction:
         region = prediction["band"]["regions"]
         face = region.get("face") or next(iter(region.values()))
@@ -243,8 +260,7 @@ def _plan_section(prediction: Values, pictures: Mapping[str, bytes]) -> Section:
     words = [
         Note(line) for line in plan_lines({n: m["clinical"] for n, m in prediction["plan"].items()})
     ]
-    blocks = (*words, *_picture("plan", pictures), *motion_blocks(prediction))
-    return Section("Plan", blocks)
+    return Section("Plan", (*words, *_picture("plan", pictures)))
 
 
 def _achieved(achieved: Values | None) -> list[Table]:
@@ -425,22 +441,28 @@ def _time_section(predictions: Sequence[Values]) -> Section:
 
 
 def _finding_section(findings: Sequence[Finding]) -> Section:
-    """Every finding in full, errors first."""
+    """Every finding in full, those of one code together, errors first."""
     kinds = {"error": "error", "warning": "warning"}
-    ordered = [finding for group in grouped(findings) for finding in group.findings]
-    blocks = [
-        Note(f"{f.severity}: {_sentence(f)}", kinds.get(f.severity, "plain")) for f in ordered
-    ]
+    blocks = []
+    for group in grouped(findings):
+        places = [f"{_placed(f).rstrip('. ')}." for f in group.findings]
+        reasons = dict.fromkeys(_sentence(f, with_what=False) for f in group.findings)
+        lines = [*places, *filter(None, reasons)]
+        head = f"{group.severity} [{group.code}]"
+        blocks.append(Note("\n".join([head, *lines]), kinds.get(group.severity, "plain")))
     return Section("Findings", tuple(blocks or [Note("No findings.")]))
 
 
 def _sentence(finding: Finding, *, with_what: bool = True) -> str:
     """What a finding states, where, why it matters and what to do, as far as it does."""
-    place = f" ({finding.where})" if finding.where else ""
-    what = f"{finding.what}{place}" if with_what else ""
+    what = _placed(finding) if with_what else ""
     fix = f"Fix: {finding.fix}" if finding.fix else ""
     parts = [text.rstrip(". ") for text in (what, finding.why, fix) if text]
     return "".join(f"{text}. " for text in parts).strip()
+
+
+def _placed(finding: Finding) -> str:
+    return f"{finding.what} ({finding.where})" if finding.where else finding.what
 
 
 def _input_section(prediction: Values) -> Section:

@@ -7,6 +7,7 @@ import pytest
 import cmfsim
 import meshes
 from cmfsim.report import Document, Figure, Note, Section, Table, render_page
+from cmfsim.report.clinical import clinical_sections
 from cmfsim.report.document import number
 from cmfsim.report.labels import MESH, MUSCLES, labelled
 
@@ -78,3 +79,41 @@ def test_figures_of_mesh_and_muscles_have_labels_and_units():
     assert not [label for label in (*found, *shown) if "_" in label]
     assert {k for k, v in used.items() if isinstance(v, str | int | float)} <= set(MUSCLES)
     assert labelled({"new_figure": 1.5}, MUSCLES) == {"new figure": 1.5}
+
+
+def measure(label, before, planned, absent=""):
+    return {
+        "label": label,
+        "unit": "°",
+        "norm": "2",
+        "source": "Steiner 1953",
+        "before": before,
+        "planned": planned,
+        "absent": absent,
+    }
+
+
+def site(name, forwards, moves_with="maxilla"):
+    return {
+        "name": name,
+        "moves_with": moves_with,
+        "forwards_mm": forwards,
+        "up_mm": 0.0,
+        "left_mm": -0.01,
+    }
+
+
+CLINICAL = {
+    "cephalometry": [measure("ANB", -1.04, 2.46), measure("SNA", None, None, "S: not given")],
+    "face": [],
+    "sites": [site("pogonion", -3.5), site("nasion", 0.0)],
+}
+
+
+def test_measures_and_landmarks_are_shown_before_planned_and_changed():
+    measures, landmarks = clinical_sections({"clinical": CLINICAL})
+    assert measures.blocks[0].rows == (("ANB, °", "−1.0", "2.5", "+3.5", "2", "Steiner 1953"),)
+    assert measures.blocks[1].text == "Not available: SNA, ° (S: not given)."
+    assert landmarks.blocks[0].rows == (("pogonion", "maxilla", "−3.5", "0.0", "0.0", "3.5"),)
+    assert landmarks.blocks[1].text == "Stay: nasion."
+    assert clinical_sections({}) == []

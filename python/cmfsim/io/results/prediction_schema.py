@@ -74,6 +74,15 @@ _BAND = {
     "calibration": Maybe({"file": str, "note": str, "n": COUNT, "group?": Maybe(str)}),
     "seconds": _SECONDS,
 }
+_PLACE = Span(-1e6, 1e6)
+_MEASURE = {
+    **dict.fromkeys(("label", "unit", "norm", "source", "absent"), str),
+    **dict.fromkeys(("before", "planned"), Maybe(_PLACE)),
+}
+_SITE = {
+    **dict.fromkeys(("name", "moves_with"), str),
+    **dict.fromkeys(("forwards_mm", "up_mm", "left_mm"), _PLACE),
+}
 PREDICTION = {
     **dict.fromkeys(("case", "case_key", "note?", "plan_digits?"), str),
     "model": frozenset(MODELS),
@@ -89,6 +98,7 @@ PREDICTION = {
     "parts": {frozenset({"bones", "muscles"}): [str]},
     "files": [PREDICTION_FILES],
     "left_out?": [str],
+    "clinical?": {"cephalometry": [_MEASURE], "face": [_MEASURE], "sites": [_SITE]},
     "achieved?": {"segments": {str: _FIT}},
     "muscles?": {
         "volumes?": {str: _LARGE},

@@ -52,6 +52,7 @@ from cmfsim.pictures.painting import Painter
 from cmfsim.pipeline.building.stages import OnMuscles
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, page_state
+from cmfsim.planning.face_measures import clinical_figures
 from cmfsim.report import Document, Figure, case_document, render_page
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.musculature import Musculature
@@ -275,6 +276,8 @@ def _fill_model(
     fresh: Path, prediction: Prediction, clock: _Clock, *, drawing: _Drawing, slicer: bool
 ) -> WrittenPrediction:
     """The files of one prediction in its folder, with the pictures that are wanted."""
+    figures = clinical_figures(prediction)
+    prediction = replace(prediction, summary={**prediction.summary, "clinical": figures})
     place = drawing.place(prediction.model)
     (fresh / place).mkdir(exist_ok=True)
     begun = drawing.begin(prediction)
