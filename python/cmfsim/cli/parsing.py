@@ -237,6 +237,9 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         "report", parents=[common], help="regenerate the report of a results folder"
     )
     report.add_argument("folder", metavar="FOLDER", type=Path, help="folder written by predict")
+    report.add_argument(
+        "--pdf", action="store_true", help="also write report.pdf, one page for the chart"
+    )
     report.set_defaults(run=study_commands.report)
 
 

@@ -1,6 +1,6 @@
 """Reports of results: one self-contained page for a case or a study, on screen and on paper."""
 
-from cmfsim.report.case import case_document
+from cmfsim.report.case import case_document, findings_of
 from cmfsim.report.document import Document, Figure, Note, Section, Table
 from cmfsim.report.page import render_page
 from cmfsim.report.study import study_document
@@ -12,6 +12,7 @@ __all__ = [
     "Section",
     "Table",
     "case_document",
+    "findings_of",
     "render_page",
     "study_document",
 ]

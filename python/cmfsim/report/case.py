@@ -93,7 +93,7 @@ def case_document(
         *clinical_sections(entry),
         *_band_sections(entry, pictures),
         *_evaluation_sections(evaluation, figures),
-        _finding_section(_findings(predictions, evaluation)),
+        _finding_section(findings_of(predictions, evaluation)),
         *(replace(part, title=f"Appendix: {part.title.lower()}") for part in appendix),
     ]
     versions = ", ".join(f"{name} {version}" for name, version in entry["versions"].items())
@@ -105,7 +105,7 @@ def case_document(
         sections=sections,
         footer=f"Made by {versions}. Mass-tensor model after Kim, Jürgens, Weber, Nolte and Reyes "
         "(2010).",
-        alerts=_alerts(_findings(predictions, evaluation), left_out),
+        alerts=_alerts(findings_of(predictions, evaluation), left_out),
         facts_title=f"Model {_named(entry['model'])}",
     )
 
@@ -170,7 +170,7 @@ def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
     return facts
 
 
-def _findings(predictions: Sequence[Values], evaluation: Values | None) -> list[Finding]:
+def findings_of(predictions: Sequence[Values], evaluation: Values | None) -> list[Finding]:
     """What the stages noticed, the solution of any model and the comparison; each once."""
     entries = [finding for prediction in predictions for finding in prediction["findings"]]
     entries += [] if evaluation is None else evaluation.get("findings", [])

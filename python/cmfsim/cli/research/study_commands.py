@@ -24,6 +24,7 @@ from cmfsim.pipeline.outputs.results import (
     WrittenPrediction,
     WrittenResults,
     write_case_report,
+    write_chart_page,
     write_results,
 )
 from cmfsim.pipeline.predicting import predict_models
@@ -318,12 +319,14 @@ def report(options: argparse.Namespace) -> int:
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("writing the report")
         name = write_case_report(folder)
+        page = write_chart_page(folder) if options.pdf else None
     if name is None:
         return FAILED
     if options.json:
-        print(json.dumps({"output": str(folder), "report": name}))
+        print(json.dumps({"output": str(folder), "report": name, "pdf": page}))
     else:
         _print_report(folder, name)
+        _print_report(folder, page)
     return DONE
 
 

@@ -33,9 +33,9 @@ DISTANCE, EVALUATED = "signed_distance_mm", "evaluated"
 
 # Written last, so that a case that has it is finished.
 EVALUATION_FILE = "metrics.json"
-REPORT_FILE = "report.html"
+REPORT_FILE, CHART_PAGE_FILE = "report.html", "report.pdf"
 EVALUATION_FILES = re.compile(
-    r"metrics\.(json|csv)|errors\.png|error-(H|M|H\+S|M\+S)\.(png|vtp)|report\.html"
+    r"metrics\.(json|csv)|errors\.png|error-(H|M|H\+S|M\+S)\.(png|vtp)|report\.(html|pdf)"
 )
 AGAIN = "run cmfsim evaluate again"
 # A picture of a report above this size is none of ours, bytes.

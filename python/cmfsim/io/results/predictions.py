@@ -16,6 +16,7 @@ from cmfsim.io.files.summaries import checked_file, hashes_of, read_summary, wri
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
 from cmfsim.io.results.metrics import (
+    CHART_PAGE_FILE,
     EVALUATION_FILE,
     REPORT_FILE,
     is_evaluation_file,
@@ -155,8 +156,9 @@ def stale_results(folder: Path, key: str) -> list[str]:
             stale += [f"{place}/{name}".lstrip("/") for name in names]
     if os.path.lexists(folder / EVALUATION_FILE) and _key_of(read_evaluation, folder) != key:
         stale += sorted(path.name for path in folder.iterdir() if is_evaluation_file(path.name))
-    if stale and os.path.lexists(folder / REPORT_FILE):
-        stale.append(REPORT_FILE)
+    if stale:
+        reports = (REPORT_FILE, CHART_PAGE_FILE)
+        stale += [name for name in reports if os.path.lexists(folder / name)]
     return [*dict.fromkeys(stale)]
 
 

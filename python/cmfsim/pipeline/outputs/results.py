@@ -21,6 +21,7 @@ from cmfsim.evaluation import error_table
 from cmfsim.io import replacing, replacing_files
 from cmfsim.io.files.summaries import hashes_of, write_summary
 from cmfsim.io.results.metrics import (
+    CHART_PAGE_FILE,
     EVALUATION_FILE,
     REPORT_FILE,
     read_evaluation,
@@ -48,12 +49,14 @@ from cmfsim.pictures import (
     plan_picture,
     prediction_picture,
 )
+from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.painting import Painter
 from cmfsim.pipeline.building.stages import OnMuscles
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, page_state
 from cmfsim.planning.face_measures import clinical_figures
-from cmfsim.report import Document, Figure, case_document, render_page
+from cmfsim.report import Document, Figure, case_document, findings_of, render_page
+from cmfsim.report.chart_page import A4, draw_chart_page
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.prediction import MODELS, Prediction
@@ -290,7 +293,7 @@ def _fill_model(
 
 def _older(output: Path, places: Iterable[str]) -> list[str]:
     """Pictures of an earlier run that this one has not drawn, and a report that it has not made."""
-    older = [REPORT_FILE]
+    older = [REPORT_FILE, CHART_PAGE_FILE]
     for place in places:
         folder = output / place
         if folder.is_dir() and (folder / "prediction.json").exists():
@@ -480,17 +483,8 @@ def _document(
     figures: Mapping[str, bytes],
     left_out: str = "",
 ) -> Document:
-    """The report of predictions in their places, with the pictures of the last that has some."""
-    pictures: dict[str, bytes] = {}
-    shown = ""
-    for place, summary in found.items():
-        drawn = {
-            name: image
-            for name in PREDICTION_PICTURES
-            if (image := read_prediction_picture(place, summary, f"{name}.png")) is not None
-        }
-        if drawn or not pictures:
-            pictures, shown = drawn, summary["model"]
+    """The report of predictions in their places."""
+    shown, pictures = _shown(found)
     shown_figures = []
     # The box plot first: it shows all models together.
     for name in sorted(figures, key=lambda name: name != "errors.png"):
@@ -499,12 +493,38 @@ def _document(
         shown_figures.append(Figure(figures[name], caption))
     return case_document(
         list(found.values()),
-        shown=shown,
+        shown=shown["model"],
         evaluation=evaluation,
         pictures=pictures,
         figures=shown_figures,
         left_out=left_out,
     )
+
+
+def _shown(found: Mapping[Path, Mapping[str, Any]]) -> tuple[Mapping[str, Any], dict[str, bytes]]:
+    """The last of some predictions that has pictures, the last of all without any, and these."""
+    pictures: dict[str, bytes] = {}
+    shown: Mapping[str, Any] = {}
+    for place, summary in found.items():
+        drawn = {
+            name: image
+            for name in PREDICTION_PICTURES
+            if (image := read_prediction_picture(place, summary, f"{name}.png")) is not None
+        }
+        if drawn or not pictures:
+            pictures, shown = drawn, summary
+    return shown, pictures
+
+
+def write_chart_page(folder: Path) -> str:
+    """The name of the page for the chart, PDF, of the results in a folder; raises as the report."""
+    found = predictions_of(folder)
+    shown, pictures = _shown(found)
+    findings = findings_of([*found.values()], None)
+    write_figure(
+        folder / CHART_PAGE_FILE, A4, lambda page: draw_chart_page(page, shown, pictures, findings)
+    )
+    return CHART_PAGE_FILE
 
 
 def _error_caption(model: str) -> str:

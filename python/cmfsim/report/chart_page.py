@@ -1,0 +1,212 @@
+"""One page for the patient's chart: plan, pictures, measures, band, warnings, versions, hashes.
+
+Every text has a largest width and number of lines; what does not fit is replaced by a reference to
+the report, so that nothing overlaps and nothing is cut. Lengths are points from the top left.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cmfsim.errors import third_party
+from cmfsim.report.clinical import TITLES, WAYS, absent_text, measure_rows, site_rows
+from cmfsim.report.page import DISCLAIMER
+from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.finding import Finding, grouped
+
+Values = Mapping[str, Any]
+
+# A4, inches; the same in points, with the margin and the widths of two columns.
+A4 = (8.27, 11.69)
+WIDTH, HEIGHT, MARGIN, LEFT, RIGHT = 595.0, 842.0, 36.0, 285.0, 224.0
+COLUMN = WIDTH - MARGIN - RIGHT
+WHOLE = WIDTH - 2 * MARGIN
+# Font sizes, and the distance between lines as a multiple of them. A text that is too wide is
+# shrunk to the least size or this share before it is shortened.
+TITLE, TEXT, SMALL, FINE, LEAST, SHRINK, LEADING = 15.0, 8.0, 6.5, 5.5, 4.5, 0.65, 1.3
+# Heights of a row of a table, of a heading, of the gap between parts and, at most, of pictures.
+ROW, HEADING, APART, PICTURES = LEADING * SMALL + 1.0, 17.0, 8.0, 220.0
+# Largest numbers of lines, and digits of the hashes of inputs.
+PLAN_LINES, ABSENT_LINES, BAND_ROWS, WARNING_LINES, INPUT_LINES, DIGITS = 7, 4, 11, 7, 3, 12
+# Where versions and hashes begin.
+FOOT = HEIGHT - MARGIN - (INPUT_LINES + 2) * LEADING * FINE
+INK, PALE, RULE, ALARM = "#1d2530", "#5d6875", "#d5dbe2", "#c2410c"
+# Shares of the columns in the width of a table of measures.
+SHARES: Mapping[str, tuple[float, ...]] = {
+    "cephalometry": (0.3, 0.11, 0.11, 0.11, 0.37),
+    "face": (0.37, 0.15, 0.17, 0.15, 0.16),
+}
+# Landmarks at teeth, chin and lips.
+SITES = (
+    *("U1", "L1", "mid_philtrum", "supradentale", "infradentale", "supramentale", "pogonion"),
+    *(f"{n} (skin)" for n in ("pronasale", "subnasale", "labiale_superius", "labiale_inferius")),
+    "pogonion (skin)",
+)
+WIDTHS = ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm")
+ELSEWHERE = "… more in report.html"
+
+
+class _Page:
+    """A figure on which texts, tables and pictures are placed."""
+
+    def __init__(self, figure: Any) -> None:
+        self._figure = figure
+        self._path = third_party("matplotlib.textpath", "pages are drawn", "report").text_to_path
+        self._fonts = third_party("matplotlib.font_manager", "pages are drawn", "report")
+        figure.set_layout_engine("none")
+        self._axes = figure.add_axes((0, 0, 1, 1), xlim=(0, WIDTH), ylim=(HEIGHT, 0))
+        self._axes.axis("off")
+
+    def _width(self, text: str, size: float, weight: str = "normal") -> float:
+        font = self._fonts.FontProperties(size=size, weight=weight)
+        return float(self._path.get_text_width_height_descent(text, font, ismath=False)[0])
+
+    def line(
+        self, x: float, y: float, text: str, size: float, *, room: float = WHOLE, **style: Any
+    ) -> None:
+        """Writes one line with its top at y, smaller or shortened where it is too wide."""
+        text, weight = " ".join(text.split()), style.get("weight", "normal")
+        width = self._width(text, size, weight)
+        if width > room:
+            size = max(LEAST, SHRINK * size, 0.98 * size * room / width)
+            if (width := self._width(text, size, weight)) > room:
+                text = text[: int(1.3 * len(text) * room / width)]
+                while self._width(f"{text}…", size, weight) > room:
+                    text = text[:-1]
+                text += "…"
+        # A user's name may hold dollar signs: nothing of it is mathematics.
+        style = {"color": INK, "va": "top", "parse_math": False, **style}
+        self._axes.text(x, y, text, size=size, **style)
+
+    def paragraph(
+        self, place: tuple[float, float], texts: Sequence[str], size: float, most: int,
+        room: float = WHOLE,
+    ) -> float:  # fmt: skip
+        """Writes texts, each wrapped, in at most so many lines; where the last one ends."""
+        lines: list[str] = []
+        for text in texts:
+            lines.append("")
+            for word in text.split():
+                longer = f"{lines[-1]} {word}".strip()
+                if lines[-1] and self._width(longer, size) > room:
+                    lines.append(word)
+                else:
+                    lines[-1] = longer
+        x, y = place
+        for line in lines if len(lines) <= most else [*lines[: most - 1], ELSEWHERE]:
+            self.line(x, y, line, size, room=room)
+            y += LEADING * size
+        return y
+
+    def heading(self, x: float, y: float, text: str, room: float = WHOLE) -> float:
+        """Writes a heading over a rule; where what follows begins."""
+        self.line(x, y, text, TEXT + 1.0, room=room, weight="bold")
+        self._axes.plot([x, x + room], [y + 13.0] * 2, color=RULE, linewidth=0.8)
+        return y + HEADING
+
+    def table(
+        self, x: float, y: float, rows: Sequence[Sequence[str]], widths: Sequence[float]
+    ) -> float:
+        """Writes a table with the first row as its head; where it ends."""
+        for row in rows:
+            weight, end = "bold" if row is rows[0] else "normal", x
+            for cell, width in zip(row, widths, strict=True):
+                place, side = (end + width, "right") if end > x else (x, "left")
+                self.line(place, y, cell, SMALL, room=width - 4.0, ha=side, weight=weight)
+                end += width
+            y += ROW
+        return y
+
+    def picture(self, x: float, y: float, image: bytes, room: tuple[float, float]) -> float:
+        """Draws a PNG as large as there is room; where it ends."""
+        images = third_party("matplotlib.image", "pages are drawn", "report")
+        pixels = images.imread(io.BytesIO(image), format="png")
+        scale = min(room[0] / pixels.shape[1], room[1] / pixels.shape[0])
+        wide, high = scale * pixels.shape[1] / WIDTH, scale * pixels.shape[0] / HEIGHT
+        axes = self._figure.add_axes((x / WIDTH, 1.0 - y / HEIGHT - high, wide, high))
+        axes.imshow(pixels, aspect="auto", cmap="gray")
+        axes.axis("off")
+        return float(y + high * HEIGHT)
+
+
+def draw_chart_page(
+    figure: Any, prediction: Values, pictures: Mapping[str, bytes], findings: Sequence[Finding]
+) -> None:
+    """Draws the page of one plan onto an empty figure of matplotlib, of the size `A4`.
+
+    The prediction is what `prediction.json` holds; pictures are PNG files, "prediction" and "plan";
+    findings are those of all stages.
+    """
+    page, y = _Page(figure), MARGIN
+    page.line(MARGIN, y, f"{prediction['case']}: predicted face", TITLE, weight="bold")
+    page.line(MARGIN, y + 21.0, DISCLAIMER, TEXT, weight="bold", color=ALARM)
+    skin = f"The skin moves by up to {prediction['skin']['largest']:.1f} mm."
+    about = f"Model {prediction['model']}. Lengths in mm. {skin}"
+    page.line(MARGIN, y + 33.0, about, TEXT, color=PALE)
+    y = page.heading(MARGIN, y + 48.0, "Plan")
+    words = plan_lines({name: m["clinical"] for name, m in prediction["plan"].items()})
+    y = page.paragraph((MARGIN, y), words, TEXT, PLAN_LINES) + APART
+    found = prediction.get("clinical", {"cephalometry": (), "face": (), "sites": ()})
+    high = min(PICTURES, FOOT - APART - _height_below(found) - y)
+    ends = [
+        page.picture(x, y, pictures[name], (room, high))
+        for name, x, room in (("prediction", MARGIN, LEFT), ("plan", COLUMN, RIGHT))
+        if name in pictures
+    ]
+    y = max([y, *ends]) + APART
+    ends = []
+    for kind, x, room in (("cephalometry", MARGIN, LEFT), ("face", COLUMN, RIGHT)):
+        end = page.heading(x, y, TITLES[kind], room)
+        rows = [row[:5] for row in measure_rows(found, kind)]
+        rows.insert(0, ("", "before", "planned", "change", "norm"))
+        end = page.table(x, end, rows, [share * room for share in SHARES[kind]])
+        text = [f"Not available: {text}" for text in [absent_text(found, kind)] if text]
+        ends.append(page.paragraph((x, end), text, FINE, ABSENT_LINES, room))
+    y = max(ends) + APART
+    y = max(_sites(page, y, found), _band(page, y, prediction.get("band"))) + APART
+    y = page.heading(MARGIN, y, "Warnings")
+    groups = [group for group in grouped(findings) if group.severity != "note"]
+    lines = [f"{group.severity}: {group.line}" for group in groups] or ["None."]
+    page.paragraph((MARGIN, y), lines, SMALL, WARNING_LINES)
+    _origin(page, prediction)
+
+
+def _height_below(found: Values) -> float:
+    """The largest height of all between the pictures and the foot of the page."""
+    measures = max(len(measure_rows(found, kind)) for kind in TITLES)
+    sites = max(sum(row[0] in SITES for row in site_rows(found)), BAND_ROWS + 2)
+    texts = LEADING * (ABSENT_LINES * FINE + WARNING_LINES * SMALL)
+    return 3 * HEADING + (measures + sites + 2) * ROW + texts + 2 * APART
+
+
+def _sites(page: _Page, y: float, found: Values) -> float:
+    y = page.heading(MARGIN, y, "Movement of landmarks", LEFT)
+    moved = {row[0]: (row[0], *row[2:]) for row in site_rows(found)}
+    rows = [("", *WAYS, "distance"), *(moved[name] for name in SITES if name in moved)]
+    return page.table(MARGIN, y, rows, [0.4 * LEFT, *[0.15 * LEFT] * 4])
+
+
+def _band(page: _Page, y: float, band: Values | None) -> float:
+    y = page.heading(COLUMN, y, "How far to trust the face", RIGHT)
+    if band is None:
+        text = "No band was requested (cmfsim predict --band)."
+        return page.paragraph((COLUMN, y), [text], SMALL, 2, RIGHT)
+    state = f"{band['state'].upper()}, {100 * band['coverage']:g} % of faces. Half width:"
+    y = page.paragraph((COLUMN, y), [state], SMALL, 2, RIGHT)
+    rows: list[tuple[str, ...]] = [("", "mean", "95 %", "largest")]
+    for name, entry in [*band["regions"].items()][:BAND_ROWS]:
+        rows.append((name, *(f"{entry[key]:.1f}" for key in WIDTHS)))
+    return page.table(COLUMN, y, rows, [0.4 * RIGHT, *[0.2 * RIGHT] * 3])
+
+
+def _origin(page: _Page, prediction: Values) -> None:
+    """Versions and hashes at the foot of the page."""
+    versions = ", ".join(f"{name} {version}" for name, version in prediction["versions"].items())
+    inputs = "; ".join(f"{name} {value[:DIGITS]}" for name, value in prediction["inputs"].items())
+    key = f"Plan, inputs and version: SHA-256 {prediction['case_key']}."
+    if digits := prediction.get("plan_digits"):
+        key += f" Digits of the plan: {digits}."
+    for number, text in enumerate((f"Made by {versions}.", key)):
+        page.line(MARGIN, FOOT + number * LEADING * FINE, text, FINE)
+    texts = [f"Inputs (first {DIGITS} digits of SHA-256): {inputs}."] if inputs else []
+    page.paragraph((MARGIN, FOOT + 2 * LEADING * FINE), texts, FINE, INPUT_LINES)

@@ -1,0 +1,130 @@
+"""The page for the chart: nothing overlaps and nothing is cut, however much there is to state."""
+
+import io
+import itertools
+
+import pytest
+
+import cmfsim
+import shared_values
+from cmfsim.cli import main
+from cmfsim.report.chart_page import A4, SITES, draw_chart_page
+
+matplotlib = pytest.importorskip("matplotlib")
+agg = pytest.importorskip("matplotlib.backends.backend_agg")
+figures = pytest.importorskip("matplotlib.figure")
+image = pytest.importorskip("matplotlib.image")
+
+# Texts may touch by this, points: the box of a line includes room for accents and descenders.
+TOUCH = 1.5
+
+
+def png(height, width):
+    file = io.BytesIO()
+    image.imsave(file, [[0.5] * width] * height, format="png")
+    return file.getvalue()
+
+
+def measure(number, absent):
+    value = None if absent else -123.4
+    return {
+        "label": f"A measure with a rather long name {number}"
+        if number
+        else "Mandibular plane to FH",
+        "unit": "mm",
+        "norm": "men −1.2 ± 1.9, women −0.1 ± 1.8",
+        "source": "Author 1953",
+        "before": value,
+        "planned": value,
+        "absent": "S, Po: not given or found" if absent else "",
+    }
+
+
+def full(many):
+    """A summary with as much as there can be, or with next to nothing."""
+    words = f"12.3 mm forwards, 4.5 mm up {'at the upper incisors ' * 4}; pitch +2.0°"
+    clinical = {"text": words, "source": "$x^2_{ " + "a long source " * 5}
+    entry = {
+        "case": "$\\frac{a}{ patient " + "with a long name " * (12 if many else 0),
+        "model": "M+S",
+        "skin": {"largest": 12.3},
+        "versions": {"cmfsim": "0.1.0", **({f"library{i}": "1.2.3" for i in range(30 * many)})},
+        "case_key": "0" * 64,
+        "inputs": {f"folder/a_file_{i}.nii.gz": "f" * 64 for i in range(40 * many)},
+        "plan": {f"segment_{i}": {"clinical": clinical} for i in range(1 + 12 * many)},
+    }
+    if not many:
+        return entry
+    region = dict.fromkeys(("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm"), 1)
+    regions = {f"a region of the face {i}": region for i in range(20)}
+    shift = {"forwards_mm": -12.3, "up_mm": 4.5, "left_mm": 0.5}
+    sites = [{"name": name, "moves_with": "maxilla", **shift} for name in SITES]
+    return entry | {
+        "plan_digits": "12345678",
+        "band": {"state": "uncalibrated", "coverage": 0.9, "regions": regions},
+        "clinical": {
+            "cephalometry": [measure(i, i % 8 == 7) for i in range(19)],
+            "face": [measure(i, absent=False) for i in range(14)],
+            "sites": sites,
+        },
+    }
+
+
+@pytest.fixture
+def unhinted():
+    """Letters that are not moved to whole pixels, as in a PDF."""
+    with matplotlib.rc_context({"text.hinting": "none"}):
+        yield
+
+
+@pytest.mark.usefixtures("unhinted")
+@pytest.mark.parametrize(("many", "drawn"), [(False, False), (False, True), (True, True)])
+def test_texts_stay_on_the_page_and_apart(many, drawn):
+    codes = ("of-doctor", "of-solving", "of-lips", "of-bones", "of-teeth") * 3
+    findings = [
+        cmfsim.Finding(f"{code}-{i}", "something $is$ wrong " * 9, severity="warning")
+        for i, code in enumerate(codes[: len(codes) * many])
+    ]
+    figure = figures.Figure(figsize=A4, dpi=360)
+    renderer = agg.FigureCanvasAgg(figure).get_renderer()
+    pictures = {"prediction": png(1240, 1650), "plan": png(820, 1650)} if drawn else {}
+    draw_chart_page(figure, full(many), pictures, findings)
+    scale = 72.0 / figure.dpi
+    page, *shown = figure.axes
+    boxes = [text.get_window_extent(renderer) for text in page.texts]
+    boxes += [axes.get_window_extent() for axes in shown]
+    assert len(shown) == 2 * drawn
+    width, height = (72.0 * size for size in A4)
+    for box in boxes:
+        assert scale * box.x0 >= 35.0
+        assert scale * box.x1 <= width - 35.0
+        assert scale * box.y0 >= 30.0
+        assert scale * box.y1 <= height - 30.0
+    for one, other in itertools.combinations(boxes, 2):
+        across = min(one.x1, other.x1) - max(one.x0, other.x0)
+        along = min(one.y1, other.y1) - max(one.y0, other.y0)
+        assert scale * min(across, along) <= TOUCH
+    texts = [text.get_text() for text in page.texts]
+    assert any("not a medical device" in text for text in texts)
+    assert any("0" * 64 in text for text in texts)
+    # A label that is a little too wide is shrunk, not shortened.
+    assert ("Mandibular plane to FH, mm" in texts) == many
+    assert ("… more in report.html" in texts) == many
+
+
+def test_the_command_writes_the_page_beside_the_report(case_results, capsys):
+    assert main(["report", str(case_results), "--pdf"]) == 0
+    assert "report.pdf" in capsys.readouterr().out
+    written = (case_results / "report.pdf").read_bytes()
+    assert written.startswith(b"%PDF")
+    assert written.count(b"/Type /Page\n") + written.count(b"/Type /Page ") == 1
+    assert main(["report", str(case_results), "--pdf"]) == 0
+    assert (case_results / "report.pdf").read_bytes() == written
+
+
+@pytest.fixture
+def case_results(tmp_path, tmp_path_factory):
+    """The folder of a coarse prediction, without pictures."""
+    patient = shared_values.coarse_demo_patient(tmp_path_factory)
+    cmfsim.write_prediction(tmp_path / "out", cmfsim.predict_patient(patient, "H"))
+    return tmp_path / "out"
