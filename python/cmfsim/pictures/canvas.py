@@ -366,7 +366,10 @@ def silent_vtk() -> Iterator[None]:
 def pyvista_module() -> Any:
     """PyVista, of the extra `view`; a named error where it cannot be imported."""
     try:
-        return import_module("pyvista")
+        with warnings.catch_warnings():
+            # What it loads in turn (pooch, tqdm) asks for ipywidgets in notebooks.
+            warnings.filterwarnings("ignore", message="IProgress not found")
+            return import_module("pyvista")
     except ImportError as error:
         # VTK without libGL fails as an ImportError that names the library.
         raise CaseInputError(
