@@ -18,13 +18,6 @@ pytest.importorskip("SimpleITK")
 FLIP = np.array([-1.0, -1.0, 1.0])
 
 
-@pytest.fixture
-def head(tmp_path):
-    """The files of the head of ellipsoids, without a case file."""
-    head_case.HeadCase().write_parts(tmp_path)
-    return tmp_path
-
-
 def entries(folder):
     """What init says of each thing; nothing may be left that it did not decide about."""
     draft = init_case(folder)

@@ -4,20 +4,12 @@ import numpy as np
 import pytest
 
 import cmfsim
-import head_case
 from cmfsim.cli import main
 from cmfsim.drafting import init_case
 from dicom_series import axial, write_series
 from synthetic_head import made_head
 
 pytest.importorskip("SimpleITK")
-
-
-@pytest.fixture
-def head(tmp_path):
-    """The files of the head of ellipsoids, without a case file."""
-    head_case.HeadCase().write_parts(tmp_path)
-    return tmp_path
 
 
 def test_a_typed_plan_reads_back_as_it_was_typed(head):
