@@ -3,110 +3,20 @@
 import bz2
 import gzip
 import os
-import struct
-import time
 import tracemalloc
 import zlib
 
 import numpy as np
 import pytest
+from header_files import SHAPE, VALUES, codes, refused, write_meta, write_nifti, write_nrrd
 
 from cmfsim import ImageData, ImageError
 from cmfsim.io.images import image_files as images
 from cmfsim.io.images.image_files import read_image, read_image_file, write_image
 from cmfsim.io.images.image_headers import ImageHeader, check_length
-from cmfsim.io.images.metaimage import meta_header
-from cmfsim.io.images.nifti import read_nifti
-from cmfsim.io.images.nrrd import nrrd_header
 from real_heads import data_folder
 
-sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
-SHAPE = (4, 5, 6)
-VALUES = np.arange(120, dtype="<i2").reshape(SHAPE[::-1]).T
-SHEARED = [[1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.6, 6.0], [0.0, 0.0, 2.0, 7.0]]
-
-
-def write_nrrd(path, *lines, values=VALUES, data=True, **fields):
-    given = {
-        "type": "short",
-        "dimension": "3",
-        "space": "left-posterior-superior",
-        "sizes": "4 5 6",
-        "space directions": "(1,0,0) (0,1,0) (0,0,2)",
-        "space origin": "(1,2,3)",
-        "encoding": "raw",
-        "endian": "little",
-    } | {name.replace("_", " "): text for name, text in fields.items()}
-    header = ["NRRD0004", *(f"{k}: {v}" for k, v in given.items() if v is not None), *lines]
-    text = "\n".join(header) + "\n\n"
-    path.write_bytes(text.encode() + (values.T.tobytes() if data else b""))
-    return path
-
-
-def write_nifti(
-    path,
-    *,
-    qform=0,
-    sform=1,
-    rows=SHEARED,
-    spacing=(1.0, 1.0, 2.0),
-    units=2,
-    offset=(5.0, 6.0, 7.0),
-    quaternion=(0.0, 0.0, 0.0),
-    shape=(3, 4, 5, 6, 1, 1, 1, 1),
-    kind=(4, 16),
-    start=352.0,
-    scale=(1.0, 0.0),
-    magic=b"n+1\0",
-):
-    header = bytearray(352)
-    struct.pack_into("<i", header, 0, 348)
-    struct.pack_into("<8h", header, 40, *shape)
-    struct.pack_into("<2h", header, 70, *kind)
-    struct.pack_into("<8f", header, 76, 1.0, *spacing, 0, 0, 0, 0)
-    struct.pack_into("<3f", header, 108, start, *scale)
-    header[123] = units
-    struct.pack_into("<2h", header, 252, qform, sform)
-    struct.pack_into("<6f", header, 256, *quaternion, *offset)
-    struct.pack_into("<12f", header, 280, *np.ravel(rows))
-    header[344:348] = magic
-    data = bytes(header) + VALUES.T.tobytes()
-    path.write_bytes(gzip.compress(data) if path.suffix == ".gz" else data)
-    return path
-
-
-def write_meta(path, *, data=True, **fields):
-    given = {
-        "ObjectType": "Image",
-        "NDims": "3",
-        "BinaryData": "True",
-        "BinaryDataByteOrderMSB": "False",
-        "CompressedData": "False",
-        "TransformMatrix": "1 0 0 0 1 0 0 0 1",
-        "Offset": "1 2 3",
-        "ElementSpacing": "1 1 2",
-        "DimSize": "4 5 6",
-        "ElementType": "MET_SHORT",
-    } | fields
-    given["ElementDataFile"] = given.pop("ElementDataFile", "LOCAL")
-    text = "".join(f"{k} = {v}\n" for k, v in given.items())
-    path.write_bytes(text.encode() + (VALUES.T.tobytes() if data else b""))
-    return path
-
-
-def refused(path, *words):
-    begun = time.monotonic()
-    with pytest.raises(ImageError) as caught:
-        read_image(path)
-    assert isinstance(caught.value, ValueError)
-    for word in (path.name, *words):
-        assert word in str(caught.value)
-    return time.monotonic() - begun
-
-
-def codes(path):
-    return [f.code for f in read_image_file(path).findings]
-
+pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 
 # Files that crash or hang readers --------------------------------------------------------------
 
@@ -379,158 +289,6 @@ def test_a_data_file_beside_or_below_its_header_is_read(tmp_path, kind):
     (tmp_path / "data" / "a.raw").write_bytes(VALUES.T.tobytes()[:-1])
     with pytest.raises(ImageError, match=r"a\.raw: is cut short"):
         read_image(path)
-
-
-# Places ----------------------------------------------------------------------------------------
-
-
-def _place(affine, index):
-    return affine[:, :3] @ np.array(index) + affine[:, 3]
-
-
-def _values_at(image, affine, scale=1.0, to_lps=(1.0, 1.0, 1.0)):
-    """The largest departure of an image from 3i + 5j + 7k at the places of a map."""
-    indices = [(1, 1, 2), (2, 3, 2), (1, 2, 4), (2, 2, 3)]
-    places = [scale * np.array(to_lps) * _place(np.array(affine), i) for i in indices]
-    expected = [3.0 * i + 5.0 * j + 7.0 * k for i, j, k in indices]
-    return float(np.abs(image.sample(places) - expected).max())
-
-
-@pytest.fixture
-def linear(monkeypatch):
-    i, j, k = np.meshgrid(*(np.arange(n) for n in SHAPE), indexing="ij")
-    values = (3 * i + 5 * j + 7 * k).astype("<i2")
-    monkeypatch.setattr("test_image_headers.VALUES", values)
-    return values
-
-
-@pytest.mark.usefixtures("linear")
-@pytest.mark.parametrize("qform", [0, 1])
-def test_a_sheared_sform_is_resampled_by_its_own_map(tmp_path, qform):
-    # dcm2niix writes the tilt of a gantry there; a qform keeps no shear, and readers prefer it.
-    path = write_nifti(tmp_path / "a.nii.gz", qform=qform, quaternion=(0.0, 0.0, 0.0))
-    if qform:
-        # What a qform keeps of it: the nearest perpendicular axes.
-        u, _, v = np.linalg.svd(np.array(SHEARED)[:, :3] / [1.0, 1.0, np.hypot(0.6, 2.0)])
-        turn = u @ v
-        angle = np.arctan2(turn[2, 1], turn[1, 1])
-        path = write_nifti(
-            tmp_path / "a.nii.gz", qform=1, quaternion=(np.sin(angle / 2.0), 0.0, 0.0)
-        )
-    found = read_image_file(path)
-    (finding,) = found.findings
-    assert finding.code == "image-oblique"
-    assert "16.7°" in finding.what
-    assert _values_at(found.image, SHEARED, to_lps=(-1, -1, 1)) < 0.51
-
-
-def test_a_sheared_nrrd_is_resampled_by_its_own_map(tmp_path, linear):
-    path = write_nrrd(
-        tmp_path / "a.nrrd",
-        values=linear,
-        **{"space directions": "(1,0,0) (0,1,0) (0,0.6,2)", "space origin": "(5,6,7)"},
-    )
-    found = read_image_file(path)
-    assert [f.code for f in found.findings] == ["image-oblique"]
-    assert _values_at(found.image, SHEARED) < 0.51
-
-
-def test_two_maps_of_one_nifti_that_disagree_are_refused(tmp_path):
-    straight = [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 2, 7]]
-    assert not codes(write_nifti(tmp_path / "a.nii", qform=1, rows=straight))
-    mirrored = [[-1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 2, 7]]
-    refused(write_nifti(tmp_path / "b.nii", qform=1, rows=mirrored), "disagree by 6 mm", "qform")
-    shifted = [[1, 0, 0, 50], [0, 1, 0, 6], [0, 0, 2, 7]]
-    refused(write_nifti(tmp_path / "c.nii", qform=1, rows=shifted), "disagree by 45 mm")
-
-
-def test_a_template_space_is_not_taken_for_the_patient(tmp_path):
-    large = [[1.2, 0, 0, 5], [0, 1.2, 0, 6], [0, 0, 2.4, 7]]
-    found = read_image_file(write_nifti(tmp_path / "a.nii", qform=1, sform=4, rows=large))
-    np.testing.assert_allclose(found.image.spacing, [1.0, 1.0, 2.0])
-    assert [f.code for f in found.findings] == ["image-template-space"]
-
-
-@pytest.mark.parametrize(("units", "scale"), [(1, 1000.0), (2, 1.0), (3, 0.001)])
-@pytest.mark.parametrize("forms", [(1, 0), (0, 1), (1, 1)])
-def test_units_of_a_nifti_are_applied_to_spacing_and_place(tmp_path, units, scale, forms):
-    rows = np.array([[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 2, 7]]) / scale
-    path = write_nifti(
-        tmp_path / "a.nii",
-        qform=forms[0],
-        sform=forms[1],
-        rows=rows,
-        spacing=tuple(np.array([1.0, 1.0, 2.0]) / scale),
-        offset=tuple(np.array([5.0, 6.0, 7.0]) / scale),
-        units=units,
-    )
-    found = read_image_file(path)
-    np.testing.assert_allclose(found.image.spacing, [1.0, 1.0, 2.0], rtol=1e-5)
-    # R and A to L and P: the first voxel in LPS is the last along these axes.
-    np.testing.assert_allclose(found.image.lowest, [-8.0, -10.0, 7.0], rtol=1e-5)
-    assert not found.findings
-
-
-def test_what_a_file_does_not_state_is_reported(tmp_path):
-    straight = [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 2, 7]]
-    assert codes(write_nifti(tmp_path / "a.nii", units=0, rows=straight)) == ["image-unit-unstated"]
-    assert codes(write_nifti(tmp_path / "b.nii", sform=0)) == ["frame-unstated"]
-    bare = {"space": None, "space directions": None, "space origin": None, "spacings": "1 1 2"}
-    found = read_image_file(write_nrrd(tmp_path / "c.nrrd", **bare))
-    assert [f.code for f in found.findings] == ["frame-unstated"]
-    np.testing.assert_allclose(found.image.spacing, [1.0, 1.0, 2.0])
-    assert codes(write_nrrd(tmp_path / "d.nrrd", space="scanner-xyz")) == ["frame-unstated"]
-
-
-@pytest.mark.parametrize(
-    ("space", "signs"),
-    [
-        ("right-anterior-superior", (-1, -1, 1)),
-        ("LAS", (1, -1, 1)),
-        ("left-posterior-superior", (1, 1, 1)),
-    ],
-)
-def test_each_space_of_a_nrrd_is_brought_to_lps(tmp_path, linear, space, signs):
-    path = write_nrrd(tmp_path / "a.nrrd", space=space, values=linear)
-    affine = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 2, 3]]
-    assert _values_at(read_image(path), affine, to_lps=signs) < 1e-6
-
-
-def test_units_of_a_nrrd_and_a_meta_image_are_applied(tmp_path):
-    path = write_nrrd(
-        tmp_path / "a.nrrd",
-        **{
-            "space units": '"m" "m" "m"',
-            "space directions": "(0.001,0,0) (0,0.001,0) (0,0,0.002)",
-            "space origin": "(0.001,0.002,0.003)",
-        },
-    )
-    np.testing.assert_allclose(read_image(path).spacing, [1.0, 1.0, 2.0])
-    np.testing.assert_allclose(read_image(path).lowest, [1.0, 2.0, 3.0])
-    path = write_meta(tmp_path / "a.mha", DistanceUnits="cm")
-    np.testing.assert_allclose(read_image(path).spacing, [10.0, 10.0, 20.0])
-    np.testing.assert_allclose(read_image(path).lowest, [10.0, 20.0, 30.0])
-
-
-@pytest.mark.parametrize("suffix", [".nrrd", ".nii", ".nii.gz", ".mha"])
-@pytest.mark.parametrize("degrees", [0.0, 90.0, 7.0])
-def test_our_reading_of_a_header_is_that_of_itk(tmp_path, suffix, degrees):
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array(
-        [[1, 0, 0], [0, c, -s], [0, s, c]]
-    )
-    image = sitk.GetImageFromArray(VALUES.T)
-    image.SetSpacing([0.5, 0.75, 2.0])
-    image.SetOrigin([-20.0, 7.0, 100.0])
-    image.SetDirection(turn.ravel().tolist())
-    path = tmp_path / f"a{suffix}"
-    sitk.WriteImage(image, str(path))
-    # Disagreement would be an error.
-    readers = {".nrrd": nrrd_header, ".mha": meta_header}
-    affine = readers[suffix](path).affine if suffix in readers else read_nifti(path)[1]
-    expected = np.column_stack([turn * [0.5, 0.75, 2.0], [-20.0, 7.0, 100.0]])
-    np.testing.assert_allclose(affine, expected, atol=1e-5)
-    read_image(path)
 
 
 def test_an_image_is_read_by_its_content_whatever_its_name(tmp_path):
