@@ -1,59 +1,25 @@
 """DICOM series as scanners and archives give them: placed rightly, or refused by name."""
 
-import os
 import struct
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_scans import codes, noisy, refused, same, smooth
 
 import cmfsim
 import ct_variants as variants
-from cmfsim import ImageData, ImageError
-from cmfsim.io.images.dicom.series import dicom_files, dicom_places
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.images.image_grids import of_slices
-from dicom_series import axial, tilted, write_classic_frames, write_enhanced, write_series
+from dicom_series import axial, tilted, write_classic_frames, write_series
 from real_heads import data_folder
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
-SHAPE = (12, 10, 8)
-
-
-def smooth(shape=SHAPE, spacing=(0.5, 0.75, 2.0), origin=(-20.0, 7.0, 100.0)):
-    """Values linear in space, which linear interpolation keeps."""
-    image = ImageData(np.zeros(shape), spacing, origin)
-    x, y, z = image.axes()
-    return image.with_values(np.round(20.0 * x + 10.0 * y - 15.0 * z).astype(np.int16))
-
-
-def noisy():
-    values = np.random.default_rng(3).integers(-1000, 2000, SHAPE).astype(np.int16)
-    return ImageData(values, (0.5, 0.75, 2.0), (-20.0, 7.0, 100.0))
 
 
 def moved(slices, shift_of):
     """The same pixels, each slice shifted by shift_of(number) mm."""
     return [replace(s, position=s.position + shift_of(k)) for k, s in enumerate(slices)]
-
-
-def codes(found):
-    return {f.code for f in found.findings}
-
-
-def refused(folder, *words, **options):
-    with pytest.raises(ImageError) as caught:
-        read_image_file(folder, **options)
-    assert isinstance(caught.value, ValueError)
-    for word in words:
-        assert word in str(caught.value)
-
-
-def same(found, image):
-    np.testing.assert_array_equal(found.image.values, image.values)
-    np.testing.assert_allclose(found.image.spacing, image.spacing, atol=1e-6)
-    np.testing.assert_allclose(found.image.lowest, image.lowest, atol=1e-6)
 
 
 # Places ----------------------------------------------------------------------------------------
@@ -366,172 +332,6 @@ def test_a_slice_without_a_place_is_refused_by_name(tmp_path):
     path = tmp_path / "ct" / "1.2.3_0003.dcm"
     path.write_bytes(path.read_bytes().replace(b"-20\\7\\106", b"-20\\7\\ nan"[:9]))
     refused(tmp_path / "ct", "1.2.3_0003.dcm", "0020,0032")
-
-
-# Series ----------------------------------------------------------------------------------------
-
-
-def test_a_series_is_chosen_by_number_or_uid(tmp_path):
-    write_series(tmp_path / "ct", axial(noisy()), uid="1.2.3", number="4", description="soft")
-    other = noisy().with_values(noisy().values + np.int16(5))
-    write_series(tmp_path / "ct", axial(other), uid="1.2.4", number="5", description="sharp")
-    refused(tmp_path / "ct", "'soft'", "'sharp'", "number 4", "8 slices", "2 mm apart", "series =")
-    for wanted in ("5", "1.2.4"):
-        same(read_image_file(tmp_path / "ct", series=wanted), other)
-    refused(tmp_path / "ct", "'6'", "'soft'", series="6")
-
-
-def test_series_of_two_patients_or_studies_are_never_chosen_from(tmp_path):
-    long = smooth((6, 5, 40))
-    write_series(tmp_path / "ct", axial(long), uid="1.2.3", study="1.2")
-    write_series(tmp_path / "ct", axial(long)[:12], uid="1.2.4", study="1.5")
-    refused(tmp_path / "ct", "2 CT series")
-
-
-def test_other_modalities_under_one_series_are_skipped_and_reported(tmp_path):
-    write_series(tmp_path / "ct", axial(noisy()))
-    write_series(tmp_path / "ct", axial(noisy())[:2], modality="OT", names=["a", "b"])
-    found = read_image_file(tmp_path / "ct")
-    same(found, noisy())
-    assert codes(found) == {"dicom-series"}
-
-
-def test_a_series_asked_for_in_a_file_is_an_error(tmp_path):
-    cmfsim.write_image(noisy(), tmp_path / "a.nrrd")
-    refused(tmp_path / "a.nrrd", "series = '3'", series="3")
-
-
-# Frames ----------------------------------------------------------------------------------------
-
-
-def test_frames_are_placed_by_what_each_states(tmp_path):
-    slices = axial(noisy())
-    write_enhanced(tmp_path / "ct.dcm", [slices[i] for i in (3, 1, 0, 2, 7, 5, 6, 4)])
-    same(read_image_file(tmp_path / "ct.dcm"), noisy())
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "ct.dcm").rename(tmp_path / "folder" / "ct")
-    same(read_image_file(tmp_path / "folder"), noisy())
-
-
-def test_missing_frames_and_frames_of_several_scales_are_refused(tmp_path):
-    slices = axial(noisy())
-    write_enhanced(tmp_path / "gap.dcm", [s for k, s in enumerate(slices) if k != 3])
-    refused(tmp_path / "gap.dcm", "1 slice missing", "104.00 and 108.00 mm")
-    slices[2] = replace(slices[2], intercept=-1000.0)
-    write_enhanced(tmp_path / "scales.dcm", slices)
-    refused(tmp_path / "scales.dcm", "different rescale")
-
-
-@pytest.mark.parametrize("gap", [{0x00180088: "2"}, {0x00180050: "2"}, {0x3004000C: "offsets"}])
-def test_frames_of_a_classic_image_follow_the_first(tmp_path, gap):
-    """As cone-beam scanners write it; a warning where the file does not state the places."""
-    if 0x3004000C in gap:
-        gap = {0x3004000C: "\\".join(str(2.0 * k) for k in range(SHAPE[2]))}
-    write_classic_frames(tmp_path / "ct.dcm", axial(noisy()), gap)
-    found = read_image_file(tmp_path / "ct.dcm")
-    same(found, noisy())
-    assert codes(found) == (set() if 0x3004000C in gap else {"dicom-frames-assumed"})
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "ct.dcm").rename(tmp_path / "folder" / "ct")
-    same(read_image_file(tmp_path / "folder"), noisy())
-
-
-def test_frames_of_a_classic_image_without_place_or_distance_are_refused(tmp_path):
-    write_classic_frames(tmp_path / "a.dcm", axial(noisy()), {})
-    refused(tmp_path / "a.dcm", "SpacingBetweenSlices", "one file per slice")
-    write_classic_frames(tmp_path / "b.dcm", axial(noisy()), {0x00180088: "2"}, placed=False)
-    refused(tmp_path / "b.dcm", "position and orientation", "one file per slice")
-
-
-# Folders ---------------------------------------------------------------------------------------
-
-
-def parted(folder, places, **options):
-    """A series of which each slice lies in the folder of its place."""
-    write_series(folder / "all", axial(noisy()), **options)
-    for path, place in zip(sorted((folder / "all").iterdir()), places, strict=True):
-        (folder / place).mkdir(parents=True, exist_ok=True)
-        path.rename(folder / place / path.name)
-    (folder / "all").rmdir()
-
-
-@pytest.mark.parametrize("places", [["."] * 4 + ["MORE"] * 4, ["a"] * 3 + ["b/c"] * 5])
-def test_a_series_goes_on_in_folders_below(tmp_path, places):
-    parted(tmp_path / "ct", places)
-    found = read_image_file(tmp_path / "ct")
-    same(found, noisy())
-    (finding,) = found.findings
-    assert finding.code == "dicom-folders"
-    assert f"{places[-1]} ({places.count(places[-1])})" in finding.what
-
-
-def test_other_series_below_a_folder_are_none_of_its_own(tmp_path):
-    """A scan after the operation, in a folder below, unless it is asked for."""
-    after = noisy().with_values(noisy().values + np.int16(5))
-    write_series(tmp_path / "ct", axial(noisy()))
-    write_series(tmp_path / "ct" / "after", axial(after), uid="1.2.4", study="1.5")
-    found = read_image_file(tmp_path / "ct")
-    same(found, noisy())
-    assert not found.findings
-    same(read_image_file(tmp_path / "ct", series="1.2.4"), after)
-    assert dicom_places([tmp_path / "ct", tmp_path / "ct" / "after"]) == [
-        (tmp_path / "ct", None),
-        (tmp_path / "ct" / "after", None),
-    ]
-
-
-def test_folders_with_parts_of_one_series_are_one_place(tmp_path):
-    parted(tmp_path, ["a"] * 3 + ["b"] * 5)
-    folders = [tmp_path / "a", tmp_path / "b"]
-    assert dicom_places(folders) == [(tmp_path, None)]
-    write_series(tmp_path / "after", axial(noisy()), uid="1.2.4", study="1.5")
-    # The folder of both holds another series now: which one is meant, its UID says.
-    assert dicom_places([*folders, tmp_path / "after"]) == [
-        (tmp_path, "1.2.3"),
-        (tmp_path / "after", None),
-    ]
-    same(read_image_file(tmp_path, series="1.2.3"), noisy())
-    refused(tmp_path, "2 CT series")
-
-
-def test_a_change_in_a_folder_below_changes_the_hash_of_a_series(tmp_path):
-    parted(tmp_path / "ct", ["."] * 4 + ["MORE"] * 4)
-    before = dicom_files(tmp_path / "ct")
-    assert [p.parent.name for p in before] == ["ct"] * 4 + ["MORE"] * 4
-    (tmp_path / "ct" / "MORE" / "notes.txt").write_text("by hand")
-    assert dicom_files(tmp_path / "ct") == before
-
-
-def test_slices_that_are_links_are_read_and_broken_links_reported(tmp_path):
-    """As DataLad leaves a folder: each file links into a store, some of it not fetched."""
-    write_series(tmp_path / "store", axial(noisy()))
-    (tmp_path / "ct").mkdir()
-    for path in (tmp_path / "store").iterdir():
-        (tmp_path / "ct" / path.name).symlink_to(f"../store/{path.name}")
-    same(read_image_file(tmp_path / "ct"), noisy())
-    (tmp_path / "store" / "1.2.3_0007.dcm").unlink()
-    found = read_image_file(tmp_path / "ct")
-    assert found.image.values.shape[2] == SHAPE[2] - 1
-    (finding,) = found.findings
-    assert (finding.severity, finding.code) == ("warning", "dicom-skipped")
-    assert "1.2.3_0007.dcm" in finding.what
-    assert "datalad get" in finding.fix
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes are those of Linux")
-def test_names_that_are_not_utf_8_keep_no_library_from_a_file(tmp_path):
-    """SimpleITK ended the process, and readers failed, in a folder with an umlaut in Latin-1."""
-    folder = tmp_path / os.fsdecode(b"Pati\xe9nt")
-    folder.mkdir()
-    for ending in (".nrrd", ".nii.gz", ".mha"):
-        path = folder / (os.fsdecode(b"gr\xfcn") + ending)
-        cmfsim.write_image(noisy(), path)
-        same(read_image_file(path), noisy())
-    write_series(tmp_path / "ct", axial(noisy()))
-    (tmp_path / "ct").rename(folder / "ct")
-    same(read_image_file(folder / "ct"), noisy())
-    write_classic_frames(folder / "ct.dcm", axial(noisy()), {0x00180088: "2"})
-    same(read_image_file(folder / "ct.dcm"), noisy())
 
 
 # Real data -------------------------------------------------------------------------------------
