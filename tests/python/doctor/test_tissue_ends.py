@@ -1,7 +1,7 @@
 """Where tissue ends: planes that fix it close to what moves, borders that leave it loose."""
 
 import numpy as np
-from test_doctor import diagnosis, image_case
+from diagnosed_heads import diagnosis, image_case
 
 import cmfsim
 from cmfsim import Anatomy, BoneSegment, ImageData, NodeKinds, SurfaceData
