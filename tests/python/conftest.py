@@ -40,7 +40,7 @@ LONGEST = (
     "pipeline/test_prediction.py",
     "registration/test_jaw_evidence.py",
     "phantom/test_phantom.py",
-    "pipeline/test_build.py",
+    "pipeline/building/test_build.py",
     "imaging/test_plates.py",
     "pipeline/test_case_lips.py",
     "lab/virtual/test_demo.py",
