@@ -70,7 +70,7 @@ LONGEST = (
     "project/test_examples.py",
     "bones/test_planned_surfaces.py",
     "pipeline/test_turned_image.py",
-    "pipeline/test_stale_results.py",
+    "pipeline/outputs/test_stale_results.py",
     "imaging/test_alignment.py",
     "drafting/test_init_ledger.py",
     "bones/test_segment_checks.py",
