@@ -3,12 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from cmfsim.errors import CmfsimError
-from cmfsim.evaluation import SKIN_LANDMARKS
+import numpy as np
+
+from cmfsim.errors import CmfsimError, LandmarkInputError
+from cmfsim.evaluation import SKIN_LANDMARKS, skin_regions
 from cmfsim.pipeline.proposing import head_surfaces, propose_landmarks
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.prediction import Prediction
 
 
 @dataclass(frozen=True)
@@ -74,3 +77,19 @@ def _none(reason: str) -> Finding:
     return Finding(
         "regions-none", f"the face is not divided into regions: {reason}", where="landmarks.skin"
     )
+
+
+def face_motion(prediction: Prediction) -> dict[str, float]:
+    """How far the skin of the face moves on average, as "face_mean", mm.
+
+    Empty where the case has not all landmarks of the skin: nothing is looked for.
+    """
+    known = prediction.patient.landmarks.get("skin", {})
+    if any(name not in known for name in SKIN_LANDMARKS):
+        return {}
+    try:
+        face = skin_regions(prediction.skin_before.vertices, known)["face"]
+    except LandmarkInputError:
+        return {}
+    moved = np.linalg.norm(prediction.skin_displacements[face], axis=1)
+    return {"face_mean": float(moved.mean())} if len(moved) else {}

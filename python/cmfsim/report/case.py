@@ -208,12 +208,14 @@ def _prediction_section(
         (
             _named(entry["model"]),
             number(entry["skin"]["mean"]),
+            number(entry["skin"].get("face_mean")),
             number(entry["skin"]["p95"]),
             number(entry["skin"]["largest"]),
         )
         for entry in predictions
     )
-    table = Table(("model", "mean", "95 %", "largest"), rows, "How far the skin moves, mm.")
+    columns = ("model", "mean", "mean in the face", "95 %", "largest")
+    table = Table(columns, rows, "How far the skin moves, mm; all but one of what is simulated.")
     drawn: Sequence[Figure | Note] = [
         Figure(figure.image, f"{figure.caption} Model {shown['model']}.")
         for figure in _picture("prediction", pictures)

@@ -7,6 +7,7 @@ import pytest
 
 import cmfsim
 import shared_values
+from cmfsim.pipeline.face_regions import face_motion
 from cmfsim.values.landmark_sites import profile_sites
 
 # Sites that synthetic heads do not have, LPS mm: as on a lateral radiograph.
@@ -159,3 +160,10 @@ def test_figures_of_a_prediction_follow_its_plan(tmp_path_factory):
     assert "Gn" in rows["Mandibular plane to SN"]["absent"]
     face = {row["label"]: row["planned"] for row in figures["face"]}
     assert face["Nasolabial angle"] == cmfsim.measure_face(prediction)["nasolabial_angle"]
+    moved = np.linalg.norm(prediction.skin_displacements, axis=1)
+    mean = face_motion(prediction)["face_mean"]
+    # The upper jaw moves the face more than neck, forehead and cheeks beside it.
+    assert 1.2 * moved.mean() < mean < moved.max()
+    few = {**patient.landmarks, "skin": {"labiale_superius": lip}}
+    fewer = dataclasses.replace(prediction.patient, landmarks=few)
+    assert not face_motion(dataclasses.replace(prediction, patient=fewer))

@@ -372,6 +372,9 @@ def _shown(text: str) -> str:
 
 def _prediction_text(entry: dict[str, Any]) -> str:
     skin = entry["skin"]
+    average = f"{skin['mean']:.2f} mm on average"
+    if "face_mean" in skin:
+        average = f"{skin['face_mean']:.2f} mm on average in the face"
     residual = "unknown" if entry["residual"] is None else f"{entry['residual']:.1e}"
     lines = [
         f"model {entry['model']}",
@@ -381,7 +384,7 @@ def _prediction_text(entry: dict[str, Any]) -> str:
         gap = "unknown" if entry["contact_gap"] is None else f"{entry['contact_gap']:.1e} mm"
         lines.append(f"  contact     {entry['contact_iterations']} iterations, largest gap {gap}")
     lines += [
-        f"  skin moves  {skin['mean']:.2f} mm on average, {skin['largest']:.2f} mm at most",
+        f"  skin moves  {average}, {skin['largest']:.2f} mm at most",
         f"  time        {sum(entry['timings'].values()):.1f} s from the files to the face",
         f"  written     {escaped(entry['output'])}: {', '.join(entry['files'])}",
     ]

@@ -89,7 +89,7 @@ PREDICTION = {
     "versions": {str: str},
     "inputs": {str: str},
     "timings": {str: _SECONDS},
-    "skin": dict.fromkeys(("mean", "p95", "largest"), _SIZE),
+    "skin": dict.fromkeys(("mean", "face_mean?", "p95", "largest"), _SIZE),
     "plan": {str: _motion},
     "segments": {str: {"joined": COUNT, "sliding": COUNT}},
     "mesh": {str: object},

@@ -53,6 +53,7 @@ from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.painting import Painter
 from cmfsim.pipeline.building.stages import OnMuscles
 from cmfsim.pipeline.evaluating import CaseEvaluation
+from cmfsim.pipeline.face_regions import face_motion
 from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, page_state
 from cmfsim.planning.face_measures import clinical_figures
 from cmfsim.report import Document, Figure, case_document, findings_of, render_page
@@ -279,8 +280,10 @@ def _fill_model(
     fresh: Path, prediction: Prediction, clock: _Clock, *, drawing: _Drawing, slicer: bool
 ) -> WrittenPrediction:
     """The files of one prediction in its folder, with the pictures that are wanted."""
-    figures = clinical_figures(prediction)
-    prediction = replace(prediction, summary={**prediction.summary, "clinical": figures})
+    summary = prediction.summary
+    skin = {**summary["skin"], **face_motion(prediction)}
+    figures = {"skin": skin, "clinical": clinical_figures(prediction)}
+    prediction = replace(prediction, summary={**summary, **figures})
     place = drawing.place(prediction.model)
     (fresh / place).mkdir(exist_ok=True)
     begun = drawing.begin(prediction)
