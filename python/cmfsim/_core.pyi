@@ -47,6 +47,7 @@ __all__ = [
     "sample_muscles",
     "signed_distance_image",
     "stuff_image",
+    "tube_levels",
 ]
 
 _Floats: TypeAlias = NDArray[np.float64]
