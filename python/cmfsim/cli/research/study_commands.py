@@ -319,14 +319,14 @@ def report(options: argparse.Namespace) -> int:
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("writing the report")
         name = write_case_report(folder)
-        page = write_chart_page(folder) if options.pdf else None
+        pages = {"pdf": write_chart_page(folder)} if options.pdf else {}
     if name is None:
         return FAILED
     if options.json:
-        print(json.dumps({"output": str(folder), "report": name, "pdf": page}))
+        print(json.dumps({"output": str(folder), "report": name, **pages}))
     else:
-        _print_report(folder, name)
-        _print_report(folder, page)
+        for written in (name, *pages.values()):
+            _print_report(folder, written)
     return DONE
 
 
