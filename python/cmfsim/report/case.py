@@ -215,7 +215,8 @@ def _prediction_section(
         for entry in predictions
     )
     columns = ("model", "mean", "mean in the face", "95 %", "largest")
-    table = Table(columns, rows, "How far the skin moves, mm; all but one of what is simulated.")
+    caption = "How far the skin moves, mm: all that is simulated, and the face alone."
+    table = Table(columns, rows, caption)
     drawn: Sequence[Figure | Note] = [
         Figure(figure.image, f"{figure.caption} Model {shown['model']}.")
         for figure in _picture("prediction", pictures)
