@@ -117,11 +117,17 @@ def cephalometry(
     return found
 
 
-def missing_sites(landmarks: Mapping[str, ArrayLike], measure: Measure) -> str:
-    """The sites that a measure lacks, in words; empty if it lacks none."""
+def missing_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, str]:
+    """The sites that each measure lacks, by its key, in words; empty if it lacks none."""
     places = _projected(landmarks)
-    names = [name for name in dict.fromkeys(measure.sites) if name not in places]
-    return f"{', '.join(names)}: not given or found" if names else ""
+    missing = {
+        m.key: [name for name in dict.fromkeys(m.sites) if name not in places]
+        for m in CEPHALOMETRIC_MEASURES
+    }
+    return {
+        key: f"{', '.join(names)}: not given or found" if names else ""
+        for key, names in missing.items()
+    }
 
 
 def _head_axes(landmarks: Mapping[str, ArrayLike]) -> Floats:

@@ -55,7 +55,7 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
             CEPHALOMETRIC_MEASURES,
             cephalometry(before),
             cephalometry(after, before),
-            {m.key: missing_sites(before, m) for m in CEPHALOMETRIC_MEASURES},
+            missing_sites(before),
         ),
         "face": _rows(
             MEASURES,
