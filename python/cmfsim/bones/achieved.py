@@ -277,19 +277,10 @@ def measure_pair(
     operated on keeps its change along the normals. Otherwise the vertices are followed in rigid
     pieces (`coherent_motion`). `fit` is None if the shapes cannot be compared.
 
-    Parameters
-    ----------
-    before, after : SurfaceData
-        The same vertices and triangles in the same order, in one frame.
-    centre : (3,) float64, mm, optional
-        About which the turn is written. Default: the middle of the vertices before.
-    is_still : bool
-        Whether the bone was not operated on: changes on it are then no motion of the bone.
-
-    Raises
-    ------
-    RegistrationError
-        See `measure_motion`.
+    before, after: The same vertices and triangles in the same order, in one frame.
+    centre: (3,), mm, about which the turn is written. Default: the middle of the vertices before.
+    is_still: Whether the bone was not operated on: changes on it are then no motion of the bone.
+    Raises `RegistrationError`: See `measure_motion`.
     """
     found = measure_motion(before, after, centre=centre)
     if found.is_rigid:

@@ -159,16 +159,9 @@ def sheet_departure(
 ) -> tuple[float, float, float]:
     """How far a sheet lies from the bone where nodes slide: mean, 95th percentile and largest, mm.
 
-    Parameters
-    ----------
-    sheet, bone : SurfaceData
-    nodes : (n, 3) float64, mm
-        Those that slide: the bone's points closest to them are compared with the sheet.
-
-    Returns
-    -------
-    tuple of float
-        All 0 where no node is given.
+    nodes: (n, 3), mm. Those that slide: the bone's points closest to them are compared with the
+        sheet.
+    Returns: All 0 where no node is given.
     """
     points = as_rows("nodes", nodes, 3)
     if not len(points):

@@ -47,16 +47,11 @@ Integers = NDArray[np.int64]
 class RemovedBone:
     """A patch of bone that is missing after the operation.
 
-    Attributes
-    ----------
-    area : float, mm²
-        Of the surface before.
-    depth : float, mm
-        The largest distance of a vertex from where the motion of the rest would have moved it.
-    place : (3,) float64, mm
-        That vertex, before.
-    vertices : (n,) int64
-        Of the surface before, that lie in the patch.
+    area: mm², of the surface before.
+    depth: mm. The largest distance of a vertex from where the motion of the rest would have moved
+        it.
+    place: (3,), mm. That vertex, before.
+    vertices: (n,) int64, of the surface before, that lie in the patch.
     """
 
     area: float
@@ -70,10 +65,7 @@ def sound_motion(motion: MovedSurface) -> MovedSurface:
 
     Surface files contain some; points near them move with the triangles around them.
 
-    Raises
-    ------
-    BoundaryError
-        (also `ValueError`) No triangle is left.
+    Raises `BoundaryError`: No triangle is left.
     """
     here, there = motion.surface.vertices, motion.moved_vertices
     triangles = motion.surface.triangles.astype(np.int64)
@@ -96,14 +88,7 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
     A piece is connected by edges that are not torn. Those that moved alike are one piece, connected
     or not: islands of a skull stay with it.
 
-    Parameters
-    ----------
-    motion : MovedSurface
-        Without triangles that have no area (`sound_motion`).
-
-    Returns
-    -------
-    tuple of MovedSurface
+    motion: Without triangles that have no area (`sound_motion`).
     """
     here, there = motion.surface.vertices, motion.moved_vertices
     triangles = motion.surface.triangles.astype(np.int64)
@@ -146,21 +131,11 @@ def missing_patches(
 ) -> tuple[RemovedBone, ...]:
     """Patches of a segment that are missing from the post-operative bone after registration.
 
-    Parameters
-    ----------
-    segment : SurfaceData
-        Before.
-    bone : Surface
-        After; a surface that is not closed encloses nothing, so nothing is found with it.
-    moved : (n, 3) float64, mm
-        Where the motion of the segment takes its vertices, with its change of size.
-    shown : float, mm
-        What lies further from the post-operative bone may be outside its scan, not removed.
-
-    Returns
-    -------
-    tuple of RemovedBone
-        The largest first; without what lies too far away for the post-operative scan to show.
+    segment: Before.
+    bone: After; a surface that is not closed encloses nothing, so nothing is found with it.
+    moved: (n, 3), mm, where the motion of the segment takes its vertices, with its change of size.
+    shown: mm. What lies further from the post-operative bone may be outside its scan, not removed.
+    Returns: The largest first; without what lies too far away for the post-operative scan to show.
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)

@@ -29,14 +29,7 @@ __all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED", "main"]
 def main(arguments: Sequence[str] | None = None) -> int:
     """The exit code of one command: 0 done, 1 failed, 2 bad input.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Arguments after the program's name; by default those of the process.
-
-    Returns
-    -------
-    int
+    arguments: Arguments after the program's name; by default those of the process.
 
     Examples
     --------

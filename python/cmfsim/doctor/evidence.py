@@ -34,12 +34,7 @@ FAR_TOO_LONG = 4200.0
 class Body:
     """A surface of the case, as read and as it would be repaired.
 
-    Attributes
-    ----------
-    name : str
-        "skin", or the bone's.
-    where : str
-    surface : SurfaceData
+    name: "skin", or the bone's.
     """
 
     name: str
@@ -84,19 +79,10 @@ class Body:
 class Evidence:
     """What could be read of a case.
 
-    Attributes
-    ----------
-    case : Case
-    image : ImageData or None
-    skin : Body or None
-    bones : mapping of str to Body
-    skull_landmarks, skin_landmarks : mapping of str to (3,) float64, mm
-        Empty where there are none, or none could be read.
-    motions : mapping of str to (4, 4) float64, mm
-        Of the segments whose plan is a matrix.
-    findings : tuple of Finding
-    transforms : mapping of str to TransformFile
-        How the transform files of the plan were understood, by segment.
+    skull_landmarks, skin_landmarks: mapping of str to (3,), mm. Empty where there are none, or none
+        could be read.
+    motions: mapping of str to (4, 4), mm, of the segments whose plan is a matrix.
+    transforms: How the transform files of the plan were understood, by segment.
     """
 
     case: Case

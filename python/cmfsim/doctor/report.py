@@ -20,15 +20,9 @@ def findings_text(
 ) -> str:
     """The findings as lines, with a count at the end.
 
-    Parameters
-    ----------
-    findings : iterable of Finding
-    colour : bool
-        Whether the severity is coloured, for a terminal.
-    width : int
-        Columns at which lines wrap; 0 keeps each finding's parts on one line.
-    escape : callable
-        Makes a text from a file harmless for the terminal.
+    colour: Whether the severity is coloured, for a terminal.
+    width: Columns at which lines wrap; 0 keeps each finding's parts on one line.
+    escape: Makes a text from a file harmless for the terminal.
     """
     findings = list(findings)
     lines: list[str] = []

@@ -67,10 +67,8 @@ def legible(name: str) -> str:
 def quoted(text: str) -> str:
     """A TOML string.
 
-    Raises
-    ------
-    UnicodeEncodeError
-        (also `ValueError`) The text is the name of a file that is not UTF-8: no case can name it.
+    Raises `UnicodeEncodeError`: The text is the name of a file that is not UTF-8: no case can name
+        it.
     """
     text.encode()
     kept = (c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in text)
@@ -81,11 +79,7 @@ def quoted(text: str) -> str:
 class Text:
     """A case file as it is written, line by line, and the questions in it.
 
-    Attributes
-    ----------
-    lines : list of str
-    questions : list of str
-        The key and the question of each line that a person has to decide.
+    questions: The key and the question of each line that a person has to decide.
     """
 
     lines: list[str] = field(default_factory=list)
@@ -121,14 +115,8 @@ class Text:
     def ask(self, key: str, question: str, choices: Sequence[str], value: str = '"?"') -> None:
         """A key that a person decides: `doctor` refuses the file and repeats question and choices.
 
-        Parameters
-        ----------
-        key : str
-        question : str
-        choices : sequence of str
-            What may be written instead.
-        value : str
-            TOML that holds "?".
+        choices: What may be written instead.
+        value: TOML that holds "?".
         """
         place = f"{self._table}.{key}".lstrip(".")
         self.questions.append(f"{place}: {question}")

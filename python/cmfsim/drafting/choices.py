@@ -20,16 +20,9 @@ OFFSET_RANGE = (1500.0, 5000.0)
 class Images:
     """The CT of a case, the one after the operation, and what was noticed.
 
-    Attributes
-    ----------
-    ct, after : ImageFind or None
-    question : tuple of (str, tuple of str) or None
-        Which of several images is the CT, with the choices.
-    rescale : tuple of (str, tuple of str) or None
-        The question what takes the values to HU.
-    scale : str
-        What does, where that is clear.
-    taken : list of Taken
+    question: Which of several images is the CT, with the choices.
+    rescale: The question what takes the values to HU.
+    scale: What does, where that is clear.
     """
 
     ct: ImageFind | None = None
@@ -127,14 +120,8 @@ def _said(find: ImageFind) -> str:
 class Marks:
     """The landmarks of a case.
 
-    Attributes
-    ----------
-    skull, skin, after : LandmarkFind or None
-    frame : str or None
-        What the case states for files that state none.
-    questions : dict of str to (str, tuple of str)
-        By key of [landmarks].
-    taken : list of Taken
+    frame: What the case states for files that state none.
+    questions: By key of [landmarks].
     """
 
     skull: LandmarkFind | None = None
@@ -159,11 +146,7 @@ class Marks:
 def choose_landmarks(found: Sequence[LandmarkFind], box: Floats | None) -> Marks:
     """Skull and skin landmarks among files of points.
 
-    Parameters
-    ----------
-    found : sequence of LandmarkFind
-    box : (2, 3) float64, mm, LPS, or None
-        Where the head is, for files that do not state their frame.
+    box: (2, 3), mm, LPS, or None, where the head is, for files that do not state their frame.
     """
     marks = Marks()
     kinds: dict[str, list[LandmarkFind]] = {}

@@ -87,21 +87,11 @@ def draft_case(
 ) -> CaseDraft:
     """The case file of what was gathered.
 
-    Parameters
-    ----------
-    found : Gathered
-    unpacked : Path
-        Where the files of a bundle lie for now.
-    name : str
-        Of the case.
-    typed : TypedPlan, optional
-        Cuts and motions besides those that files state.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) What is there makes no case: neither a CT, nor a skin with a bone; cuts
-        or motions that do not suit it.
+    unpacked: Where the files of a bundle lie for now.
+    name: Of the case.
+    typed: Cuts and motions besides those that files state.
+    Raises `CaseError`: What is there makes no case: neither a CT, nor a skin with a bone; cuts or
+        motions that do not suit it.
     """
     typed = typed or TypedPlan()
     draft = _decide(found, unpacked)

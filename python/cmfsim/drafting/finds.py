@@ -65,28 +65,14 @@ PREAMBLE = 128
 class SurfaceFind:
     """A surface, in its file's own numbers.
 
-    Attributes
-    ----------
-    label : str
-        What reports call it: its path, or its scene and node.
-    role : NameRole
-    path : Path
-        The file; for a segment of a segmentation, that of all segments.
-    surface : SurfaceData
-    stated : str or None
-        The frame that its header, or its scene, states.
-    is_silent : bool
-        Whether the file itself states none: its scene does, or nothing.
-    is_closed : bool
-    to_world : (4, 4) float64, mm, LPS
-        What its scene applies to it.
-    chain : tuple of str
-        The names of the transforms that do, the nearest first.
-    in_scene : bool
-    is_made : bool
-        Whether it was made of voxels: it has no file of its own.
-    joined : tuple of str
-        The labels of the teeth that were added to it.
+    label: What reports call it: its path, or its scene and node.
+    path: The file; for a segment of a segmentation, that of all segments.
+    stated: The frame that its header, or its scene, states.
+    is_silent: Whether the file itself states none: its scene does, or nothing.
+    to_world: (4, 4), mm, LPS. What its scene applies to it.
+    chain: The names of the transforms that do, the nearest first.
+    is_made: Whether it was made of voxels: it has no file of its own.
+    joined: The labels of the teeth that were added to it.
     """
 
     label: str
@@ -118,27 +104,16 @@ class SurfaceFind:
 class ImageFind:
     """A CT, or another image.
 
-    Attributes
-    ----------
-    label, role, path
-        As of a surface; `path` is a folder for DICOM.
-    modality : str
-        Of DICOM; empty where the file does not state it.
-    values : tuple of float
-        Lowest and highest.
-    words : str
-        Its size and spacing.
-    box : (2, 3) float64, mm, LPS
-        Its lowest and highest corner.
-    error : str
-        Why it cannot be read; empty if it can.
-    series : str or None
-        UID of the DICOM series that is meant, where the folder holds several.
-    is_labels : bool
-        Whether its values are labels of segments, and not those of a CT.
-    to_hu : tuple of float or None
-        Slope and offset to HU and the expected error at bone, HU, where the values are not HU and
-        their peaks clearly give the scale.
+    label, role, path: As of a surface; `path` is a folder for DICOM.
+    modality: Of DICOM; empty where the file does not state it.
+    values: Lowest and highest.
+    words: Its size and spacing.
+    box: (2, 3), mm, LPS. Its lowest and highest corner.
+    error: Why it cannot be read; empty if it can.
+    series: UID of the DICOM series that is meant, where the folder holds several.
+    is_labels: Whether its values are labels of segments, and not those of a CT.
+    to_hu: Slope and offset to HU and the expected error at bone, HU, where the values are not HU
+        and their peaks clearly give the scale.
     """
 
     label: str
@@ -193,12 +168,8 @@ class OtherFind:
 class Listing:
     """The paths in a folder, by what their endings say.
 
-    Attributes
-    ----------
-    unread : dict of (Path, str) to list of Path
-        What no case reads, by its folder and the reason.
-    seen : list of Path
-        Every file, read or not.
+    unread: What no case reads, by its folder and the reason.
+    seen: Every file, read or not.
     """
 
     surfaces: list[Path] = field(default_factory=list)
@@ -233,10 +204,7 @@ class Listing:
 def listing(folder: Path) -> Listing:
     """The files of a folder and those below it, by kind.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) More files than a case has.
+    Raises `CaseError`: More files than a case has.
     """
     found = Listing()
     dicom: dict[Path, None] = {}
@@ -328,10 +296,7 @@ def _is_dicom(path: Path) -> bool:
 def surface_find(path: Path, label: str) -> SurfaceFind:
     """A surface file, read.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) As `read_surface`.
+    Raises `CaseError`: As `read_surface`.
     """
     read = surface_as_stored(path)
     surface, stated = read.surface, read.frame
@@ -409,10 +374,7 @@ def _are_turned_labels(path: Path, findings: tuple[Finding, ...]) -> bool:
 def landmark_find(path: Path, label: str) -> LandmarkFind:
     """A file of landmarks, read.
 
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) As `read_landmarks`.
+    Raises `LandmarkError`: As `read_landmarks`.
     """
     name = path.name.partition(".")[0]
     return LandmarkFind(label, name_role(name), path, read_landmark_file(path))

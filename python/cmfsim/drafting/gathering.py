@@ -40,20 +40,12 @@ Found = TypeVar("Found")
 class Gathered:
     """What was found, by kind.
 
-    Attributes
-    ----------
-    scene : str
-        The label of the scene that was read; empty if there is none.
-    by_slicer : bool
-        Whether 3D Slicer saved any of the files.
-    seen : list of Path
-        Every file of the folder.
-    names : list of Path
-        Those with the names of labels.
-    scene_files : set of Path
-        Those that the scene names.
-    links : dict of str to tuple of str
-        The transforms of the scene, with what lies directly under each.
+    scene: The label of the scene that was read; empty if there is none.
+    by_slicer: Whether 3D Slicer saved any of the files.
+    seen: Every file of the folder.
+    names: Those with the names of labels.
+    scene_files: Those that the scene names.
+    links: The transforms of the scene, with what lies directly under each.
     """
 
     folder: Path
@@ -80,20 +72,10 @@ def gather(
 ) -> Gathered:
     """What a folder holds.
 
-    Parameters
-    ----------
-    folder : Path
-    scene : Path or None
-        The scene that is meant; else the only one of the folder.
-    unpacked : Path
-        An empty folder for the files of a bundle.
-    progress : callable
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Several scenes; a scene that is damaged or hostile; a transform of a
-        scene that is not rigid.
+    scene: The scene that is meant; else the only one of the folder.
+    unpacked: An empty folder for the files of a bundle.
+    Raises `CaseError`: Several scenes; a scene that is damaged or hostile; a transform of a scene
+        that is not rigid.
     """
     found = Gathered(folder)
     paths = listing(folder)

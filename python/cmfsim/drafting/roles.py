@@ -86,18 +86,12 @@ UPPER_QUADRANTS = "1256"
 class NameRole:
     """The meaning of a name.
 
-    Attributes
-    ----------
-    part : str
-        "skin", "bone" (a skull with its jaw), "cranium", one of `MOVING`, "upper teeth", "lower
+    part: "skin", "bone" (a skull with its jaw), "cranium", one of `MOVING`, "upper teeth", "lower
         teeth", "teeth" (of which jaw, the name does not say), "other" (no bone of a case), or
         empty: the name does not say it.
-    is_after : bool
-        Of the patient after the operation.
-    registers : bool
-        Of a transform: it brings data together, and is no plan.
-    word : str
-        What in the name says it.
+    is_after: Of the patient after the operation.
+    registers: Of a transform: it brings data together, and is no plan.
+    word: What in the name says it.
     """
 
     part: str

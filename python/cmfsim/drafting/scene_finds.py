@@ -26,11 +26,7 @@ SLICE_MODELS = "Volume Slice"
 class LooseMotion:
     """A transform of a scene that is applied to nothing: hardened, or never used.
 
-    Attributes
-    ----------
-    label : str
-    role : NameRole
-    matrix : (4, 4) float64, mm, LPS
+    matrix: (4, 4), mm, LPS.
     """
 
     label: str
@@ -57,11 +53,8 @@ class SceneFinds:
 def scene_finds(scene: SlicerScene, label: str) -> SceneFinds:
     """The models, segments, volumes, markups and transforms of a scene.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) What a case would be made of lies under a transform that is not rigid,
-        or that cannot be read.
+    Raises `CaseError`: What a case would be made of lies under a transform that is not rigid, or
+        that cannot be read.
     """
     found = SceneFinds()
     for node in scene.nodes.values():

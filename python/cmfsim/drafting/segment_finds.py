@@ -59,12 +59,8 @@ def segment_finds(files: Sequence[tuple[Path, str]]) -> SegmentFinds:
     Teeth are added to the jaw that their name says, where both have the same grid; so are the bones
     that a label image cuts out of its skin.
 
-    Parameters
-    ----------
-    files : sequence of (Path, str)
-        Files of segments or labels, each with what reports call it. One mask per file is a segment
-        that is named after its file.
-
+    files: Files of segments or labels, each with what reports call it. One mask per file is a
+        segment that is named after its file.
     """
     masks: list[_Mask] = []
     others: list[OtherFind] = []

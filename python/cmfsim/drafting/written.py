@@ -36,14 +36,10 @@ SAME = 1e-9
 class Shown:
     """Where everything lies, and how it moves, as a draft reports it.
 
-    Attributes
-    ----------
-    surfaces : dict of str to (v, 3) float64, mm, LPS
-        By the path that the case names.
-    landmarks : dict of str to mapping of str to (3,) float64, mm, LPS
-        By "skull", "skin" and "landmarks_after".
-    motions : dict of str to (4, 4) float64, mm, LPS
-        By segment.
+    surfaces: dict of str to (v, 3), mm, LPS, by the path that the case names.
+    landmarks: dict of str to mapping of str to (3,), mm, LPS, by "skull", "skin" and
+        "landmarks_after".
+    motions: dict of str to (4, 4), mm, LPS, by segment.
     """
 
     surfaces: dict[str, Floats] = field(default_factory=dict)
@@ -79,20 +75,10 @@ def unaccounted(found: Gathered, plan: Plan, taken: Sequence[Taken]) -> list[Tak
 def check_written(file: Path, shown: Shown, *, is_open: bool) -> None:
     """Loads a case that was written, and compares it with what was shown.
 
-    Parameters
-    ----------
-    file : Path
-        The case file.
-    shown : Shown
-    is_open : bool
-        Whether questions are left: the case cannot be loaded as a whole, then.
-
-    Raises
-    ------
-    CaseError
-        Something is missing, or lies or moves otherwise.
-    CaseInputError
-        The case cannot be loaded, although no question is left.
+    file: The case file.
+    is_open: Whether questions are left: the case cannot be loaded as a whole, then.
+    Raises `CaseError`: Something is missing, or lies or moves otherwise.
+    Raises `CaseInputError`: The case cannot be loaded, although no question is left.
     """
     if not is_open:
         try:
@@ -164,14 +150,9 @@ def _motions(plan: Any, folder: Path, shown: Shown) -> Iterator[str]:
 class Place:
     """How the surfaces of a table of the case are placed.
 
-    Attributes
-    ----------
-    frame : str or None
-        What the table states.
-    shown : str or None
-        The frame of the files that state none.
-    matrix : callable
-        What carries a surface from its own coordinates to those of the case, LPS mm.
+    frame: What the table states.
+    shown: The frame of the files that state none.
+    matrix: What carries a surface from its own coordinates to those of the case, LPS mm.
     """
 
     frame: str | None

@@ -110,15 +110,10 @@ class Skin:
 class Matches:
     """Vertices of one skin with their partners on another.
 
-    Attributes
-    ----------
-    vertices : (k,) int64
-        Those that were kept.
-    partners : (k, 3) float64, mm
-    signed : (k,) float64, mm
-        Distance to the partner; negative where the vertex lies behind the other skin.
-    n_border, n_far : int
-        Left out because the partner lies on the other skin's border; or too far away.
+    vertices: (k,) int64. Those that were kept.
+    partners: (k, 3), mm.
+    signed: (k,), mm. Distance to the partner; negative where the vertex lies behind the other skin.
+    n_border, n_far: Left out because the partner lies on the other skin's border; or too far away.
     """
 
     vertices: NDArray[np.int64]

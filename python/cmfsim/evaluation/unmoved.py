@@ -28,16 +28,10 @@ MOST_CHANGE = 0.5
 class ThicknessChange:
     """The change of the soft tissue's thickness, as one fraction of its depth.
 
-    Attributes
-    ----------
-    share : float
-        Of the depth; negative where it became thinner.
-    n : int
-        Vertices that it was fitted at.
-    depth : float, mm
-        Mean depth of the soft tissue there.
-    before, after : float, mm
-        Mean |distance| there without and with the change.
+    share: Of the depth; negative where it became thinner.
+    n: Vertices that it was fitted at.
+    depth: mm. Mean depth of the soft tissue there.
+    before, after: mm. Mean |distance| there without and with the change.
     """
 
     share: float
@@ -65,24 +59,11 @@ def compare_unmoved(
 ) -> SkinComparison | None:
     """The face before against the face after, where nothing was operated on.
 
-    Parameters
-    ----------
-    preoperative, postoperative : SurfaceData
-    regions : mapping of str to (v,) bool
-        Of the pre-operative skin: `unmoved_regions`.
-    moved : (v,) float64, mm
-        How far each vertex is moved by the model that moves it most.
-
-    Returns
-    -------
-    SkinComparison or None
-        By closest points: nothing slides along itself there. None where fewer than 20 vertices of
-        the regions stay, as on a mesh that ends below the forehead.
-
-    Raises
-    ------
-    RegistrationError
-        (also `ValueError`) None of them has a partner: the scan after ends below the forehead.
+    regions: mapping of str to (v,) bool, of the pre-operative skin: `unmoved_regions`.
+    moved: (v,), mm. How far each vertex is moved by the model that moves it most.
+    Returns: By closest points: nothing slides along itself there. None where fewer than 20 vertices
+        of the regions stay, as on a mesh that ends below the forehead.
+    Raises `RegistrationError`: None of them has a partner: the scan after ends below the forehead.
     """
     still = moved < STILL
     parts: dict[str, NDArray[np.bool_]] = {n: np.asarray(p) & still for n, p in regions.items()}

@@ -49,20 +49,12 @@ NOT_PLACED = frozenset({"0", "1"})
 class LandmarkFile:
     """The landmarks of a file, and what to know about them.
 
-    Attributes
-    ----------
-    points : mapping of str to (3,) float64, mm
-        LPS, by label, in the order of the file.
-    frame : str
-        The frame of the numbers in the file, "LPS" or "RAS".
-    stated : bool
-        Whether the file states it.
-    findings : tuple of Finding
-        An unstated frame, points that were never placed.
-    unset : tuple of str
-        The labels of the points that were never placed.
-    descriptions : mapping of str to str
-        Of the points that have one, by label.
+    points: mapping of str to (3,), mm. LPS, by label, in the order of the file.
+    frame: The frame of the numbers in the file, "LPS" or "RAS".
+    stated: Whether the file states it.
+    findings: An unstated frame, points that were never placed.
+    unset: The labels of the points that were never placed.
+    descriptions: Of the points that have one, by label.
     """
 
     points: Mapping[str, Floats]

@@ -55,12 +55,8 @@ class Markup:
 def markup_text(path: Path) -> str:
     """The text of a file of landmarks.
 
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    LandmarkError
-        (also `ValueError`) A folder, too large, not UTF-8.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `LandmarkError`: A folder, too large, not UTF-8.
     """
     check_readable(path, LandmarkInputError)
     size = path.stat().st_size
@@ -185,16 +181,9 @@ def read_curves(path: str | os.PathLike[str]) -> tuple[Floats, ...]:
     A closed curve ends where it starts. A file that states no frame is read as LPS, as Slicer's
     schema says.
 
-    Returns
-    -------
-    tuple of (n, 3) float64, mm
-
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    LandmarkError
-        (also `ValueError`) Not such a file, another markup, a curve of one point.
+    Returns: tuple of (n, 3), mm.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `LandmarkError`: Not such a file, another markup, a curve of one point.
     """
     path = Path(path)
     text = markup_text(path)

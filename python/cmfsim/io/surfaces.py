@@ -32,12 +32,7 @@ _log = logging.getLogger(__name__)
 class SurfaceFile:
     """A surface with what its file states and what was found on it.
 
-    Attributes
-    ----------
-    surface : SurfaceData
-    frame : str or None
-        The frame that the header states, if it does.
-    findings : tuple of Finding
+    frame: The frame that the header states, if it does.
     """
 
     surface: SurfaceData

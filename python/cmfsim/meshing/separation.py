@@ -12,13 +12,9 @@ from cmfsim.values.surface_data import SurfaceData
 class SeparatedMesh:
     """A mesh that was separated, and where its new nodes come from.
 
-    Attributes
-    ----------
-    mesh : TetMesh
-        Nodes keep their numbers; new ones follow.
-    parents : (k, 2) uint32
-        Of each new node, the ends of the edge that was cut there, or twice the node that it is a
-        copy of.
+    mesh: Nodes keep their numbers; new ones follow.
+    parents: (k, 2) uint32, of each new node, the ends of the edge that was cut there, or twice the
+        node that it is a copy of.
     """
 
     mesh: TetMesh
@@ -28,10 +24,7 @@ class SeparatedMesh:
 def separated_mesh(mesh: TetMesh, surface: SurfaceData) -> SeparatedMesh:
     """The mesh separated along an open surface, as `part_mesh`, with the origin of its new nodes.
 
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) The surface runs through no tissue.
+    Raises `MeshError`: The surface runs through no tissue.
     """
     return SeparatedMesh(*_core.part_mesh(mesh, Surface(surface.vertices, surface.triangles)))
 

@@ -107,12 +107,8 @@ def to_surface(
 def level_surface(field: Field, low: Floats, high: Floats, spacing: float) -> SurfaceData:
     """The closed zero surface of a level within a box, normals outward.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The spacing is too coarse: no point of the grid lies inside.
-    ImportError
-        scikit-image is not installed.
+    Raises `CaseError`: The spacing is too coarse: no point of the grid lies inside.
+    Raises `ImportError`: scikit-image is not installed.
     """
     try:
         from skimage.measure import marching_cubes  # noqa: PLC0415

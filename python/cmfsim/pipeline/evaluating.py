@@ -311,10 +311,7 @@ def _not_shown(reason: str) -> Finding:
 def evaluation_key(case: Case, models: Sequence[str]) -> str:
     """The SHA-256 of everything that an evaluation depends on: inputs, models and version.
 
-    Raises
-    ------
-    OSError
-        A file that the case names cannot be read.
+    Raises `OSError`: A file that the case names cannot be read.
     """
     content = {"case": case_key(case), "models": sorted(models)}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -31,14 +31,8 @@ def check_face_after(
 
     They are errors, unless the case states that the face is verified.
 
-    Parameters
-    ----------
-    case : Case
-    comparison : ModelComparison
-    unmoved : SkinComparison or None
-        The faces before and after where nothing was operated on, where it is known.
-    moved : mapping of str to (v,) float64, mm
-        How far each model moves each vertex of the skin.
+    unmoved: The faces before and after where nothing was operated on, where it is known.
+    moved: mapping of str to (v,), mm. How far each model moves each vertex of the skin.
     """
     given = case.postoperative
     severity = "warning" if given is not None and given.verified else "error"
@@ -81,10 +75,7 @@ def _is_unchanged(comparison: ModelComparison) -> bool:
 def refuse_other_face(findings: Iterator[Finding]) -> tuple[Finding, ...]:
     """The findings, where none is an error.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) One is.
+    Raises `CaseError`: One is.
     """
     found = tuple(findings)
     for finding in found:

@@ -18,12 +18,9 @@ from cmfsim.values.prediction import Prediction
 class FaceLandmarks:
     """Landmarks that place the regions of a face.
 
-    Attributes
-    ----------
-    points : mapping of str to (3,) float64, mm
-        All of `SKIN_LANDMARKS`; empty where they are neither given nor found.
-    findings : tuple of Finding
-        That they were proposed, or why there are none.
+    points: mapping of str to (3,), mm. All of `SKIN_LANDMARKS`; empty where they are neither given
+        nor found.
+    findings: That they were proposed, or why there are none.
     """
 
     points: Mapping[str, Floats]
@@ -35,10 +32,6 @@ def face_landmarks(patient: PatientModel) -> FaceLandmarks:
 
     Those of the case where it has all of them; else they are proposed on its surfaces, which takes
     a few seconds. Proposed ones place regions, and nothing else: no distance depends on them.
-
-    Parameters
-    ----------
-    patient : PatientModel
     """
     known = patient.landmarks.get("skin", {})
     if patient.landmarks_are_found:

@@ -56,21 +56,10 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
     surface. A missing site is doubtful if its expected error is above `GOOD_ERROR`, and stays
     missing above `MOST_ERROR`.
 
-    Parameters
-    ----------
-    head : ProposedHead
-        With what was proposed, which may be nothing.
-    given : mapping of (kind, label) to point (mm) and state
-
-    Returns
-    -------
-    ProposedLandmarks
-        With the origin of each site.
-
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) A given site lies on none of the bones, or not on the skin.
+    head: With what was proposed, which may be nothing.
+    given: mapping of (kind, label) to point (mm) and state.
+    Returns: With the origin of each site.
+    Raises `LandmarkError`: A given site lies on none of the bones, or not on the skin.
     """
     before = head_distribution(head)
     points = {key: point for key, (point, _) in given.items()}

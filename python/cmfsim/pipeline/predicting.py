@@ -143,10 +143,7 @@ def predictions_of(
 def named_models(models: str | Sequence[str]) -> tuple[str, ...]:
     """Models by name, each once, in the order given.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) None, or another name: with the one that was meant, it seems.
+    Raises `CaseError`: None, or another name: with the one that was meant, it seems.
     """
     named = (models,) if isinstance(models, str) else tuple(dict.fromkeys(models))
     if not named:
@@ -171,10 +168,7 @@ def build_patient(
 ) -> PatientModel:
     """The patient as models need it: muscles are placed if one of them has muscles.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A file of the case changed while the work went on.
+    Raises `CaseError`: A file of the case changed while the work went on.
     """
     case, options = as_case(case), options or BuildOptions()
     # Before the files are read: the key must be that of what is built.

@@ -32,23 +32,12 @@ def prepare(
 ) -> None:
     """Finds before any work what would end it late.
 
-    Parameters
-    ----------
-    case : Case
-    is_written : callable
-        Whether a file of a name is written to the output folder.
-    report : bool
-        Whether a report is written.
-    evaluation : bool
-        Whether predictions are compared with the face after the operation.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Packages are missing, all named in one line; the output folder is a
-        file, leads out of the case's folder, or holds an input of a name that is written there.
-    OSError
-        The output folder cannot be written to.
+    is_written: Whether a file of a name is written to the output folder.
+    report: Whether a report is written.
+    evaluation: Whether predictions are compared with the face after the operation.
+    Raises `CaseError`: Packages are missing, all named in one line; the output folder is a file,
+        leads out of the case's folder, or holds an input of a name that is written there.
+    Raises `OSError`: The output folder cannot be written to.
     """
     check_output(case, is_written)
     check_extras(_needs(case, report=report, evaluation=evaluation))

@@ -89,10 +89,7 @@ def propose_landmarks(
 def head_surfaces(anatomy: Anatomy) -> tuple[dict[str, SurfaceData], SurfaceData | None]:
     """The bones and the skin of a head as surfaces: as given, or those of its levels.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) scikit-image is missing.
+    Raises `CaseError`: scikit-image is missing.
     """
     levels = {**anatomy.bones, "skin": anatomy.skin}
     found: dict[str, SurfaceData] = {}
@@ -117,15 +114,8 @@ def head_surfaces(anatomy: Anatomy) -> tuple[dict[str, SurfaceData], SurfaceData
 class ProposedHead:
     """A head with the landmarks that were found on it.
 
-    Attributes
-    ----------
-    anatomy : Anatomy
-        The one given, or the one with the jaws separated again.
-    bones : mapping of str to SurfaceData
-    skin : SurfaceData or None
-    landmarks : ProposedLandmarks
-    findings : tuple of Finding
-        What was noticed beyond those of anatomy and landmarks.
+    anatomy: The one given, or the one with the jaws separated again.
+    findings: What was noticed beyond those of anatomy and landmarks.
     """
 
     anatomy: Anatomy
@@ -151,18 +141,11 @@ def proposed_head(
     doubtful. If the second jaw is worse, the first one stays. Where the first jaw shows no teeth,
     as in a head that nods far forwards, an average head's separate it, and then the patient's own.
 
-    Parameters
-    ----------
-    case : Case
-    anatomy : Anatomy
-    stage : callable
-        Called with the name of each stage.
-    templates : sequence of Path, optional
-        Folders of template heads besides those that the case names.
-    is_read : bool
-        Whether the anatomy is what `read_anatomy` makes of the case: any other keeps its jaws.
-    placed : mapping of str to (3,) float64, mm, optional
-        Sites of the skull that a person placed, which separate the jaws wherever they contradict.
+    stage: Called with the name of each stage.
+    templates: Folders of template heads besides those that the case names.
+    is_read: Whether the anatomy is what `read_anatomy` makes of the case: any other keeps its jaws.
+    placed: mapping of str to (3,), mm. Sites of the skull that a person placed, which separate the
+        jaws wherever they contradict.
     """
     placed = placed or {}
     heads = [read_template_head(folder) for folder in (*case.landmarks.templates, *templates)]
@@ -275,12 +258,8 @@ def read_template_head(folder: Path) -> TemplateHead:
     The folder holds `cranium.*`, `mandible.*` and, where known, `skin.*` (PLY, STL, OBJ, VTP; LPS
     mm), `skull_landmarks.mrk.json` and, where known, `skin_landmarks.mrk.json`.
 
-    Raises
-    ------
-    FileNotFoundError
-        The folder has no cranium or no skull landmarks.
-    CmfsimError
-        (also `ValueError`) A file cannot be read.
+    Raises `FileNotFoundError`: The folder has no cranium or no skull landmarks.
+    Raises `CmfsimError`: A file cannot be read.
     """
     surfaces = {
         name: read_surface(path)

@@ -14,16 +14,8 @@ def least_volume_ratios(tensors: MassTensors, displacements: ArrayLike) -> Float
     det F, which is one number for a linear tet. In a quadratic one it varies: the least of its
     middle and its corners is taken, so that what inverts between these alone is not seen.
 
-    Parameters
-    ----------
-    tensors : MassTensors
-    displacements : (n, 3) float64, mm
-        Of every node of `tensors.nodes`: `Solution.all_displacements`.
-
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) Displacements of another number of nodes, or not finite.
+    displacements: (n, 3), mm, of every node of `tensors.nodes`: `Solution.all_displacements`.
+    Raises `MeshError`: Displacements of another number of nodes, or not finite.
 
     Examples
     --------
@@ -72,21 +64,10 @@ def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[i
     Linear kinematics has no use for it: its tets keep their strain however they turn, and a
     negative volume is an error of the linear model rather than of the solution.
 
-    Parameters
-    ----------
-    tensors : MassTensors
-    displacements : (n, 3) float64, mm
-        As for `least_volume_ratios`, of a solution by "corotational" or "hyperelastic" kinematics.
-
-    Returns
-    -------
-    tuple of int and Finding or None
-        The finding's code is "inverted-tets".
-
-    Raises
-    ------
-    MeshError
-        As `least_volume_ratios`.
+    displacements: (n, 3), mm. As for `least_volume_ratios`, of a solution by "corotational" or
+        "hyperelastic" kinematics.
+    Returns: The finding's code is "inverted-tets".
+    Raises `MeshError`: As `least_volume_ratios`.
 
     Examples
     --------

@@ -109,15 +109,7 @@ def predict_patient(
 
 @dataclass(frozen=True, eq=False)
 class SolvedPatient:
-    """A prediction with what solved it, for whoever goes on from there.
-
-    Attributes
-    ----------
-    prediction : Prediction
-    scene : Scene
-    solver : StaticSolver
-    solution : Solution
-    """
+    """A prediction with what solved it, for whoever goes on from there."""
 
     prediction: Prediction
     scene: Scene
@@ -130,12 +122,7 @@ def solved_patient(
 ) -> SolvedPatient:
     """The prediction of `predict_patient`, with its solver and solution.
 
-    Parameters
-    ----------
-    patient : PatientModel
-    model : str
-    solver : StaticSolver, optional
-        As for `predict_patient`.
+    solver: As for `predict_patient`.
     """
     scene = model_scene(patient, model)
     begun = time.perf_counter()
@@ -288,23 +275,16 @@ def _stays(motion: Floats | MovedSurface) -> bool:
 def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
     """The warning that a predicted skin is torn or folded over, if it is anywhere.
 
-    Parameters
-    ----------
-    skin : SurfaceData
-        Before the operation.
-    displacements : (v, 3) float64, mm
-        Of its vertices.
-
-    Returns
-    -------
-    Finding or None
-        The finding's code is "skin-torn".
+    skin: Before the operation.
+    displacements: (v, 3), mm, of its vertices.
+    Returns: The finding's code is "skin-torn".
 
     Notes
     -----
     An edge counts as torn if it is stretched by more than half, and becomes longer by at least
     1.5 mm; a triangle as turned over if its normal turns by more than a right angle, and if it has
     at least 0.5 mm² before the operation.
+
 
     Examples
     --------

@@ -42,16 +42,10 @@ class TissueParts:
 
     With the fraction p of muscle, E = E_fat (1 − p) + E_m along and across, ν likewise.
 
-    Attributes
-    ----------
-    fat_young : float, MPa
-    fat_poisson : float
-    fraction : (m,) float64
-    along, across, poisson : (m,) float64
-        What muscle adds, Σ p_i E_i in MPa and Σ p_i ν_i.
-    fibre : (m, 3) float64
-        Unit vectors.
-    law : str
+    fat_young: MPa.
+    fraction: (m,).
+    along, across, poisson: (m,). What muscle adds, Σ p_i E_i in MPa and Σ p_i ν_i.
+    fibre: (m, 3). Unit vectors.
     """
 
     fat_young: float
@@ -66,10 +60,7 @@ class TissueParts:
     def tissue(self) -> Tissue:
         """The tissue of all tets.
 
-        Raises
-        ------
-        MaterialError
-            A stiffness that is not positive definite.
+        Raises `MaterialError`: A stiffness that is not positive definite.
         """
         rest = 1.0 - self.fraction
         fat, poisson = rest * self.fat_young, rest * self.fat_poisson + self.poisson
@@ -81,12 +72,8 @@ class TissueParts:
     def changed(self, source: str, by: float) -> "TissueParts":
         """The parts with one source changed.
 
-        Parameters
-        ----------
-        source : str
-            Name of one of `TISSUE`.
-        by : float
-            In its unit; degrees for directions.
+        source: Name of one of `TISSUE`.
+        by: In its unit; degrees for directions.
         """
         return _CHANGES[source](self, by)
 
@@ -136,15 +123,9 @@ def tissue_parts(
 ) -> TissueParts | None:
     """Fat and muscle of a scene's tissue; None where they cannot be told apart.
 
-    Parameters
-    ----------
-    data : TissueData
-        Of the scene.
-    n_tets : int
-    fat : TissueData
-        Between the muscles.
-    fraction : (m,) float64 or None
-        Share of muscle in each tet; None in a patient without.
+    data: Of the scene.
+    fat: Between the muscles.
+    fraction: (m,) or None. Share of muscle in each tet; None in a patient without.
     """
     if data.kind == "stiffness" or (data.kind == "preset" and data.mixing != "moduli"):
         return None
@@ -186,15 +167,9 @@ def tissue_parts(
 class SkinRates:
     """Displacements of the skin by one standard deviation of each source.
 
-    Attributes
-    ----------
-    rates : mapping of str to (k, 3) float64, mm
-        By source; those of a plan are called "SEGMENT: SOURCE".
-    sources : mapping of str to Source
-        By the same names.
-    left_out : tuple of str
-        Sources that the scene does not allow, with the reason.
-    seconds : float
+    rates: mapping of str to (k, 3), mm, by source; those of a plan are called "SEGMENT: SOURCE".
+    sources: By the same names.
+    left_out: Sources that the scene does not allow, with the reason.
     """
 
     rates: Mapping[str, Floats]
@@ -208,21 +183,10 @@ def skin_rates(
 ) -> SkinRates:
     """The derivatives of the skin with respect to tissue and plan, each times its prior's sd.
 
-    Parameters
-    ----------
-    patient : PatientModel
-    scene : Scene
-        What was solved: `model_scene` of the patient.
-    solver : StaticSolver
-    solution : Solution
-        Of the scene's plan.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Kinematics that are not linear, or lips in contact: no linear map.
-    SolverError
-        A linear solve that fails.
+    scene: What was solved: `model_scene` of the patient.
+    solution: Of the scene's plan.
+    Raises `CaseError`: Kinematics that are not linear, or lips in contact: no linear map.
+    Raises `SolverError`: A linear solve that fails.
     """
     begun = time.perf_counter()
     _check_scene(scene)
@@ -274,15 +238,9 @@ def tissue_load(
 ) -> Floats:
     """−(∂K/∂p) u times the standard deviation, (n, 3) N.
 
-    Parameters
-    ----------
-    tensors : MassTensors
-        Of the tissue as it is.
-    u, forces : (n, 3) float64, mm and N
-        Displacements, and their forces K u.
-    parts : TissueParts
-    source : Source
-        One of `parts.sources`.
+    tensors: Of the tissue as it is.
+    u, forces: (n, 3), mm and N. Displacements, and their forces K u.
+    source: One of `parts.sources`.
     """
     tissue = parts.changed(source.name, STEP * source.sd).tissue()
     changed = MassTensors(tensors.mesh, tissue, element=tensors.element)

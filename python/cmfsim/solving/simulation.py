@@ -167,11 +167,7 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
 def solved_scene(scene: Scene, solver: StaticSolver) -> tuple[SceneResult, Solution]:
     """The result of a scene as `solve_scene` has it, and the core's solution, which can go on.
 
-    Parameters
-    ----------
-    scene : Scene
-    solver : StaticSolver
-        Of this scene, whatever its plan.
+    solver: Of this scene, whatever its plan.
     """
     solution = solver.solve(scene_plan(scene), loads=scene.loads)
     _log.info(
@@ -312,18 +308,10 @@ def slip_finding(scene: Scene, displacements: ArrayLike) -> Finding | None:
     node that slips by more has usually gone round an edge, and the plan may have another
     equilibrium in which it has not.
 
-    Parameters
-    ----------
-    scene : Scene
-        Segments that follow surfaces are left out, and so is unilateral contact, where nodes may
+    scene: Segments that follow surfaces are left out, and so is unilateral contact, where nodes may
         leave the bone.
-    displacements : (n, 3) float64, mm
-        Of the nodes of the scene.
-
-    Returns
-    -------
-    Finding or None
-        The finding's code is "contact-slipped-far".
+    displacements: (n, 3), mm, of the nodes of the scene.
+    Returns: The finding's code is "contact-slipped-far".
 
     Examples
     --------

@@ -26,14 +26,8 @@ LOG_FILE = "log.txt"
 class CaseJob:
     """One case of a study, as plain values that travel to another process or machine.
 
-    Attributes
-    ----------
-    name, file, output : str
-    models : tuple of str
-    threads : int
-        That the case may use.
-    changes : str
-        Of its settings, as `CaseChanges.as_json` writes them; empty if there are none.
+    threads: That the case may use.
+    changes: Of its settings, as `CaseChanges.as_json` writes them; empty if there are none.
     """
 
     name: str
@@ -48,16 +42,9 @@ class CaseJob:
 class CaseOutcome:
     """The outcome of one case.
 
-    Attributes
-    ----------
-    name : str
-    status : str
-        "done", "kept" (finished by an earlier run, nothing has changed since) or "failed".
-    seconds : float
-    error : str
-        The last lines of its log, where it failed.
-    evaluation : mapping
-        What `cmfsim evaluate` wrote; empty where it failed.
+    status: "done", "kept" (finished by an earlier run, nothing has changed since) or "failed".
+    error: The last lines of its log, where it failed.
+    evaluation: What `cmfsim evaluate` wrote; empty where it failed.
     """
 
     name: str
@@ -178,18 +165,9 @@ def run_studies(
 ) -> list[StudyReport]:
     """The reports of several cohorts, whose cases share the workers.
 
-    Parameters
-    ----------
-    cohorts : sequence of Cohort
-        Each with a different output folder.
-    options : StudyOptions
-    progress : callable
-        Called with each outcome as soon as it is known.
-
-    Raises
-    ------
-    CaseError, OSError
-        As `run_study`.
+    cohorts: Each with a different output folder.
+    progress: Called with each outcome as soon as it is known.
+    Raises `CaseError`, `OSError`: As `run_study`.
     """
     cores = os.cpu_count() or 1
     workers = options.workers

@@ -33,15 +33,11 @@ LANDMARK_SD = 2.0
 class LandmarkTrial:
     """One trial: landmarks placed anew, and what that changes.
 
-    Attributes
-    ----------
-    landmarks : mapping of str to (3,) float64, mm
-    landmark_deviation : float, mm
-        Mean distance of the landmarks from those of the case.
-    muscle_deviation : mapping of str to float, mm
-        Mean distance of each muscle's vertices from where the case's landmarks put them.
-    skin_deviation : (k,) float64, mm
-        Distance of each vertex of the predicted skin from that of the case.
+    landmarks: mapping of str to (3,), mm.
+    landmark_deviation: mm. Mean distance of the landmarks from those of the case.
+    muscle_deviation: mm. Mean distance of each muscle's vertices from where the case's landmarks
+        put them.
+    skin_deviation: (k,), mm. Distance of each vertex of the predicted skin from that of the case.
     """
 
     landmarks: Mapping[str, Floats]

@@ -22,13 +22,8 @@ def evaluate_case(file: str, output: str, changes: str, models: Sequence[str]) -
 
     It writes what `cmfsim evaluate` writes; if so, `metrics.json` is whole and new.
 
-    Parameters
-    ----------
-    file, output : str
-        The case, and its output folder.
-    changes : str
-        Of its settings, as `CaseChanges.as_json` writes them, or an empty text.
-    models : sequence of str
+    file, output: The case, and its output folder.
+    changes: Of its settings, as `CaseChanges.as_json` writes them, or an empty text.
     """
     logging.basicConfig(format="cmfsim: %(message)s", level=logging.WARNING, stream=sys.stderr)
     try:

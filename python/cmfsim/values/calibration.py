@@ -16,12 +16,7 @@ from cmfsim.values.model_names import MODELS
 
 
 def settings_digest(settings: Mapping[str, Any]) -> str:
-    """The SHA-256 of plain values, whatever the order of their names.
-
-    Parameters
-    ----------
-    settings : mapping of str to plain values
-    """
+    """The SHA-256 of plain values, whatever the order of their names."""
     return hashlib.sha256(json.dumps(dict(settings), sort_keys=True).encode()).hexdigest()
 
 

@@ -58,16 +58,11 @@ LIP_HEIGHT = 13.0
 class CaseImage:
     """A CT and how to read tissue from it; None stands for the default of the imaging stage.
 
-    Attributes
-    ----------
-    file : Path
-        NRRD, NIfTI, MetaImage, or a folder of DICOM slices.
-    skin_threshold, bone_threshold, metal_threshold : float or None, HU
-    working_spacing : float or None, mm
-    series : str or None
-        UID or number of the DICOM series that is meant, where the folder holds several.
-    rescale : tuple of float or None
-        Slope and intercept from the image's values to HU, where they are not HU.
+    file: NRRD, NIfTI, MetaImage, or a folder of DICOM slices.
+    skin_threshold, bone_threshold, metal_threshold: HU.
+    working_spacing: mm.
+    series: UID or number of the DICOM series that is meant, where the folder holds several.
+    rescale: Slope and intercept from the image's values to HU, where they are not HU.
     """
 
     file: Path
@@ -83,15 +78,9 @@ class CaseImage:
 class CaseSurfaces:
     """Ready surfaces of skin and bones.
 
-    Attributes
-    ----------
-    skin : Path
-    bones : mapping of str to Path
-    units : str
-        Of the numbers in every file: "mm", "cm", "m", "um", "inch".
-    frame : str or None
-        Of the numbers in every file: "LPS" or "RAS". None: what each file's header states, and LPS
-        where it states none.
+    units: Of the numbers in every file: "mm", "cm", "m", "um", "inch".
+    frame: Of the numbers in every file: "LPS" or "RAS". None: what each file's header states, and
+        LPS where it states none.
     """
 
     skin: Path
@@ -114,16 +103,10 @@ FEW_SITES = 12
 class CaseLandmarks:
     """Files of landmarks, 3D Slicer's `.mrk.json` or `.fcsv`.
 
-    Attributes
-    ----------
-    skull, skin : Path or None
-    frame : str or None
-        The frame of files that do not state theirs.
-    automatic : bool or "missing"
-        Whether landmarks are found automatically where neither file is given, and the others where
-        the one of the skull has fewer than twelve; "missing": whatever the files lack.
-    templates : tuple of Path
-        Folders of heads whose landmarks are known, for finding them; see docs/landmarks.md.
+    frame: The frame of files that do not state theirs.
+    automatic: Whether landmarks are found automatically where neither file is given, and the others
+        where the one of the skull has fewer than twelve; "missing": whatever the files lack.
+    templates: Folders of heads whose landmarks are known, for finding them; see docs/landmarks.md.
     """
 
     skull: Path | None = None
@@ -152,18 +135,12 @@ class CaseLandmarks:
 class CaseMesh:
     """Options of the mesh of the soft tissue, or the source of its tets.
 
-    Attributes
-    ----------
-    edge_length : float, mm
-    refine : bool
-        Smaller tets where tissue is thin, and at the mouth.
-    parting : Path or None
-        A surface that parts the lips where the image or skin shows them as one.
-    cleft : float, mm
-        Tissue of which two segments that part are less than this away, taken together, is left out:
-        between tooth rows and at cuts. 0: none.
-    file : Path or None
-        Tets from elsewhere; edge length, refinement and cleft are then not used.
+    edge_length: mm.
+    refine: Smaller tets where tissue is thin, and at the mouth.
+    parting: A surface that parts the lips where the image or skin shows them as one.
+    cleft: mm. Tissue of which two segments that part are less than this away, taken together, is
+        left out: between tooth rows and at cuts. 0: none.
+    file: Tets from elsewhere; edge length, refinement and cleft are then not used.
     """
 
     edge_length: float = EDGE_LENGTH
@@ -177,17 +154,12 @@ class CaseMesh:
 class CaseLips:
     """Whether the lips of a case are separated, and where; see `lip_seam` and `lip_regions`.
 
-    Attributes
-    ----------
-    contact : bool
-        The tissue is separated between the lips, and neither lip enters the other or the teeth.
-    seam : Path or str
-        "auto": from the gap or crease that the skin shows, else from landmarks; "landmarks"; or the
-        file of a surface between the lips, its normals towards the upper lip.
-    depth : float, mm
-        How far the seam continues past the teeth, between their rows.
-    height : float, mm
-        How far from the seam the lips reach.
+    contact: The tissue is separated between the lips, and neither lip enters the other or the
+        teeth.
+    seam: "auto": from the gap or crease that the skin shows, else from landmarks; "landmarks"; or
+        the file of a surface between the lips, its normals towards the upper lip.
+    depth: mm. How far the seam continues past the teeth, between their rows.
+    height: mm. How far from the seam the lips reach.
     """
 
     contact: bool = LIP_CONTACT
@@ -200,16 +172,10 @@ class CaseLips:
 class CaseBand:
     """Whether a prediction comes with a band that states how far to trust it.
 
-    Attributes
-    ----------
-    asked : bool
-        The case has a table [band].
-    calibration : Path or None
-        File of a calibration; None makes an uncalibrated band.
-    coverage : float
-        Share of cases that are to lie within it: 0.9 for 90 %.
-    group : str or None
-        The calibration cases to use; None uses all of them.
+    asked: The case has a table [band].
+    calibration: File of a calibration; None makes an uncalibrated band.
+    coverage: Share of cases that are to lie within it: 0.9 for 90 %.
+    group: The calibration cases to use; None uses all of them.
     """
 
     asked: bool = False
@@ -222,18 +188,11 @@ class CaseBand:
 class CaseOsteotomy:
     """One cut: a standard procedure placed from landmarks, or a plane through a bone.
 
-    Attributes
-    ----------
-    procedure : str or None
-        "le_fort_1", "le_fort_3", "bsso" or "genioplasty".
-    options : mapping of str to plain values
-        Adjustments of the procedure, as the osteotomy stage takes them.
-    plane : Plane or None
-        The side to which its normal points becomes the new segment.
-    bone : str or None
-        The bone that the plane cuts.
-    name : str or None
-        The name of the new segment.
+    procedure: "le_fort_1", "le_fort_3", "bsso" or "genioplasty".
+    options: Adjustments of the procedure, as the osteotomy stage takes them.
+    plane: The side to which its normal points becomes the new segment.
+    bone: The bone that the plane cuts.
+    name: The name of the new segment.
     """
 
     procedure: str | None = None
@@ -264,22 +223,14 @@ class CaseOsteotomy:
 class CaseMotion(Frozen):
     """The motion of one segment: a matrix, a transform file, or a surface before and after.
 
-    Attributes
-    ----------
-    matrix : (4, 4) float64, mm, or None
-        In LPS, whatever the frame of the case file's own numbers.
-    transform : Path or None
-        ITK `.tfm` or `.h5`, or a text of 4 × 4 numbers.
-    surface, moved_surface : Path or None
-        Files with the same triangles.
-    centre : (3,) float64, mm, LPS, or None
-        The centre of the turn, where the case states one.
-    direction : str or None
-        What the numbers of the transform file do: one of `DIRECTIONS`; stated for ITK's files.
-    frame : str or None
-        The frame in which the case file, or the transform file, has its numbers, where stated.
-    typed : bool
-        Whether the motion is given by translation, angle, axis and centre.
+    matrix: (4, 4), mm, or None, in LPS, whatever the frame of the case file's own numbers.
+    transform: ITK `.tfm` or `.h5`, or a text of 4 × 4 numbers.
+    surface, moved_surface: Files with the same triangles.
+    centre: (3,), mm, LPS, or None. The centre of the turn, where the case states one.
+    direction: What the numbers of the transform file do: one of `DIRECTIONS`; stated for ITK's
+        files.
+    frame: The frame in which the case file, or the transform file, has its numbers, where stated.
+    typed: Whether the motion is given by translation, angle, axis and centre.
     """
 
     matrix: Floats | None = None
@@ -294,10 +245,7 @@ class CaseMotion(Frozen):
     def source(self, understood: str = "") -> str:
         """Where the motion comes from and what was assumed, in words; empty for a typed one.
 
-        Parameters
-        ----------
-        understood : str
-            How the transform file was understood, where it is known.
+        understood: How the transform file was understood, where it is known.
         """
         if self.transform is not None:
             return f"{self.transform.name}{f': {understood}' if understood else ''}"
@@ -359,27 +307,16 @@ class CaseMuscles:
 class CasePostoperative:
     """The post-operative data.
 
-    Attributes
-    ----------
-    skin : Path or None
-        Surface of the skin after the operation.
-    image : Path or None
-        CT after the operation, instead of skin and bones.
-    landmarks : Path or None
-        Skin landmarks on it, for correspondences.
-    bones : mapping of str to Path
-        Surfaces of bones or segments, by name, for the achieved plan.
-    aligned : bool
-        Whether it lies in the frame of the data before the operation already.
-    units : str
-        Of the surface files.
-    frame : str or None
-        Of the surface files, as in `CaseSurfaces`.
-    series : str or None
-        UID or number of the DICOM series of the image, where its folder holds several.
-    verified : bool
-        Whether the user states that this is the patient after this operation: findings that it is
-        another face, or the face before, are then warnings, not errors.
+    skin: Surface of the skin after the operation.
+    image: CT after the operation, instead of skin and bones.
+    landmarks: Skin landmarks on it, for correspondences.
+    bones: Surfaces of bones or segments, by name, for the achieved plan.
+    aligned: Whether it lies in the frame of the data before the operation already.
+    units: Of the surface files.
+    frame: Of the surface files, as in `CaseSurfaces`.
+    series: UID or number of the DICOM series of the image, where its folder holds several.
+    verified: Whether the user states that this is the patient after this operation: findings that
+        it is another face, or the face before, are then warnings, not errors.
     """
 
     skin: Path | None = None

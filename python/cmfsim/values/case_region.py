@@ -23,16 +23,9 @@ POSTERIOR_LANDMARKS = ("supraglenoid_L", "supraglenoid_R")
 class Plane(Frozen):
     """A plane in space.
 
-    Attributes
-    ----------
-    point : (3,) float64, mm, LPS
-    normal : (3,) float64
-        Unit vector; given at any length but zero.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Not three finite numbers, a normal of length zero.
+    point: (3,), mm, LPS.
+    normal: (3,). Unit vector; given at any length but zero.
+    Raises `CaseError`: Not three finite numbers, a normal of length zero.
     """
 
     point: Floats
@@ -52,15 +45,11 @@ class Plane(Frozen):
 class Region:
     """The part of the head that is meshed: the face, in front of a posterior plane.
 
-    Attributes
-    ----------
-    posterior_plane : Plane or None
-        Its normal points out of the region, backwards.
-    posterior_depth : float or None, mm
-        Distance of a coronal plane behind the roots of the zygomatic arches (`supraglenoid_L` and
-        `_R`); below 0 in front of them. 10 mm if neither it nor the plane is given.
-    lower, upper : float or None, mm
-        Heights (S axis) that bound the region; None keeps what the skin has.
+    posterior_plane: Its normal points out of the region, backwards.
+    posterior_depth: mm. Distance of a coronal plane behind the roots of the zygomatic arches
+        (`supraglenoid_L` and `_R`); below 0 in front of them. 10 mm if neither it nor the plane is
+        given.
+    lower, upper: mm. Heights (S axis) that bound the region; None keeps what the skin has.
     """
 
     posterior_plane: Plane | None = None
@@ -75,17 +64,9 @@ class Region:
     def plane(self, landmarks: Mapping[str, ArrayLike], foremost: float, hindmost: float) -> Plane:
         """The posterior plane: as given, or coronal, from landmarks or from the head's depth.
 
-        Parameters
-        ----------
-        landmarks : mapping of str to (3,) float64, mm
-            Skull landmarks; may be empty.
-        foremost, hindmost : float, mm
-            P coordinates of the skin's first and last point.
-
-        Returns
-        -------
-        Plane
-            Its normal points backwards, out of the region.
+        landmarks: mapping of str to (3,), mm. Skull landmarks; may be empty.
+        foremost, hindmost: mm. P coordinates of the skin's first and last point.
+        Returns: Its normal points backwards, out of the region.
         """
         if self.posterior_plane is not None:
             return self.posterior_plane

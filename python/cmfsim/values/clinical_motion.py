@@ -273,10 +273,7 @@ def planned_motion(
 def plan_lines(plan: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The lines that state a plan: one for each segment that moves, one for those that stay.
 
-    Parameters
-    ----------
-    plan : mapping of str to mapping
-        `ClinicalMotion.as_dict()` by segment.
+    plan: `ClinicalMotion.as_dict()` by segment.
     """
     lines = []
     for name, motion in plan.items():

@@ -107,10 +107,7 @@ class Finding:
 class FindingGroup:
     """Findings of one severity and code, in their order.
 
-    Attributes
-    ----------
-    findings : tuple of Finding
-        At least one.
+    findings: At least one.
     """
 
     findings: tuple[Finding, ...]

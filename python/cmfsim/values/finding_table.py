@@ -17,12 +17,8 @@ BLANK = re.compile(r"\{(\w+)(?:!r)?(?::[^}]*)?\}")
 class FindingKind:
     """What findings of one code have in common.
 
-    Attributes
-    ----------
-    severity : str
-        "error", "warning" or "note"; several joined by " or " where it depends on the size.
-    meaning, why, fix : str
-        The fact, its effect on the result, and what to do.
+    severity: "error", "warning" or "note"; several joined by " or " where it depends on the size.
+    meaning, why, fix: The fact, its effect on the result, and what to do.
     """
 
     severity: str

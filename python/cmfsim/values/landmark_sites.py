@@ -192,20 +192,13 @@ def label_key(label: str) -> str:
 class CephalometricSite:
     """A landmark under the names of cephalometry and of Slicer's automatic tools.
 
-    Attributes
-    ----------
-    short : tuple of str
-        Its abbreviations without a side ("LGo" and "Go_L" are the left gonion); the first is
+    short: Its abbreviations without a side ("LGo" and "Go_L" are the left gonion); the first is
         written.
-    kind : str
-        "skull" or "skin".
-    name : str
-        In words.
-    site : str
-        Of `SKULL_LANDMARKS` or `SKIN_LANDMARKS` without its side; empty if only `cephalometry`
+    kind: "skull" or "skin".
+    name: In words.
+    site: Of `SKULL_LANDMARKS` or `SKIN_LANDMARKS` without its side; empty if only `cephalometry`
         uses it.
-    where : str
-        Its definition in cephalometry.
+    where: Its definition in cephalometry.
     """
 
     short: tuple[str, ...]
@@ -322,15 +315,8 @@ CEPHALOMETRY: tuple[CephalometricSite, ...] = (
 def named_site(label: str, kind: str) -> str | None:
     """The site of a kind that a label stands for, in any spelling or by an abbreviation.
 
-    Returns
-    -------
-    str or None
-        None if it is none of cmfsim's.
-
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) A paired site without its side.
+    Returns: None if it is none of cmfsim's.
+    Raises `LandmarkError`: A paired site without its side.
     """
     key = label_key(label)
     found = _labels(kind).get(key)

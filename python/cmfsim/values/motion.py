@@ -235,10 +235,7 @@ def plan_digits(motions: Mapping[str, NDArray[np.float64]]) -> str:
     The planning page writes the same digits into the plans that it saves. Segments that stay do
     not count.
 
-    Parameters
-    ----------
-    motions : mapping of str to (4, 4) float64, mm
-        By segment; or (n, 3), the motion of its vertices.
+    motions: mapping of str to (4, 4), mm, by segment; or (n, 3), the motion of its vertices.
     """
     texts = []
     for name, motion in motions.items():

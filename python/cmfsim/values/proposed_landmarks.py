@@ -36,14 +36,9 @@ ORIGINS = {
 class SiteState:
     """Where a landmark comes from.
 
-    Attributes
-    ----------
-    origin : str
-        A key of `ORIGINS`.
-    error : float, mm
-        Expected distance from where a person would place it; 0 where one did.
-    doubt : str
-        The reason to check it; empty if there is none.
+    origin: A key of `ORIGINS`.
+    error: mm. Expected distance from where a person would place it; 0 where one did.
+    doubt: The reason to check it; empty if there is none.
     """
 
     origin: str = PLACED
@@ -79,16 +74,10 @@ def site_state(description: str) -> SiteState:
 class ProposedSite:
     """A proposed landmark.
 
-    Attributes
-    ----------
-    point : (3,) float64, mm
-        On the surface of the bone or skin, in the frame of the head.
-    error : float, mm
-        Expected distance from where a person would place it.
-    doubt : str
-        The reason to check it; empty if there is none.
-    origin : str
-        A key of `ORIGINS`: "proposed", or who placed, moved or filled it in.
+    point: (3,), mm, on the surface of the bone or skin, in the frame of the head.
+    error: mm. Expected distance from where a person would place it.
+    doubt: The reason to check it; empty if there is none.
+    origin: A key of `ORIGINS`: "proposed", or who placed, moved or filled it in.
     """
 
     point: Floats
@@ -106,19 +95,13 @@ class ProposedSite:
 class ProposedLandmarks:
     """Landmarks that were found automatically.
 
-    Attributes
-    ----------
-    skull, skin : mapping of str to ProposedSite
-        By label, in the order of `SKULL_LANDMARKS` and `SKIN_LANDMARKS`; sites that were not found
-        are absent.
-    missing_skull, missing_skin : mapping of str to str
-        The sites that were not found, with the reason.
-    impossible_jaw : str
-        Why the bone taken for the mandible cannot be one; empty if it can.
-    doubtful_jaw : str
-        Everything that speaks against it, including doubts; empty if nothing does.
-    separation : mapping of str to (3,) float64, mm
-        Points from which the jaws of an image can be separated again.
+    skull, skin: By label, in the order of `SKULL_LANDMARKS` and `SKIN_LANDMARKS`; sites that were
+        not found are absent.
+    missing_skull, missing_skin: The sites that were not found, with the reason.
+    impossible_jaw: Why the bone taken for the mandible cannot be one; empty if it can.
+    doubtful_jaw: Everything that speaks against it, including doubts; empty if nothing does.
+    separation: mapping of str to (3,), mm. Points from which the jaws of an image can be separated
+        again.
     """
 
     skull: Mapping[str, ProposedSite]

@@ -9,17 +9,10 @@ from numpy.typing import NDArray
 def used_nodes(cells: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The nodes that triangles or tets use, ascending, and the same cells in those numbers.
 
-    Parameters
-    ----------
-    cells : (c, 3) or (c, 4) unsigned or signed integers
-        Nodes, or vertices of a surface; none is negative.
-
-    Returns
-    -------
-    nodes : (k,) int64
-        Rows to keep of whatever is stored by node.
-    cells : as `cells`, int64
-        Indices into `nodes`.
+    cells: (c, 3) or (c, 4) unsigned or signed integers. Nodes, or vertices of a surface; none is
+        negative.
+    Returns `nodes`: (k,) int64. Rows to keep of whatever is stored by node.
+    Returns `cells`: as `cells`, int64. Indices into `nodes`.
 
     Examples
     --------

@@ -34,12 +34,9 @@ class SkinEnd(Frozen):
     from the plane keep their solution; the skin behind the plane, which has no tets, then fades
     out (`attachment`).
 
-    Attributes
-    ----------
-    vertices : (z,) int64
-        Vertices of the skin.
-    edges : (e, 2) int64
-        Pairs of a place in `vertices`, and a neighbour among the vertices of the skin.
+    vertices: (z,) int64. Vertices of the skin.
+    edges: (e, 2) int64. Pairs of a place in `vertices`, and a neighbour among the vertices of the
+        skin.
     """
 
     vertices: NDArray[np.int64]
@@ -65,12 +62,8 @@ class SkinEnd(Frozen):
 def skin_end(skin: SurfaceData, held: ArrayLike) -> SkinEnd:
     """The part of a skin that ends on planes which hold it, and what it is continued from.
 
-    Parameters
-    ----------
-    skin : SurfaceData
-        The mesh's skin.
-    held : (k,) bool
-        Its vertices on those planes.
+    skin: The mesh's skin.
+    held: (k,) bool. Its vertices on those planes.
     """
     on_plane = np.asarray(held, dtype=bool)
     triangles = skin.triangles.astype(np.int64)
@@ -94,17 +87,12 @@ def skin_end(skin: SurfaceData, held: ArrayLike) -> SkinEnd:
 class Attachment(Frozen):
     """Where points on or near a mesh's skin are attached to it.
 
-    Attributes
-    ----------
-    triangles : (k,) integers
-        Of the skin, with the closest point of each.
-    closest : (k, 3) float64, mm
-    places : (k, 3) float64, mm
-        The points themselves, those farther away than an edge drawn nearer to the skin: rotations
-        of a triangle are followed no farther out.
-    share : (k,) float64
-        Of the movement of their places that the points follow: 1 up to two edges from the skin, 0
-        from 25 mm beyond that.
+    triangles: (k,) integers, of the skin, with the closest point of each.
+    closest: (k, 3), mm.
+    places: (k, 3), mm. The points themselves, those farther away than an edge drawn nearer to the
+        skin: rotations of a triangle are followed no farther out.
+    share: (k,), of the movement of their places that the points follow: 1 up to two edges from the
+        skin, 0 from 25 mm beyond that.
     """
 
     triangles: NDArray[np.uint32]
@@ -116,11 +104,8 @@ class Attachment(Frozen):
 def attachment(skin: Surface, points: ArrayLike) -> Attachment:
     """Where points are attached to a mesh's skin.
 
-    Parameters
-    ----------
-    skin : Surface
-        The mesh's skin.
-    points : (k, 3) float64, mm
+    skin: The mesh's skin.
+    points: (k, 3), mm.
     """
     places = as_rows("points", points, 3)
     closest, _, triangles = skin.closest(places)
@@ -140,13 +125,9 @@ def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike
     What lies away from the tissue that was simulated, as the back of the head, stays: from two
     edges off its movement fades, over 25 mm.
 
-    Parameters
-    ----------
-    before : SurfaceData
-        The mesh's skin.
-    displacements : (v, 3) float64, mm
-        Of its vertices.
-    points : (k, 3) float64, mm
+    before: The mesh's skin.
+    displacements: (v, 3), mm, of its vertices.
+    points: (k, 3), mm.
     """
     skin = before.searched
     found = attachment(skin, points)

@@ -15,15 +15,9 @@ from cmfsim.values.checks import as_positive
 class Source:
     """A source of uncertainty.
 
-    Attributes
-    ----------
-    name : str
-    sd : float
-        Standard deviation, above 0.
-    unit : str
-        "log": of the natural logarithm; "1", "share", "degrees" or "mm".
-    reference : str
-        Where the standard deviation comes from.
+    sd: Standard deviation, above 0.
+    unit: "log": of the natural logarithm; "1", "share", "degrees" or "mm".
+    reference: Where the standard deviation comes from.
     """
 
     name: str

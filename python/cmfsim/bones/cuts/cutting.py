@@ -43,17 +43,9 @@ SURFACES_AT_ONCE = 2
 class CutOptions:
     """Options of cutting bones.
 
-    Attributes
-    ----------
-    crumb_volume : float, mm³
-        A fragment smaller than this that a cut separates from its segment is assigned to the
-        segment on the other side of the cut, to which it is still connected.
-    surface : SurfaceOptions
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A negative volume.
+    crumb_volume: mm³. A fragment smaller than this that a cut separates from its segment is
+        assigned to the segment on the other side of the cut, to which it is still connected.
+    Raises `CaseError`: A negative volume.
     """
 
     crumb_volume: float = 500.0
@@ -416,21 +408,9 @@ def part_segment(
 ) -> tuple[BoneSegment, ...]:
     """The pieces of a segment: each has the bone that lies nearest to its surface.
 
-    Parameters
-    ----------
-    segment : BoneSegment
-    pieces : mapping of str to SurfaceData
-        Parts of the segment's own surface by name, the largest first; they need not be closed.
-
-    Returns
-    -------
-    tuple of BoneSegment
-        Without pieces that hold less than 100 mm³ of the segment.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) No piece holds as much.
+    pieces: Parts of the segment's own surface by name, the largest first; they need not be closed.
+    Returns: Without pieces that hold less than 100 mm³ of the segment.
+    Raises `CaseError`: No piece holds as much.
     """
     level = segment.level
     values = level.single

@@ -72,19 +72,12 @@ class CuttingPlane:
 class Cut:
     """A piece to be cut from a bone: it lies where all planes of any one group are positive.
 
-    Attributes
-    ----------
-    segment : str
-        Name of the piece.
-    groups : tuple of tuples of CuttingPlane
-        Each group is a convex region; the piece is their union.
-    sources : tuple of str
-        The piece is cut from the first of these bones or segments that exists.
-    rest : str or None
-        What the source is called afterwards; None leaves its name.
-    joined : CuttingPlane or None
-        Where the source is a "skull" whose jaws could not be separated, the piece also lies on the
-        positive side of this plane, so that the other jaw stays. None refuses such a source.
+    segment: Name of the piece.
+    groups: Each group is a convex region; the piece is their union.
+    sources: The piece is cut from the first of these bones or segments that exists.
+    rest: What the source is called afterwards; None leaves its name.
+    joined: Where the source is a "skull" whose jaws could not be separated, the piece also lies on
+        the positive side of this plane, so that the other jaw stays. None refuses such a source.
     """
 
     segment: str

@@ -21,12 +21,8 @@ LEFT_OUT = 1e-9
 class AlongSurface:
     """A surface along which values are averaged.
 
-    Attributes
-    ----------
-    areas : (n,) float64, mm²
-        Of the vertices, above 0.
-    ends : (m, 2) int64
-        The two vertices of each edge.
+    areas: (n,), mm², of the vertices, above 0.
+    ends: (m, 2) int64. The two vertices of each edge.
     """
 
     def __init__(self, surface: SurfaceData) -> None:

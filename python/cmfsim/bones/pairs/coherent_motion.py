@@ -64,13 +64,9 @@ INWARDS = -0.7
 class RigidPiece(Frozen):
     """A part of a bone that moved as one.
 
-    Attributes
-    ----------
-    matrix : (4, 4) float64, mm
-        Its rigid motion.
-    area : float, mm²
-    vertices : (n,) int64
-        Of the surface, that lie in it.
+    matrix: (4, 4), mm. Its rigid motion.
+    area: mm².
+    vertices: (n,) int64, of the surface, that lie in it.
     """
 
     matrix: Floats
@@ -86,18 +82,11 @@ class RigidPiece(Frozen):
 class CoherentMotion:
     """The motion of a bone in pieces.
 
-    Attributes
-    ----------
-    motion : MovedSurface
-        Without noise, slip and removed bone.
-    pieces : tuple of RigidPiece
-        The largest first.
-    removed : tuple of RemovedBone
-        The largest first.
-    slip : float, mm
-        How far vertices slid along the bone: the rms of what was taken off.
-    noise : float, mm
-        The rms of the noise that was averaged out; 0 where it is too small to matter.
+    motion: Without noise, slip and removed bone.
+    pieces: The largest first.
+    removed: The largest first.
+    slip: mm. How far vertices slid along the bone: the rms of what was taken off.
+    noise: mm. The rms of the noise that was averaged out; 0 where it is too small to matter.
     """
 
     motion: MovedSurface
@@ -110,15 +99,8 @@ class CoherentMotion:
 def coherent_motion(motion: MovedSurface) -> CoherentMotion:
     """The motion of a bone in rigid pieces.
 
-    Parameters
-    ----------
-    motion : MovedSurface
-        Without triangles that have no area (`sound_motion`).
-
-    Raises
-    ------
-    BoundaryError
-        (also `ValueError`) scipy is missing.
+    motion: Without triangles that have no area (`sound_motion`).
+    Raises `BoundaryError`: scipy is missing.
 
     Notes
     -----

@@ -83,10 +83,8 @@ class MatchOptions:
 def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions) -> ShapeFit:
     """The fit of a segment, known by its name, to the post-operative bone.
 
-    Raises
-    ------
-    RegistrationError
-        It does not fit, or too little of it does; the search does not converge.
+    Raises `RegistrationError`: It does not fit, or too little of it does; the search does not
+        converge.
     """
     try:
         moving = Surface(segment.vertices, segment.triangles, crease_angle=segment.crease_angle)

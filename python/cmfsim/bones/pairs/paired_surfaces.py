@@ -49,21 +49,12 @@ RIGID_SHARE, LEAST_LYING = 0.95, 0.6
 class PairedShape:
     """A bone registered by shape to the same mesh after the operation.
 
-    Attributes
-    ----------
-    fit : ShapeFit
-    is_rigid : bool
-        Whether the bone moved rigidly, apart from a change of size and removed bone.
-    bent : (n,) float64, mm
-        How far the bone after lies off along the normals, on average over neighbours, with the
-        change of size removed: how it bent. 0 where it was removed.
-    slip : float, mm
-        How far vertices slid along the surface, median.
-    slid_free : (n, 3) float64, mm
-        The vertices after without slip and change of size: each where the rigid motion takes it,
-        and from there as far along the normal as the bone after lies off.
-    removed : tuple of RemovedBone
-    stray : tuple of StrayPatch
+    is_rigid: Whether the bone moved rigidly, apart from a change of size and removed bone.
+    bent: (n,), mm. How far the bone after lies off along the normals, on average over neighbours,
+        with the change of size removed: how it bent. 0 where it was removed.
+    slip: mm. How far vertices slid along the surface, median.
+    slid_free: (n, 3), mm. The vertices after without slip and change of size: each where the rigid
+        motion takes it, and from there as far along the normal as the bone after lies off.
     """
 
     fit: ShapeFit
@@ -78,17 +69,9 @@ class PairedShape:
 def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
     """The registration by shape of a bone to the same mesh after the operation.
 
-    Parameters
-    ----------
-    before, after : SurfaceData
-        The same triangles in the same order.
-
-    Raises
-    ------
-    RegistrationError
-        (also `ValueError`) Vertices that lie on one line; see `fit_shape` too.
-    MeshError
-        (also `ValueError`) A triangle without area after.
+    before, after: The same triangles in the same order.
+    Raises `RegistrationError`: Vertices that lie on one line; see `fit_shape` too.
+    Raises `MeshError`: A triangle without area after.
     """
     here, there = before.vertices, after.vertices
     bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)

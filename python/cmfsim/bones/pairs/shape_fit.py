@@ -45,13 +45,9 @@ LEAST_SIZE, MOST_SIZE = 0.85, 1.15
 class OpenDirection(Frozen):
     """A motion of a bone that its shape hardly determines, such as the rotation of a ball.
 
-    Attributes
-    ----------
-    turn, shift : (3,) float64
-        The turn about the middle of the bone, times the radius of the bone, and the shift; both
-        together of unit length.
-    ratio : float
-        How well the shape determines it, relative to the direction that it determines best: the
+    turn, shift: (3,). The turn about the middle of the bone, times the radius of the bone, and the
+        shift; both together of unit length.
+    ratio: How well the shape determines it, relative to the direction that it determines best: the
         ratio of eigenvalues of the normal equations.
     """
 
@@ -83,28 +79,17 @@ class OpenDirection(Frozen):
 class ShapeFit(Frozen):
     """The registration of a bone to the post-operative bone, by shape.
 
-    Attributes
-    ----------
-    matrix : (4, 4) float64, mm
-        The rigid motion. A change of size is about the centre of the segment's vertices, which it
-        does not move further.
-    scale : float
-        Size after, as a share of the size before.
-    scale_interval : tuple of float
-        Low and high end of its 95 % interval: block jackknife, and a surface that is known to
-        0.1 mm all round.
-    eigenvalue_ratio : float
-        Of the normal equations of the rigid motion: smallest to largest.
-    open : tuple of OpenDirection
-        What the shape does not determine; in these directions the motion is that of the start.
-    sigma : float, mm
-        Standard deviation of the distances along normals, robust.
-    off : (n,) float64, mm
-        Distance of each vertex, moved and scaled, from the bone after.
-    kept : (n,) bool
-        Vertices that count: near enough, on bone with a similar normal.
-    middle : (3,) float64, mm
-        Of the segment's vertices, before.
+    matrix: (4, 4), mm. The rigid motion. A change of size is about the centre of the segment's
+        vertices, which it does not move further.
+    scale: Size after, as a share of the size before.
+    scale_interval: Low and high end of its 95 % interval: block jackknife, and a surface that is
+        known to 0.1 mm all round.
+    eigenvalue_ratio: Of the normal equations of the rigid motion: smallest to largest.
+    open: What the shape does not determine; in these directions the motion is that of the start.
+    sigma: mm. Standard deviation of the distances along normals, robust.
+    off: (n,), mm. Distance of each vertex, moved and scaled, from the bone after.
+    kept: (n,) bool. Vertices that count: near enough, on bone with a similar normal.
+    middle: (3,), mm, of the segment's vertices, before.
     """
 
     matrix: Floats
@@ -160,23 +145,14 @@ def fit_shape(
 ) -> ShapeFit:
     """The motion that registers a segment to the post-operative bone, by the shape of both.
 
-    Parameters
-    ----------
-    segment : SurfaceData
-        Before.
-    bone : Surface
-        After.
-    start : (4, 4) float64, mm
-        Rigid motion to start from. Directions that the shape does not determine keep its value.
-    max_angle : float, degrees
-        Between normals of partners.
-    most_points : int
-        Vertices used in the fit.
-
-    Raises
-    ------
-    RegistrationError
-        (also `ValueError`) Fewer partners than unknowns; sizes that differ too much for one bone.
+    segment: Before.
+    bone: After.
+    start: (4, 4), mm. Rigid motion to start from. Directions that the shape does not determine keep
+        its value.
+    max_angle: degrees, between normals of partners.
+    most_points: Vertices used in the fit.
+    Raises `RegistrationError`: Fewer partners than unknowns; sizes that differ too much for one
+        bone.
 
     Notes
     -----

@@ -37,19 +37,13 @@ FACING, SHOWN_SHARE = 0.5, 0.5
 class StrayPatch:
     """A patch of a segment that lies off the bone after the operation.
 
-    Attributes
-    ----------
-    area : float, mm²
-        Of the surface before.
-    distance : float, mm
-        From the post-operative bone, after the segment's motion; median of the patch's vertices.
-    place : (3,) float64, mm
-        The vertex nearest to the middle of the patch, before.
-    has_bone : bool
-        Whether bone lies within reach that may be this patch, displaced, or what is left of it
-        after grinding; else it was removed, lies outside the scan, or moved further.
-    vertices : (n,) int64
-        Of the segment, that lie in the patch.
+    area: mm², of the surface before.
+    distance: mm, from the post-operative bone, after the segment's motion; median of the patch's
+        vertices.
+    place: (3,), mm. The vertex nearest to the middle of the patch, before.
+    has_bone: Whether bone lies within reach that may be this patch, displaced, or what is left of
+        it after grinding; else it was removed, lies outside the scan, or moved further.
+    vertices: (n,) int64, of the segment, that lie in the patch.
     """
 
     area: float
@@ -77,25 +71,13 @@ def stray_patches(
 ) -> tuple[tuple[StrayPatch, ...], Floats]:
     """The patches of a segment that lie off the bone, and how far off each vertex is.
 
-    Parameters
-    ----------
-    segment : SurfaceData
-        Before.
-    bone : Surface
-        After.
-    matrix : (4, 4) float64, mm
-        The motion of the segment.
-    rms : float, mm
-        Residual of the fit over the vertices that it keeps.
-    beside : sequence of SurfaceData
-        The other segments before: what touches them was cut, and is not searched for.
-
-    Returns
-    -------
-    patches : tuple of StrayPatch
-        The largest first.
-    off : (n,) float64, mm
-        Distance of each vertex from the bone.
+    segment: Before.
+    bone: After.
+    matrix: (4, 4), mm. The motion of the segment.
+    rms: mm. Residual of the fit over the vertices that it keeps.
+    beside: The other segments before: what touches them was cut, and is not searched for.
+    Returns `patches`: The largest first.
+    Returns `off`: (n,), mm. Distance of each vertex from the bone.
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)

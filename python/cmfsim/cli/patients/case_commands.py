@@ -120,10 +120,7 @@ def checked(
 ) -> tuple[Finding, ...]:
     """The findings of the doctor for a case and some models; warnings are printed.
 
-    Raises
-    ------
-    FindingsError
-        An error is among the findings.
+    Raises `FindingsError`: An error is among the findings.
     """
     with StageProgress(sys.stderr, quiet=quiet) as progress:
         progress.stage("checking the case")

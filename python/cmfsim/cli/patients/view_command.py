@@ -37,12 +37,8 @@ def view(options: argparse.Namespace) -> int:
 def parts_of(path: Path, model: str | None = None) -> list[ViewPart]:
     """The surfaces to show of a folder or file.
 
-    Raises
-    ------
-    FileNotFoundError
-        It is not there.
-    CaseError
-        (also `ValueError`) It holds nothing that can be shown.
+    Raises `FileNotFoundError`: It is not there.
+    Raises `CaseError`: It holds nothing that can be shown.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")

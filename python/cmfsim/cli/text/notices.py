@@ -56,10 +56,8 @@ class Notices(Observer):
     def summarise(self, where: str | None) -> None:
         """Prints the list at the end: nothing if there are no findings.
 
-        Parameters
-        ----------
-        where : str or None
-            The file that lists all findings in full, for the first line; None lists notes as well.
+        where: The file that lists all findings in full, for the first line; None lists notes as
+            well.
         """
         groups = grouped(self._found)
         if where is not None or self._quiet:

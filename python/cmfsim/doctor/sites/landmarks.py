@@ -128,15 +128,10 @@ def check_landmarks(
 ) -> list[Finding]:
     """Findings about the landmarks of one kind; each landmark is named once.
 
-    Parameters
-    ----------
-    key : str
-        "skull" or "skin".
-    landmarks : mapping of str to (3,) float64, mm
-    where : str
-        The line of the case that names their file.
-    nearest : callable, optional
-        Closest points on the bones or the skin; without it distances are not checked.
+    key: "skull" or "skin".
+    landmarks: mapping of str to (3,), mm.
+    where: The line of the case that names their file.
+    nearest: Closest points on the bones or the skin; without it distances are not checked.
     """
     if not landmarks:
         return []

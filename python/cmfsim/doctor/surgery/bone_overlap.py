@@ -56,18 +56,11 @@ def _everywhere(points: Floats) -> NDArray[np.bool_]:
 class BonePart:
     """A bone or segment with its motion.
 
-    Attributes
-    ----------
-    name : str
-    jaw : str
-        "lower" or "upper".
-    where : str
-        Of its motion in the case file.
-    surface : SurfaceData
-        Closed; of a segment that of its bone.
-    motion : (4, 4) float64, mm, or MovedSurface
-    owns : callable
-        Which of (n, 3) points within its bone are its own.
+    jaw: "lower" or "upper".
+    where: Of its motion in the case file.
+    surface: Closed; of a segment that of its bone.
+    motion: (4, 4), mm, or MovedSurface.
+    owns: Which of (n, 3) points within its bone are its own.
     """
 
     name: str
@@ -124,11 +117,7 @@ def _sampled(vertices: Floats, triangles: NDArray[np.uint32]) -> Floats:
 def check_jaws(parts: Sequence[BonePart], landmarks: Mapping[str, Floats]) -> tuple[Finding, ...]:
     """Findings about jaws that a plan moves through each other, apart, or out of the joint.
 
-    Parameters
-    ----------
-    parts : sequence of BonePart
-    landmarks : mapping of str to (3,) float64, mm
-        Of the skull.
+    landmarks: mapping of str to (3,), mm, of the skull.
     """
     joints = _joints(parts)
     return (

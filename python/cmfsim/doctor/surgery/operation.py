@@ -196,13 +196,8 @@ def check_plan(
 ) -> Iterator[Finding]:
     """Findings about what the plan does to each bone.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    plan : mapping of str to ClinicalMotion
-        As `state_plan` gives it.
-    pieces : mapping of str to (k, 6) float64 or None
-        As `pieces_of` gives it.
+    plan: As `state_plan` gives it.
+    pieces: mapping of str to (k, 6) or None. As `pieces_of` gives it.
     """
     case = evidence.case
     # A motion that cannot be read is reported where files are.

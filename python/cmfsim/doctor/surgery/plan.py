@@ -20,11 +20,7 @@ def state_plan(
 
     An achieved plan is empty here: it is read off the bones when the case is built.
 
-    Parameters
-    ----------
-    evidence : Evidence
-    vertices : mapping of str to (k, 3) float64, mm, or None
-        Of the surface of each segment, where known.
+    vertices: mapping of str to (k, 3), mm, or None, of the surface of each segment, where known.
     """
     found: dict[str, ClinicalMotion] = {}
     for name, given in evidence.case.plan.items():

@@ -32,20 +32,12 @@ REACH = 60.0
 class SizedMotion:
     """A rigid motion of a segment with what its size is judged by.
 
-    Attributes
-    ----------
-    name : str
-        Of the segment.
-    matrix : (4, 4) float64, mm
-    where : str
-        Its place in the case file.
-    points : (k, 3) float64, mm, or None
-        On the segment's surface, where one is known.
-    point : (3,) float64, mm, or None
-        One point of the segment, where no surface is known.
-    typed : bool
-        Whether it was given by translation, angle, axis and centre.
-    has_centre : bool
+    name: Of the segment.
+    matrix: (4, 4), mm.
+    where: Its place in the case file.
+    points: (k, 3), mm, or None, on the segment's surface, where one is known.
+    point: (3,), mm, or None. One point of the segment, where no surface is known.
+    typed: Whether it was given by translation, angle, axis and centre.
     """
 
     name: str

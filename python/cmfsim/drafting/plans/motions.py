@@ -24,22 +24,13 @@ NOTHING = 1e-9
 class DraftMotion:
     """The motion of a segment as the case will have it.
 
-    Attributes
-    ----------
-    words : str
-        What it does, such as "moves the maxilla 4.0 mm forwards at the upper incisors".
-    source : tuple of str
-        Where it comes from and how it was understood.
-    matrix : (4, 4) float64, mm, LPS, or None
-    transform : str
-        A TOML value instead of a matrix.
-    question : str
-        Why a person has to decide; empty if not.
-    choices : tuple of str
-    shown : (4, 4) float64, mm, LPS, or None
-        The motion that `words` describes.
-    typed : mapping of str to str
-        Keys of the table and their TOML, instead of a matrix.
+    words: What it does, such as "moves the maxilla 4.0 mm forwards at the upper incisors".
+    source: Where it comes from and how it was understood.
+    matrix: (4, 4), mm, LPS, or None.
+    transform: A TOML value instead of a matrix.
+    question: Why a person has to decide; empty if not.
+    shown: (4, 4), mm, LPS, or None. The motion that `words` describes.
+    typed: Keys of the table and their TOML, instead of a matrix.
     """
 
     words: str
@@ -56,17 +47,9 @@ class DraftMotion:
 class Plan:
     """The motions of a case by segment, and what was noticed.
 
-    Attributes
-    ----------
-    anatomy : Anatomy
-        The surfaces that move.
-    landmarks : mapping of str to (3,) float64, mm, LPS
-        Of the skull, before the operation.
-    motions : dict of str to DraftMotion
-    taken : list of Taken
-    others : list of OtherFind
-    links : set of str
-        The names of the transforms of the scene that are motions of segments.
+    anatomy: The surfaces that move.
+    landmarks: mapping of str to (3,), mm, LPS, of the skull, before the operation.
+    links: The names of the transforms of the scene that are motions of segments.
     """
 
     anatomy: Anatomy
@@ -94,17 +77,11 @@ def scene_motions(
 ) -> None:
     """Adds the motions that a scene applies to segments, relative to the rest of the head.
 
-    Parameters
-    ----------
-    plan : Plan
-    moved : mapping of str to SurfaceFind
-        Segments by name.
-    loose : sequence of LooseMotion
-        Transforms that are applied to nothing.
-    reference : (4, 4) float64, mm, LPS
-        What the scene applies to what does not move.
-    in_image : bool
-        Whether the case is in the coordinates of its image, rather than in those of the world.
+    moved: Segments by name.
+    loose: Transforms that are applied to nothing.
+    reference: (4, 4), mm, LPS. What the scene applies to what does not move.
+    in_image: Whether the case is in the coordinates of its image, rather than in those of the
+        world.
     """
     back = np.linalg.inv(reference)
     asked = _asked(plan.anatomy)
@@ -212,12 +189,7 @@ def _add_loose(plan: Plan, motion: LooseMotion) -> None:
 def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool) -> None:
     """Adds the motions in transform files, by the segment in the file's name.
 
-    Parameters
-    ----------
-    plan : Plan
-    found : sequence of TransformFind
-    by_slicer : bool
-        Whether other files of the folder were saved by 3D Slicer.
+    by_slicer: Whether other files of the folder were saved by 3D Slicer.
     """
     by_part: dict[str, list[TransformFind]] = {}
     for find in found:
@@ -270,10 +242,7 @@ def _ask_which(plan: Plan, name: str, finds: Sequence[TransformFind]) -> None:
 def _of_file(plan: Plan, name: str, find: TransformFind, *, by_slicer: bool) -> DraftMotion:
     """The motion in a file, with its direction and frame as far as they are known.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) As `read_transform_file`.
+    Raises `CaseError`: As `read_transform_file`.
     """
     file = f"file = {quoted(find.label)}"
 

@@ -28,12 +28,8 @@ WORDS = (*SHIFTS, *TURNS)
 class TypedPlan:
     """What a person wants cut and moved.
 
-    Attributes
-    ----------
-    cuts : tuple of str
-        Procedures.
-    moves : mapping of str to mapping of str to float
-        Numbers by word for each segment: forwards, backwards, up, down, left, right in mm, and
+    cuts: Procedures.
+    moves: Numbers by word for each segment: forwards, backwards, up, down, left, right in mm, and
         pitch (front up), yaw (front to the left), roll (left side up) in degrees.
     """
 
@@ -57,11 +53,8 @@ class TypedPlan:
 def read_moves(given: Iterable[Iterable[str]]) -> dict[str, dict[str, float]]:
     """The numbers of `--move SEGMENT WORD=NUMBER …`, by segment.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) No segment or no number, a text that is no number, a segment or a word
-        given twice.
+    Raises `CaseError`: No segment or no number, a text that is no number, a segment or a word given
+        twice.
     """
     moves: dict[str, dict[str, float]] = {}
     for segment, *texts in given:
@@ -91,19 +84,9 @@ def read_moves(given: Iterable[Iterable[str]]) -> dict[str, dict[str, float]]:
 def add_typed(plan: Plan, typed: TypedPlan, bones: Iterable[str], *, is_turned: bool) -> None:
     """Adds the motions that a person typed to those of files.
 
-    Parameters
-    ----------
-    plan : Plan
-    typed : TypedPlan
-    bones : iterable of str
-        That the case has before it is cut.
-    is_turned : bool
-        Whether a scene turns the case, so that its landmarks lie elsewhere.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A segment that no bone is and no procedure makes, or that a file moves
+    bones: That the case has before it is cut.
+    is_turned: Whether a scene turns the case, so that its landmarks lie elsewhere.
+    Raises `CaseError`: A segment that no bone is and no procedure makes, or that a file moves
         already; a cut whose pieces are there already; a turn about a point that is not known.
     """
     bones = set(bones)

@@ -20,14 +20,9 @@ FLIP = np.array([-1.0, -1.0, 1.0])
 class Question:
     """A decision about a key that a person has to make.
 
-    Attributes
-    ----------
-    key : str
-        Below [surfaces].
-    text : str
-        The question.
-    choices : tuple of (SurfaceFind or None, str)
-        What may be written: the file of a surface, or none, and words about it.
+    key: Below [surfaces].
+    text: The question.
+    choices: What may be written: the file of a surface, or none, and words about it.
     """
 
     key: str

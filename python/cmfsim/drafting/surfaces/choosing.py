@@ -30,11 +30,8 @@ def choose_surfaces(
 ) -> Anatomy:
     """Skin and bones among surfaces; what is not clear becomes a question.
 
-    Parameters
-    ----------
-    found : sequence of SurfaceFind
-    boxes : sequence of (str, (2, 3) float64)
-        What lies in LPS mm for certain, by name, with its lowest and highest corner.
+    boxes: sequence of (str, (2, 3)). What lies in LPS mm for certain, by name, with its lowest and
+        highest corner.
     """
     anatomy = Anatomy()
     before = [find for find in found if not find.role.is_after]

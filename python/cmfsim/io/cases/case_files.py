@@ -235,10 +235,8 @@ CaseOrPath: TypeAlias = Case | str | os.PathLike[str]
 def as_case(case: CaseOrPath) -> Case:
     """The case itself, or the one that the file or folder at a path describes.
 
-    Raises
-    ------
-    FileNotFoundError, CaseError
-        As `Case.load`; `CaseError` (also `ValueError`) also for anything else.
+    Raises `FileNotFoundError`, `CaseError`: As `Case.load`; `CaseError` (also `ValueError`) also
+        for anything else.
     """
     if isinstance(case, Case):
         return case

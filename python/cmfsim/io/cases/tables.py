@@ -98,12 +98,8 @@ def _paths(values: Mapping[str, Any], above: KeyPath) -> Iterator[KeyPath]:
 def read_tables(path: Path) -> "Table":
     """The whole of a TOML file as a table.
 
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    CaseError
-        (also `ValueError`) Not TOML, not UTF-8, larger than 1 MiB, a pipe, keys of many parts.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `CaseError`: Not TOML, not UTF-8, larger than 1 MiB, a pipe, keys of many parts.
     """
     check_readable(path)
     if path.suffix != ".toml":
@@ -237,10 +233,7 @@ class Table:
     def changed(self, changes: CaseChanges) -> "Table":
         """The whole file with changes; an error names the file in which its key stands.
 
-        Raises
-        ------
-        CaseError
-            (also `ValueError`) A key to be removed that the file does not have.
+        Raises `CaseError`: A key to be removed that the file does not have.
         """
         values, lines = copy.deepcopy(dict(self._values)), dict(self._lines)
         for name in changes.without:

@@ -61,12 +61,8 @@ class TemplateSurvey:
 def read_template(path: str | os.PathLike[str]) -> TemplateData:
     """The template of a folder with `template.toml`, or of an `.npz` archive.
 
-    Raises
-    ------
-    FileNotFoundError
-        The folder or archive, or a file that it names, does not exist.
-    CaseError
-        (also `ValueError`) Anything else: file, line and key, and how many more there are.
+    Raises `FileNotFoundError`: The folder or archive, or a file that it names, does not exist.
+    Raises `CaseError`: Anything else: file, line and key, and how many more there are.
     """
     survey = survey_template(path)
     errors = [f for f in survey.findings if f.severity == "error"]
@@ -81,10 +77,7 @@ def read_template(path: str | os.PathLike[str]) -> TemplateData:
 def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
     """What a template on disk holds, and everything that keeps it from being read.
 
-    Raises
-    ------
-    FileNotFoundError
-        There is no such folder or archive.
+    Raises `FileNotFoundError`: There is no such folder or archive.
     """
     path = Path(path)
     if not is_there(path):
@@ -113,12 +106,8 @@ def write_template(
     The files of a folder take their places together. A folder that is there must hold a template
     and nothing else; files that the new one lacks go.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The folder holds files that are not of a template.
-    OSError
-        The place cannot be written to.
+    Raises `CaseError`: The folder holds files that are not of a template.
+    Raises `OSError`: The place cannot be written to.
     """
     path = Path(path)
     if path.suffix == ".npz":

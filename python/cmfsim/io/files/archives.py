@@ -139,27 +139,12 @@ def read_archive(
 ) -> tuple[dict[str, Any], Mapping[str, NDArray[Any]]]:
     """Header and arrays of an archive of this format; an array is unpacked when it is asked for.
 
-    Parameters
-    ----------
-    path : Path
-    format_name : str
-        What the header states as its format.
-    text_name : str
-        The member that is the header, a JSON text.
-
-    Returns
-    -------
-    dict
-        The header.
-    mapping of str to array
-        Looking one up raises `CaseError` where it is damaged or too large.
-
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    CaseError
-        (also `ValueError`) Not an archive, cut short, another format, version or units.
+    format_name: What the header states as its format.
+    text_name: The member that is the header, a JSON text.
+    Returns: The header.
+    Returns: Looking one up raises `CaseError` where it is damaged or too large.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `CaseError`: Not an archive, cut short, another format, version or units.
     """
     check_readable(path)
     try:

@@ -54,27 +54,14 @@ def replacing_files(
     still to be taken: until then the files that state what the others are (`STATEMENTS`) are
     missing, so that nothing reads old and new files as one.
 
-    Parameters
-    ----------
-    folder : Path
-    summary : str or None
-        The JSON file whose "files" lists what was written; `fill` writes it last.
-    is_ours : callable
-        Whether a file of a name may be removed.
-    fill : callable
-        Writes the files into the folder that it is given, and returns their names: plain ones, or
+    summary: The JSON file whose "files" lists what was written; `fill` writes it last.
+    is_ours: Whether a file of a name may be removed.
+    fill: Writes the files into the folder that it is given, and returns their names: plain ones, or
         one folder and a name ("M/prediction.vtp").
-    stale : callable, optional
-        The names in the folder that do not belong to what `fill` wrote; called after it.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A subfolder that files are to be written to is a link or a file.
-    CmfsimError
-        The folder was deleted meanwhile.
-    OSError
-        The folder cannot be made or written to; names it.
+    stale: The names in the folder that do not belong to what `fill` wrote; called after it.
+    Raises `CaseError`: A subfolder that files are to be written to is a link or a file.
+    Raises `CmfsimError`: The folder was deleted meanwhile.
+    Raises `OSError`: The folder cannot be made or written to; names it.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
@@ -112,10 +99,7 @@ def finish_writing(folder: Path) -> None:
     What a stranger put there under such a name can neither lead out of the folder nor keep a run
     from working.
 
-    Raises
-    ------
-    OSError
-        Files that are whole cannot take their places; names the folder.
+    Raises `OSError`: Files that are whole cannot take their places; names the folder.
     """
     for left in abandoned(folder, f"{PREFIX}*", folders=True):
         undo, ready = _journal(left / UNDO), _journal(left / READY)
@@ -133,10 +117,7 @@ def check_below(folder: Path, base: Path) -> None:
     A case comes from strangers, and a link in it could have results replace files anywhere. A
     folder that does not lie below is the user's own choice.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Where the link leads.
+    Raises `CaseError`: Where the link leads.
     """
     if not folder.absolute().is_relative_to(base.absolute()):
         return
@@ -157,12 +138,8 @@ def check_writable(folder: Path) -> None:
 
     Permissions do not tell: root has them all, and a disk may be read-only or full.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) It is a file, or would be in one.
-    OSError
-        It cannot be written to.
+    Raises `CaseError`: It is a file, or would be in one.
+    Raises `OSError`: It cannot be written to.
     """
     there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():

@@ -92,12 +92,9 @@ def deleted_meanwhile(folder: Path) -> CmfsimError:
 def check_readable(path: Path, error: type[ValueError] = CaseInputError) -> None:
     """Refuses what is no plain file: opening a pipe waits for ever, a device may never end.
 
-    Raises
-    ------
-    FileNotFoundError
-        There is nothing of this name.
-    CaseError, or the error that is given
-        (also `ValueError`) A folder, a pipe or device, a name that no file can have, no permission.
+    Raises `FileNotFoundError`: There is nothing of this name.
+    Raises `CaseError`, `or the error that is given`: A folder, a pipe or device, a name that no
+        file can have, no permission.
     """
     mode = _mode(path, error)
     if mode is None:
@@ -114,10 +111,8 @@ def check_readable(path: Path, error: type[ValueError] = CaseInputError) -> None
 def is_there(path: Path, error: type[ValueError] = CaseInputError) -> bool:
     """Whether there is a file or folder of this name.
 
-    Raises
-    ------
-    CaseError, or the error that is given
-        (also `ValueError`) A name that no file can have, links in a circle, no permission.
+    Raises `CaseError`, `or the error that is given`: A name that no file can have, links in a
+        circle, no permission.
     """
     return _mode(path, error) is not None
 
@@ -230,10 +225,7 @@ def read_document(path: Path) -> dict[str, Any]:
 def utf8_text(data: bytes) -> str:
     """The text of a file in UTF-8, with or without a mark at its beginning.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Another encoding; names the line, and says how to save the file.
+    Raises `CaseError`: Another encoding; names the line, and says how to save the file.
     """
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise CaseInputError(
@@ -269,10 +261,7 @@ def toml_hint(text: str, message: str) -> str:
 def check_plain_toml(text: str) -> None:
     """Refuses keys of more than 8 parts: their tables in tables take a thousand times the text.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) With the line.
+    Raises `CaseError`: With the line.
     """
     # Usually there is no such key, in texts and comments neither.
     found = re.search(DEEP_KEY, text) and next(
@@ -286,16 +275,8 @@ def check_plain_toml(text: str) -> None:
 def check_numbers(value: object, *, finite: bool = False) -> None:
     """Refuses whole numbers beyond a float's range anywhere in plain values of a text.
 
-    Parameters
-    ----------
-    value : plain values
-    finite : bool
-        Whether other numbers must be finite as well: JSON reads 1e400 as infinity.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) With the number of its digits.
+    finite: Whether other numbers must be finite as well: JSON reads 1e400 as infinity.
+    Raises `CaseError`: With the number of its digits.
     """
     left = [value]
     while left:
@@ -324,10 +305,7 @@ def toml_module() -> Any:
 def parsed_json(text: str) -> Any:
     """The value of a JSON text; NaN, Infinity and a name twice in one table are refused.
 
-    Raises
-    ------
-    ValueError, RecursionError
-        Not JSON, or nested too deeply.
+    Raises `ValueError`, `RecursionError`: Not JSON, or nested too deeply.
     """
     return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=_refuse_twice)
 
@@ -402,17 +380,9 @@ def strict_parser(text: bytes, separator: str | None = None) -> XMLParserType:
     The encoding is UTF-8 whatever the text states: nothing hides behind another one. Entities could
     grow without bound.
 
-    Parameters
-    ----------
-    text : bytes
-        What will be parsed.
-    separator : str, optional
-        Between namespace and name; without one, namespaces are not resolved.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The text holds zero bytes; while parsing, a document type or an entity.
+    text: What will be parsed.
+    separator: Between namespace and name; without one, namespaces are not resolved.
+    Raises `CaseError`: The text holds zero bytes; while parsing, a document type or an entity.
     """
     if b"\0" in text:
         raise CaseInputError("is not XML in UTF-8: it holds zero bytes")

@@ -69,18 +69,9 @@ def write_summary(
 ) -> None:
     """Writes a summary with the hashes of files next to it, and its own.
 
-    Parameters
-    ----------
-    path : Path
-    values : mapping
-        Plain values.
-    sealed : mapping of str to str, optional
-        The files in the same folder that it answers for: their `hashes_of`.
-
-    Raises
-    ------
-    ValueError
-        NaN or infinity among the values.
+    values: Plain values.
+    sealed: The files in the same folder that it answers for: their `hashes_of`.
+    Raises `ValueError`: NaN or infinity among the values.
     """
     content = {**values, "sha256": dict(sealed or {})}
     # As a reader will have it: tuples are lists, keys are texts.
@@ -92,20 +83,10 @@ def write_summary(
 def read_summary(path: Path, shape: Shape, again: str) -> dict[str, Any]:
     """The content of a summary that is whole, unchanged and as it must be.
 
-    Parameters
-    ----------
-    path : Path
-    shape
-        As `check` takes it.
-    again : str
-        What makes the file again, for the error.
-
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    CaseError
-        (also `ValueError`) It is a link or no file, too large, not JSON; its digest is missing or
+    shape: As `check` takes it.
+    again: What makes the file again, for the error.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `CaseError`: It is a link or no file, too large, not JSON; its digest is missing or
         another; a value of another type or out of range, with its place.
     """
     try:
@@ -129,12 +110,8 @@ def read_summary(path: Path, shape: Shape, again: str) -> dict[str, Any]:
 def checked_file(folder: Path, summary: Mapping[str, Any], name: str, again: str) -> Path:
     """The path of a file next to a summary that is the one it was written with.
 
-    Raises
-    ------
-    FileNotFoundError
-        There is none.
-    CaseError
-        (also `ValueError`) The summary does not list it, or it is another file.
+    Raises `FileNotFoundError`: There is none.
+    Raises `CaseError`: The summary does not list it, or it is another file.
     """
     path = folder / name
     known = summary["sha256"].get(name)
@@ -154,12 +131,8 @@ def checked_file(folder: Path, summary: Mapping[str, Any], name: str, again: str
 def plain_json(path: Path) -> dict[str, Any]:
     """The table of names and values in a JSON file that is no link and not too large.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Anything else; without the file's name.
-    OSError
-        It cannot be opened.
+    Raises `CaseError`: Anything else; without the file's name.
+    Raises `OSError`: It cannot be opened.
     """
     mode = path.lstat().st_mode
     if not stat.S_ISREG(mode):

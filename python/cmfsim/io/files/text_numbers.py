@@ -15,22 +15,10 @@ SHOWN = 40
 def real_numbers(words: Sequence[bytes], where: Callable[[int], str], kind: str = "f8") -> Floats:
     """Words as finite float64, one for one.
 
-    Parameters
-    ----------
-    words : sequence of bytes
-    where : callable
-        The place of a word, by its index, as an error names it: "line 3".
-    kind : str
-        "f4" where the file states single precision: numbers become those that it can hold.
-
-    Returns
-    -------
-    (n,) float64
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A word that is no number, NaN or infinity.
+    where: The place of a word, by its index, as an error names it: "line 3".
+    kind: "f4" where the file states single precision: numbers become those that it can hold.
+    Returns: (n,).
+    Raises `CaseError`: A word that is no number, NaN or infinity.
     """
     try:
         values = np.fromiter(map(float, words), np.float64, len(words))
@@ -54,20 +42,9 @@ def real_numbers(words: Sequence[bytes], where: Callable[[int], str], kind: str 
 def whole_numbers(words: Sequence[bytes], where: Callable[[int], str]) -> NDArray[np.int64]:
     """Words as int64, one for one.
 
-    Parameters
-    ----------
-    words : sequence of bytes
-    where : callable
-        The place of a word, by its index, as an error names it.
-
-    Returns
-    -------
-    (n,) int64
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A word that is no whole number, or one beyond 64 bits.
+    where: The place of a word, by its index, as an error names it.
+    Returns: (n,) int64.
+    Raises `CaseError`: A word that is no whole number, or one beyond 64 bits.
     """
     try:
         values = np.fromiter(map(int, words), np.int64, len(words))

@@ -21,14 +21,7 @@ def toml_lines(text: str) -> dict[KeyPath, int]:
     Keys inside inline tables and arrays are not listed: they have the line of the key before them
     (`line_of`).
 
-    Parameters
-    ----------
-    text : str
-        A text that a TOML reader has accepted.
-
-    Returns
-    -------
-    dict of key path to int
+    text: A text that a TOML reader has accepted.
     """
     lines: dict[KeyPath, int] = {}
     counts: dict[KeyPath, int] = {}

@@ -48,13 +48,8 @@ COPIES = 4
 class ImageFile:
     """An image with what was found on its file.
 
-    Attributes
-    ----------
-    image : ImageData
-        On an axis-aligned grid, LPS, mm.
-    modality : str
-        "CT", "MR", … of DICOM; empty where the file does not say it.
-    findings : tuple of Finding
+    image: On an axis-aligned grid, LPS, mm.
+    modality: "CT", "MR", … of DICOM; empty where the file does not say it.
     """
 
     image: ImageData
@@ -91,11 +86,8 @@ def read_image(path: str | os.PathLike[str], *, series: str | None = None) -> Im
 def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) -> ImageFile:
     """The image of a file or a DICOM folder, with its modality and findings.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) As `read_image`.
-    FileNotFoundError
+    Raises `ImageError`: As `read_image`.
+    Raises `FileNotFoundError`.
     """
     path = Path(path)
     if not is_there(path, ImageInputError):

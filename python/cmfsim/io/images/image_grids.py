@@ -31,16 +31,9 @@ SAME = 1e-6
 def aligned(values: NDArray[Any], affine: NDArray[np.float64]) -> ImageData | None:
     """Voxels whose axes run along the patient's, in the order and direction of these.
 
-    Parameters
-    ----------
-    values : (n, m, k) array
-        values[i, j, k] lies at affine · (i, j, k, 1).
-    affine : (3, 4) float64, mm
-
-    Returns
-    -------
-    ImageData or None
-        None where an axis runs obliquely.
+    values: (n, m, k) array. values[i, j, k] lies at affine · (i, j, k, 1).
+    affine: (3, 4), mm.
+    Returns: None where an axis runs obliquely.
     """
     directions = affine[:, :3] / np.linalg.norm(affine[:, :3], axis=0)
     order = np.argmax(np.abs(directions), axis=1)
@@ -89,10 +82,7 @@ def shear_of(affine: NDArray[np.float64]) -> float:
 def upright(values: NDArray[Any], affine: NDArray[np.float64], name: str) -> ImageData:
     """Voxels on oblique or sheared axes, linearly on the least grid in LPS that holds them.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) The grid would have too many voxels.
+    Raises `ImageError`: The grid would have too many voxels.
     """
     itk = import_module("SimpleITK")
     image = itk.GetImageFromArray(values.T)
@@ -140,20 +130,11 @@ def of_slices(
     pixels, so that nothing rings at bone, metal and air. Next to the first and the last slice, and
     where one of the four does not hold the place, it is linear between slices.
 
-    Parameters
-    ----------
-    values : (slices, rows, columns) array
-    positions : (slices, 3) float64, mm
-        Of the first pixel of each slice, in ascending order along the normal.
-    axes : (2, 3) float64
-        Unit vectors along a row (from column to column) and along a column.
-    spacing : tuple of float, mm
-        Between columns and between rows.
-
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) The grid would have too many voxels.
+    positions: (slices, 3), mm, of the first pixel of each slice, in ascending order along the
+        normal.
+    axes: (2, 3). Unit vectors along a row (from column to column) and along a column.
+    spacing: mm, between columns and between rows.
+    Raises `ImageError`: The grid would have too many voxels.
     """
     values, positions, axes = _rows_to_left(values, positions, axes, spacing[0])
     along_row, along_column = axes

@@ -49,14 +49,8 @@ KNOWN = "NRRD, NIfTI, MetaImage or DICOM is needed"
 class PackedVoxels:
     """Voxels that ITK does not unpack, and the header of a file that has them unpacked.
 
-    Attributes
-    ----------
-    header : bytes
-    data : Path
-    start : int
-        Where they begin.
-    packing : str
-        As `check_length` takes it.
+    start: Where they begin.
+    packing: As `check_length` takes it.
     """
 
     header: bytes
@@ -79,22 +73,13 @@ class PackedVoxels:
 class ImageHeader:
     """What the header of an image file states.
 
-    Attributes
-    ----------
-    reader : str
-        ITK's name of the reader for its format.
-    size : tuple of int
-        Voxels along each of the three axes.
-    affine : (3, 4) float64 or None, mm
-        Takes an index (i, j, k, 1) to its place in LPS; None where the file states no frame: then
-        the reader's own spacing and origin are all that is known.
-    bytes : int
-        Of all voxels, unpacked.
-    scaled : bool
-        Whether the affine differs from the reader's for a stated reason: a unit, a choice.
-    findings : tuple of Finding
-    packed : PackedVoxels or None
-        Where ITK does not unpack them.
+    reader: ITK's name of the reader for its format.
+    size: Voxels along each of the three axes.
+    affine: (3, 4) or None, mm. Takes an index (i, j, k, 1) to its place in LPS; None where the file
+        states no frame: then the reader's own spacing and origin are all that is known.
+    bytes: Of all voxels, unpacked.
+    scaled: Whether the affine differs from the reader's for a stated reason: a unit, a choice.
+    packed: Where ITK does not unpack them.
     """
 
     reader: str
@@ -109,10 +94,7 @@ class ImageHeader:
 def check_shape(name: str, size: list[int], components: int = 1) -> None:
     """Refuses what is no volume of one number per voxel.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`)
+    Raises `ImageError`.
     """
     text = " × ".join(map(str, size))
     if components != 1:
@@ -142,22 +124,11 @@ def check_length(
 
     ITK pads what is short, drops what is long, and does not compare checksums.
 
-    Parameters
-    ----------
-    data : Path
-    start : int
-        Where the voxels begin.
-    needed : int
-        Bytes of the voxels, unpacked.
-    layer : int
-        Bytes of one slice: as many more may be slices that the header misses, and are refused.
-    packing : str
-        "gzip", "zlib" or "bzip2"; empty where they are not packed.
-
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) With both lengths.
+    start: Where the voxels begin.
+    needed: Bytes of the voxels, unpacked.
+    layer: Bytes of one slice: as many more may be slices that the header misses, and are refused.
+    packing: "gzip", "zlib" or "bzip2"; empty where they are not packed.
+    Raises `ImageError`: With both lengths.
     """
     found, left = data.stat().st_size - start, 0
     if packing:
@@ -216,10 +187,7 @@ def _rest(reader: Any) -> bytes:
 def data_file(path: Path, name: str) -> Path:
     """The file beside a header that holds its voxels.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) It would lead out of the header's folder, it is a list or a pattern of
+    Raises `ImageError`: It would lead out of the header's folder, it is a list or a pattern of
         names, or there is none.
     """
     how = (
@@ -272,10 +240,7 @@ def apart(a: NDArray[np.float64], b: NDArray[np.float64], size: tuple[int, int, 
 def whole(path: Path, key: str, text: str) -> int:
     """A whole number of a header, not below 0.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`)
+    Raises `ImageError`.
     """
     if not _WHOLE.fullmatch(text.strip()):
         raise ImageInputError(f"{path.name}: {key} is {text[:MOST_DIGITS]!r}: not a whole number")
@@ -285,10 +250,7 @@ def whole(path: Path, key: str, text: str) -> int:
 def number(path: Path, key: str, text: str) -> float:
     """A finite number of a header.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) None, not finite, longer than any that is meant, or farther than a head.
+    Raises `ImageError`: None, not finite, longer than any that is meant, or farther than a head.
     """
     text = text.strip()
     if len(text) > MOST_DIGITS or not _NUMBER.fullmatch(text):
@@ -302,10 +264,7 @@ def number(path: Path, key: str, text: str) -> float:
 def check_affine(name: str, affine: NDArray[np.float64], size: tuple[int, int, int]) -> None:
     """Refuses a map from index to place whose axes span no space, or that leads too far.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`)
+    Raises `ImageError`.
     """
     lengths = np.linalg.norm(affine[:, :3], axis=0)
     if not (lengths > 0.0).all():

@@ -40,10 +40,7 @@ def is_meta(begin: bytes) -> bool:
 def meta_header(path: Path) -> ImageHeader:
     """The checked header of a MetaImage file.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) Something impossible is stated, or a data file elsewhere.
+    Raises `ImageError`: Something impossible is stated, or a data file elsewhere.
     """
     fields, begin = _fields(path)
     axes = whole(path, "NDims", fields.get("NDims", ""))

@@ -60,10 +60,7 @@ TEXTS = frozenset({"content", "data file", "datafile", "labels", "units", "sampl
 def nrrd_header(path: Path) -> ImageHeader:
     """The checked header of a NRRD file.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) Something impossible is stated, or a data file elsewhere.
+    Raises `ImageError`: Something impossible is stated, or a data file elsewhere.
     """
     fields, begin = nrrd_fields(path)
     kind = fields.get("type", "").lower()

@@ -56,13 +56,7 @@ class Segment:
 class Segmentation:
     """The segments of a file.
 
-    Attributes
-    ----------
-    labels : (layers, nx, ny, nz) array of whole numbers
-    affine : (3, 4) float64, mm
-        The map from index (i, j, k, 1) to LPS.
-    segments : tuple of Segment
-    findings : tuple of Finding
+    affine: (3, 4), mm. The map from index (i, j, k, 1) to LPS.
     """
 
     labels: NDArray[Any]
@@ -79,12 +73,8 @@ class Segmentation:
 def read_segmentation(path: Path) -> Segmentation:
     """The segments of a `.seg.nrrd` file, or the labels of a label image as segments.
 
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    ImageError
-        (also `ValueError`) Not NRRD, detached, cut short, real numbers; a layer that is not there.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `ImageError`: Not NRRD, detached, cut short, real numbers; a layer that is not there.
     """
     check_readable(path, ImageInputError)
     with path.open("rb") as file:
@@ -137,17 +127,9 @@ def are_labels(values: NDArray[Any]) -> bool:
 def read_labels(path: Path) -> Segmentation:
     """The labels of an image as segments; their names where the file, or nnU-Net, states them.
 
-    Parameters
-    ----------
-    path : Path
-        NRRD, NIfTI or MetaImage. One label alone is a mask, named after its file.
-
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    ImageError
-        (also `ValueError`) As `read_segmentation`; no labels.
+    path: NRRD, NIfTI or MetaImage. One label alone is a mask, named after its file.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `ImageError`: As `read_segmentation`; no labels.
     """
     check_readable(path, ImageInputError)
     name = path.name.lower()

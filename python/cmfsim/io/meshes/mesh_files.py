@@ -74,18 +74,10 @@ READERS: Mapping[str, Callable[[bytes], PlainMesh]] = MappingProxyType(
 def read_mesh(path: Path) -> PlainMesh:
     """The mesh in a file, its indices checked.
 
-    Parameters
-    ----------
-    path : path
-        STL, PLY, OBJ, VTP, VTU, legacy VTK, Gmsh; or another format of one file that meshio reads,
-        in the child process.
-
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    CaseError
-        (also `ValueError`) Not such a file, cut short, damaged, an index that is not there, a
+    path: STL, PLY, OBJ, VTP, VTU, legacy VTK, Gmsh; or another format of one file that meshio
+        reads, in the child process.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `CaseError`: Not such a file, cut short, damaged, an index that is not there, a
         coordinate that is not finite, more memory or time than a file of this size needs.
     """
     check_readable(path)
@@ -211,10 +203,7 @@ def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], ND
 def read_tets(mesh: PlainMesh, path: Path) -> tuple[NDArray[np.int64], dict[str, NDArray[Any]]]:
     """The linear tets of a mesh and their cell data.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) No tets, or other volume elements: leaving them out would leave holes.
+    Raises `CaseError`: No tets, or other volume elements: leaving them out would leave holes.
     """
     blocks = [i for i, b in enumerate(mesh.cells) if b.type == "tetra" and len(b.data)]
     others = {b.type for b in mesh.cells if len(b.data)} - PASSED_OVER

@@ -40,13 +40,8 @@ WHOLE = re.compile(r"-?[0-9]{1,18}")
 class Cursor:
     """A place in a file, which moves on with what is read.
 
-    Attributes
-    ----------
-    data : bytes
-    at : int
-        Where the next line or block begins.
-    order : str
-        "<" or ">" where numbers are bytes, empty where they are words.
+    at: Where the next line or block begins.
+    order: "<" or ">" where numbers are bytes, empty where they are words.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -73,18 +68,9 @@ class Cursor:
     def numbers(self, kind: str, count: int, what: str) -> NDArray[Any]:
         """The next numbers: float64 for a kind of float, else int64.
 
-        Parameters
-        ----------
-        kind : str
-            numpy's name of the type that the file holds: "f4", "i8".
-        count : int
-        what : str
-            What they are, for errors.
-
-        Raises
-        ------
-        CaseError
-            (also `ValueError`) Fewer than that many are left, or one is none.
+        kind: numpy's name of the type that the file holds: "f4", "i8".
+        what: What they are, for errors.
+        Raises `CaseError`: Fewer than that many are left, or one is none.
         """
         wide = np.float64 if kind[0] == "f" else np.int64
         if self.order:
@@ -139,11 +125,8 @@ class _Values(NamedTuple):
 def read_msh(data: bytes) -> PlainMesh:
     """The mesh of a file.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Not such a file, another version, a section that does not end, fewer or
-        more nodes or elements than stated, a number twice, a node that is not there.
+    Raises `CaseError`: Not such a file, another version, a section that does not end, fewer or more
+        nodes or elements than stated, a number twice, a node that is not there.
     """
     return _Reader(data).mesh()
 

@@ -44,10 +44,7 @@ def read_obj(data: bytes) -> tuple[Floats, Integers]:
 
     Negative indices count back from the vertices defined so far. Polygons become triangles.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A line that is none of OBJ, with its number; vertex 0 or one that is not
+    Raises `CaseError`: A line that is none of OBJ, with its number; vertex 0 or one that is not
         there; a coordinate that is not finite; other counts than a comment states.
     """
     data = data.removeprefix(UTF8).rstrip(ENDS)

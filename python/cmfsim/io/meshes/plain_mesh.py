@@ -32,12 +32,8 @@ CELL_CORNERS = {
 class Cells:
     """Cells of one type.
 
-    Attributes
-    ----------
-    type : str
-        "triangle", "tetra", …
-    data : (m, k) int64
-        Indices of points, from 0 on.
+    type: "triangle", "tetra", ….
+    data: (m, k) int64. Indices of points, from 0 on.
     """
 
     type: str
@@ -48,23 +44,13 @@ class Cells:
 class PlainMesh:
     """Points and cells of a file.
 
-    Attributes
-    ----------
-    points : (n, 3) float64
-    cells : tuple of Cells
-    point_data : mapping of str to (n, …) array
-    cell_data : mapping of str to tuple of (m, …) array
-        One array for each entry of `cells`.
-    frame : str or None
-        "LPS" or "RAS" where the file's header states it.
-    findings : tuple of Finding
-        What was ignored on reading, although the file states it.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A point that is not finite, a cell that names a point that is not there,
-        an array of another length.
+    points: (n, 3).
+    point_data: mapping of str to (n, …) array.
+    cell_data: mapping of str to tuple of (m, …) array. One array for each entry of `cells`.
+    frame: "LPS" or "RAS" where the file's header states it.
+    findings: What was ignored on reading, although the file states it.
+    Raises `CaseError`: A point that is not finite, a cell that names a point that is not there, an
+        array of another length.
     """
 
     points: Floats

@@ -73,11 +73,8 @@ class _Rows:
 def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
     """The vertices (n, 3), triangles (t, 3) and findings of a file. Polygons become triangles.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Not PLY; a header that does not end; fewer bytes than the header states,
-        or more that may be another row; indices that are no whole numbers or name no vertex; a
+    Raises `CaseError`: Not PLY; a header that does not end; fewer bytes than the header states, or
+        more that may be another row; indices that are no whole numbers or name no vertex; a
         coordinate that is not finite.
     """
     elements, order, start = _header(data)

@@ -16,21 +16,11 @@ def checked_indices(
 ) -> Integers:
     """The indices (m, k), if each names one of `count` vertices.
 
-    Parameters
-    ----------
-    indices : (m, k) int64
-        From 0 on.
-    count : int
-        Number of vertices.
-    of : str
-        What a row is, for the error.
-    first : int
-        Number of the first vertex in the file's own count: 1 in OBJ, 0 elsewhere.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) An index below 0 or beyond the last.
+    indices: (m, k) int64, from 0 on.
+    count: Number of vertices.
+    of: What a row is, for the error.
+    first: Number of the first vertex in the file's own count: 1 in OBJ, 0 elsewhere.
+    Raises `CaseError`: An index below 0 or beyond the last.
     """
     if indices.size and (int(indices.min()) < 0 or int(indices.max()) >= count):
         row, column = np.argwhere((indices < 0) | (indices >= count))[0]
@@ -52,21 +42,12 @@ def triangles_of(
     A polygon becomes a fan of triangles about its first corner from which all of them face the same
     way; one that no fan fills, such as a star or a bow, is refused.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    counts : (f,) int64
-        Number of corners of each face.
-    corners : (sum of counts,) int64
-        From 0 on.
-    first : int
-        Number of the first vertex in the file's own count.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A face of fewer than three corners, an index that is not there, a
-        polygon that no fan fills.
+    points: (n, 3).
+    counts: (f,) int64. Number of corners of each face.
+    corners: (sum of counts,) int64, from 0 on.
+    first: Number of the first vertex in the file's own count.
+    Raises `CaseError`: A face of fewer than three corners, an index that is not there, a polygon
+        that no fan fills.
     """
     few = np.flatnonzero(counts < 3)
     if len(few):
@@ -101,18 +82,10 @@ def triangles_of_strips(points: Floats, counts: Integers, corners: Integers) -> 
     Every other triangle of a strip runs the other way round, so that all face the same way. One
     that names a corner twice joins two parts of a strip and is none.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-    counts : (s,) int64
-        Number of corners of each strip.
-    corners : (sum of counts,) int64
-        From 0 on.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A strip of fewer than three corners, an index that is not there.
+    points: (n, 3).
+    counts: (s,) int64. Number of corners of each strip.
+    corners: (sum of counts,) int64, from 0 on.
+    Raises `CaseError`: A strip of fewer than three corners, an index that is not there.
     """
     few = np.flatnonzero(counts < 3)
     if len(few):

@@ -20,17 +20,9 @@ STL_HEADER = 80
 def stated_frame(data: bytes, suffix: str) -> str | None:
     """The frame in the header of an STL, PLY, OBJ or legacy VTK file; None where it states none.
 
-    Parameters
-    ----------
-    data : bytes
-        The whole file.
-    suffix : str
-        Its ending in lower case, such as ".stl".
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Two frames, or one that is neither LPS nor RAS.
+    data: The whole file.
+    suffix: Its ending in lower case, such as ".stl".
+    Raises `CaseError`: Two frames, or one that is neither LPS nor RAS.
     """
     head = _header(data[:MOST_HEADER], suffix)
     found = {match.upper() for match in SLICER.findall(head)}

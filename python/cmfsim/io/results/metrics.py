@@ -77,14 +77,9 @@ _EVALUATION = {
 class SkinErrors:
     """A predicted skin with its distances from the skin after the operation.
 
-    Attributes
-    ----------
-    skin : SurfaceData
-        As predicted.
-    signed : (v,) float64, mm
-        Negative where the prediction lies behind; 0 where nothing was evaluated.
-    evaluated : (v,) bool
-        The vertices that the tables count: those evaluated in every model.
+    skin: As predicted.
+    signed: (v,), mm. Negative where the prediction lies behind; 0 where nothing was evaluated.
+    evaluated: (v,) bool. The vertices that the tables count: those evaluated in every model.
     """
 
     skin: SurfaceData
@@ -122,15 +117,9 @@ def write_skin_errors(
 ) -> None:
     """Writes a predicted skin with its distances; an old file goes in one step.
 
-    Parameters
-    ----------
-    path : path
-    skin : SurfaceData
-        As predicted.
-    vertices : (k,) indices
-        The vertices that were evaluated.
-    signed : (k,) float64, mm
-        Their distances.
+    skin: As predicted.
+    vertices: (k,) indices. The vertices that were evaluated.
+    signed: (k,), mm. Their distances.
     """
     count = len(skin.vertices)
     values, evaluated = np.zeros(count), np.zeros(count, dtype=np.uint8)
@@ -145,20 +134,10 @@ def read_skin_errors(
 ) -> SkinErrors:
     """The errors of a model that an evaluation lists, as they were written.
 
-    Parameters
-    ----------
-    folder : path
-        With the files of the evaluation.
-    evaluation : mapping
-        `read_evaluation` of the same folder.
-    model : str
-
-    Raises
-    ------
-    FileNotFoundError
-        The file is missing.
-    CaseError
-        (also `ValueError`) It is none of that evaluation, was changed, or holds no distances.
+    folder: With the files of the evaluation.
+    evaluation: `read_evaluation` of the same folder.
+    Raises `FileNotFoundError`: The file is missing.
+    Raises `CaseError`: It is none of that evaluation, was changed, or holds no distances.
     """
     path = checked_file(Path(folder), evaluation, skin_errors_file(model), AGAIN)
     mesh = read_mesh(path)
@@ -185,12 +164,8 @@ def is_evaluation_file(name: str) -> bool:
 def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """What `metrics.json` in a folder holds, which `cmfsim evaluate` wrote there.
 
-    Raises
-    ------
-    FileNotFoundError
-        There is none.
-    CaseError
-        (also `ValueError`) It was changed, or holds what an evaluation does not.
+    Raises `FileNotFoundError`: There is none.
+    Raises `CaseError`: It was changed, or holds what an evaluation does not.
     """
     return read_summary(Path(folder) / EVALUATION_FILE, _EVALUATION, AGAIN)
 
@@ -200,12 +175,8 @@ def read_evaluation_picture(
 ) -> bytes:
     """A picture that an evaluation lists, as it was written.
 
-    Raises
-    ------
-    FileNotFoundError
-        It is missing.
-    CaseError
-        (also `ValueError`) It is none of that evaluation, or no PNG.
+    Raises `FileNotFoundError`: It is missing.
+    Raises `CaseError`: It is none of that evaluation, or no PNG.
     """
     check("files", name, EVALUATION_FILES)
     return read_picture(checked_file(Path(folder), evaluation, name, AGAIN))

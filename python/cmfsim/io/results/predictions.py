@@ -37,10 +37,7 @@ AGAIN = "run cmfsim predict again"
 def is_result_file(name: str) -> bool:
     """Whether predictions and evaluations of a case are written as files of this name.
 
-    Parameters
-    ----------
-    name : str
-        From the case's output folder; those of several models lie in a folder for each.
+    name: From the case's output folder; those of several models lie in a folder for each.
     """
     model, _, plain_name = name.rpartition("/")
     if model:
@@ -51,16 +48,8 @@ def is_result_file(name: str) -> bool:
 def read_prediction(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """What `prediction.json` in a folder holds, which `write_prediction` wrote there.
 
-    Returns
-    -------
-    dict of str to plain values
-
-    Raises
-    ------
-    FileNotFoundError
-        There is none: another program's folder, or a run that was stopped.
-    CaseError
-        (also `ValueError`) It was changed, or holds what a prediction does not.
+    Raises `FileNotFoundError`: There is none: another program's folder, or a run that was stopped.
+    Raises `CaseError`: It was changed, or holds what a prediction does not.
     """
     return read_summary(Path(folder) / PREDICTION_FILE, PREDICTION, AGAIN)
 
@@ -70,12 +59,8 @@ def read_prediction_picture(
 ) -> bytes | None:
     """A picture of a prediction as it was written; None where it was not drawn.
 
-    Raises
-    ------
-    FileNotFoundError
-        It is missing.
-    CaseError
-        (also `ValueError`) It is another file than was written, or no PNG.
+    Raises `FileNotFoundError`: It is missing.
+    Raises `CaseError`: It is another file than was written, or no PNG.
     """
     if name not in summary["files"]:
         return None
@@ -87,23 +72,11 @@ def predictions_of(folder: str | os.PathLike[str]) -> dict[Path, dict[str, Any]]
 
     What a stopped run had still to put in place is put there first.
 
-    Parameters
-    ----------
-    folder : path
-        That of the case, or of one model.
-
-    Returns
-    -------
-    dict of Path to mapping
-        What `read_prediction` gives, in the order of the models; each model once.
-
-    Raises
-    ------
-    FileNotFoundError
-        There is no prediction.
-    CaseError
-        (also `ValueError`) Predictions of different plans, inputs or versions lie there together,
-        or one that was changed: names them.
+    folder: That of the case, or of one model.
+    Returns: What `read_prediction` gives, in the order of the models; each model once.
+    Raises `FileNotFoundError`: There is no prediction.
+    Raises `CaseError`: Predictions of different plans, inputs or versions lie there together, or
+        one that was changed: names them.
     """
     folder = Path(folder)
     places = [folder, *(folder / model for model in MODELS)]
@@ -135,16 +108,9 @@ def predictions_of(folder: str | os.PathLike[str]) -> dict[Path, dict[str, Any]]
 def stale_results(folder: Path, key: str) -> list[str]:
     """The names of results in a case's output folder that belong to another plan than a key.
 
-    Parameters
-    ----------
-    folder : Path
-    key : str
-        The "case_key" of the results that are about to be put there.
-
-    Returns
-    -------
-    list of str
-        Files of predictions, of their comparison and their report, with the folder of the model.
+    key: The "case_key" of the results that are about to be put there.
+    Returns: Files of predictions, of their comparison and their report, with the folder of the
+        model.
     """
     stale: list[str] = []
     for place in ("", *MODELS):
@@ -295,22 +261,11 @@ def read_parts(
 ) -> dict[str, dict[str, tuple[SurfaceData, NDArray[np.float64]]]]:
     """The surfaces of a prediction that was written, with their vertices after the operation.
 
-    Parameters
-    ----------
-    folder : path
-        That `write_prediction` filled.
-
-    Returns
-    -------
-    dict of str to dict of str to (SurfaceData, (v, 3) float64)
-        "skin", "bones" and, in models with muscles, "muscles"; then by name. Muscles stay.
-
-    Raises
-    ------
-    FileNotFoundError
-        A file is missing: another program's folder, or an older version's.
-    CaseError
-        (also `ValueError`) A file that cannot be read, or is not the one that was written with the
+    folder: That `write_prediction` filled.
+    Returns: dict of str to dict of str to (SurfaceData, (v, 3)). "skin", "bones" and, in models
+        with muscles, "muscles"; then by name. Muscles stay.
+    Raises `FileNotFoundError`: A file is missing: another program's folder, or an older version's.
+    Raises `CaseError`: A file that cannot be read, or is not the one that was written with the
         others; PyVista is missing.
     """
     folder = Path(folder)

@@ -35,11 +35,8 @@ def read_itk_hdf5(path: Path) -> list[tuple[str, Floats, Floats]]:
 
     Kinds are ITK's class names without precision and dimension, such as "Euler3DTransform".
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Not HDF5, too large, damaged, not a transform of 3-D space; SimpleITK
-        (extra `imaging`) is missing. The text is without the file's name.
+    Raises `CaseError`: Not HDF5, too large, damaged, not a transform of 3-D space; SimpleITK (extra
+        `imaging`) is missing. The text is without the file's name.
     """
     size = path.stat().st_size
     if size > MAX_FILE:

@@ -61,22 +61,13 @@ MATRIX = "matrixTransformToParent"
 class SceneNode:
     """Something in a scene that a case may use.
 
-    Attributes
-    ----------
-    kind : str
-        "model", "segmentation", "volume", "transform", "markups", or "other": what no case uses.
-    id, name : str
-    file : Path or None
-        Where its data are kept; None where the scene alone has them.
-    missing : str
-        Why the file cannot be used, in words; empty if it can.
-    parent : str or None
-        The id of the transform that is applied to it.
-    frame : str or None
-        The frame of a file that does not state its own. Of a model, "RAS" where the scene does not
-        state it either: 3D Slicer reads scenes from before it stated frames so.
-    tag : str
-        What Slicer calls its kind.
+    kind: "model", "segmentation", "volume", "transform", "markups", or "other": what no case uses.
+    file: Where its data are kept; None where the scene alone has them.
+    missing: Why the file cannot be used, in words; empty if it can.
+    parent: The id of the transform that is applied to it.
+    frame: The frame of a file that does not state its own. Of a model, "RAS" where the scene does
+        not state it either: 3D Slicer reads scenes from before it stated frames so.
+    tag: What Slicer calls its kind.
     """
 
     kind: str
@@ -94,11 +85,7 @@ class SceneNode:
 class SlicerScene:
     """A scene, and where each of its nodes lies in the world.
 
-    Attributes
-    ----------
-    file : Path
-    nodes : mapping of str to SceneNode
-        By id, in the order of the scene.
+    nodes: By id, in the order of the scene.
     """
 
     file: Path
@@ -111,10 +98,7 @@ class SlicerScene:
     def chain(self, node: SceneNode) -> list[SceneNode]:
         """The transforms that are applied to a node, the nearest first.
 
-        Raises
-        ------
-        CaseError
-            (also `ValueError`) A transform that is not there, or that is its own parent.
+        Raises `CaseError`: A transform that is not there, or that is its own parent.
         """
         found: list[SceneNode] = []
         parent = node.parent
@@ -136,10 +120,7 @@ class SlicerScene:
     def to_world(self, node: SceneNode) -> Floats:
         """What carries a node's own coordinates to where Slicer shows it, (4, 4), LPS mm.
 
-        Raises
-        ------
-        CaseError
-            (also `ValueError`) As `chain` and `to_parent`.
+        Raises `CaseError`: As `chain` and `to_parent`.
         """
         matrix = np.eye(4)
         for above in self.chain(node):
@@ -149,10 +130,7 @@ class SlicerScene:
     def to_parent(self, node: SceneNode) -> Floats:
         """The motion that a transform applies to what lies under it, (4, 4), LPS mm.
 
-        Raises
-        ------
-        CaseError
-            (also `ValueError`) Scale, shear or bending; a file that is missing or damaged.
+        Raises `CaseError`: Scale, shear or bending; a file that is missing or damaged.
         """
         with named(self.file):
             try:
@@ -186,17 +164,9 @@ class SlicerScene:
 def read_slicer_scene(path: str | os.PathLike[str]) -> SlicerScene:
     """The nodes of a scene file that a case may use.
 
-    Parameters
-    ----------
-    path : path
-        `.mrml`. Files that it names are looked for, and not read.
-
-    Raises
-    ------
-    FileNotFoundError
-        The file does not exist.
-    CaseError
-        (also `ValueError`) Not a scene, too large, a document type, two nodes of one id.
+    path: `.mrml`. Files that it names are looked for, and not read.
+    Raises `FileNotFoundError`: The file does not exist.
+    Raises `CaseError`: Not a scene, too large, a document type, two nodes of one id.
     """
     path = Path(path)
     check_readable(path)
@@ -307,20 +277,11 @@ def _elements(text: bytes) -> list[tuple[str, dict[str, str]]]:
 def unpack_bundle(path: Path, folder: Path) -> Path:
     """The scene file of a bundle that was unpacked into a folder.
 
-    Parameters
-    ----------
-    path : Path
-        `.mrb`.
-    folder : Path
-        Empty, and the caller's to remove.
-
-    Raises
-    ------
-    FileNotFoundError
-        The bundle does not exist.
-    CaseError
-        (also `ValueError`) Not a zip archive, damaged, encrypted; a name that leads out of the
-        folder, a link; more or larger files than a scene has; no scene, or several.
+    path: `.mrb`.
+    folder: Empty, and the caller's to remove.
+    Raises `FileNotFoundError`: The bundle does not exist.
+    Raises `CaseError`: Not a zip archive, damaged, encrypted; a name that leads out of the folder,
+        a link; more or larger files than a scene has; no scene, or several.
     """
     check_readable(path)
     with named(path):

@@ -45,16 +45,10 @@ STATED = re.compile(r"^#.*\bmm, (LPS|RAS)(?:, (to-parent|from-parent))?\s*$")
 class TransformFile:
     """The motion in a transform file, and how the file was interpreted.
 
-    Attributes
-    ----------
-    matrix : (4, 4) float64, mm
-        The motion of the bone: x ↦ R x + t on LPS points.
-    direction : str
-        "to-parent" or "from-parent": how the numbers of the file were interpreted.
-    frame : str
-        "LPS" or "RAS".
-    assumed : tuple of str
-        Which of "direction" and "frame" neither the caller nor the file stated.
+    matrix: (4, 4), mm. The motion of the bone: x ↦ R x + t on LPS points.
+    direction: "to-parent" or "from-parent": how the numbers of the file were interpreted.
+    frame: "LPS" or "RAS".
+    assumed: Which of "direction" and "frame" neither the caller nor the file stated.
     """
 
     matrix: Floats

@@ -26,16 +26,10 @@ NOTE = "in silico: {n} drawn virtual patients, {settings}"
 class MethodBand:
     """How many of a method's standard deviations cover 90 % of patients, by region.
 
-    Attributes
-    ----------
-    factors : mapping of str to BandFactor
-        Empty where the calibration part has too few predictions with a standard deviation.
-    cases : tuple of CalibrationCase
-        The patients that it was calibrated on.
-    settings : mapping
-        What the standard deviations depend on apart from the patient.
-    missing : tuple of str
-        Patients of the calibration part without one.
+    factors: Empty where the calibration part has too few predictions with a standard deviation.
+    cases: The patients that it was calibrated on.
+    settings: What the standard deviations depend on apart from the patient.
+    missing: Patients of the calibration part without one.
     """
 
     factors: Mapping[str, BandFactor]
@@ -63,19 +57,9 @@ def calibrated_band(
 ) -> MethodBand | None:
     """The band of a method; None if it states no standard deviation for any of these patients.
 
-    Parameters
-    ----------
-    method : str
-    folder : Path
-        The folder of all predictions.
-    patients : sequence of BenchmarkPatient
-        The calibration part; none of them may be scored.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A prediction of another skin, or made under other settings than the
-        first.
+    folder: The folder of all predictions.
+    patients: The calibration part; none of them may be scored.
+    Raises `CaseError`: A prediction of another skin, or made under other settings than the first.
     """
     place = EntryFolder(folder)
     cases: list[CalibrationCase] = []

@@ -47,14 +47,8 @@ TIMES = ".seconds"
 class Ratio:
     """The share of a bone's motion that a landmark of the skin follows.
 
-    Attributes
-    ----------
-    skin : str
-    bone : str
-        The landmark of the skull whose planned motion counts.
-    segments : tuple of str
-        Who carries it: the first of these that the plan moves.
-    forwards, backwards : float
+    bone: The landmark of the skull whose planned motion counts.
+    segments: Who carries it: the first of these that the plan moves.
     """
 
     skin: str
@@ -116,10 +110,7 @@ def _move(patient: BenchmarkPatient, ratio: Ratio) -> Floats:
 class EntryFolder:
     """Where the predictions of a population are stored.
 
-    Attributes
-    ----------
-    folder : Path
-        `predictions`, with a folder for each method.
+    folder: `predictions`, with a folder for each method.
     """
 
     folder: Path
@@ -167,10 +158,7 @@ class EntryFolder:
 def times_of(folder: Path, method: str, patients: Sequence[str]) -> dict[str, float]:
     """The run times of predictions, s, where they were recorded: `PATIENT.seconds`.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A file that does not contain a number.
+    Raises `CaseError`: A file that does not contain a number.
     """
     found = {}
     for patient in patients:
@@ -191,13 +179,8 @@ def patient_entries(
 
     A model that fails is recorded with its reason.
 
-    Parameters
-    ----------
-    patient, folder : str
-        The patient's folder, and that of all predictions.
-    methods : sequence of str
-    banded : sequence of str
-        Models whose predictions state a standard deviation, from which a band is calibrated.
+    patient, folder: The patient's folder, and that of all predictions.
+    banded: Models whose predictions state a standard deviation, from which a band is calibrated.
     """
     of = BenchmarkPatient(Path(patient).name, Path(patient))
     place, made_from = EntryFolder(Path(folder)), of.digest()
@@ -271,10 +254,7 @@ def _entered(patient: BenchmarkPatient, prediction: Prediction, made_from: str) 
 def check_own(method: str, prediction: SkinPrediction, patient: BenchmarkPatient) -> None:
     """Refuses an entry of the package made by another version, or for an earlier patient.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`)
+    Raises `CaseError`.
     """
     own = (*ENTRIES, *ON_REQUEST)
     if method in own and not prediction.made_from.endswith(patient.digest()):
@@ -291,10 +271,7 @@ def learned_entries(
 
     If there is nothing to learn from, the entry is recorded as failed.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A patient to predict is in the training part.
+    Raises `CaseError`: A patient to predict is in the training part.
     """
     both = {patient.name for patient in training} & {patient.name for patient in patients}
     if both:

@@ -42,10 +42,8 @@ FEATURES = {
 class PartialLeastSquares:
     """A linear map by partial least squares (SIMPLS, de Jong 1993).
 
-    Attributes
-    ----------
-    mean_x, mean_y : (p,) and (q,) float64
-    coefficients : (p, q) float64
+    mean_x, mean_y: (p,) and (q,).
+    coefficients: (p, q).
     """
 
     mean_x: Floats
@@ -91,16 +89,10 @@ class PartialLeastSquares:
 class LearnedFace:
     """The model learned from the training part.
 
-    Attributes
-    ----------
-    landmarks : (14, 3) float64, mm
-        Of the skin of the person whose points are compared.
-    points : (k, 3) float64, mm
-        On that skin.
-    map : PartialLeastSquares
-        From the plan in numbers to the displacements of the points.
-    components : int
-        Chosen within the training part, each patient left out once.
+    landmarks: (14, 3), mm, of the skin of the person whose points are compared.
+    points: (k, 3), mm, on that skin.
+    map: From the plan in numbers to the displacements of the points.
+    components: Chosen within the training part, each patient left out once.
     """
 
     landmarks: Floats
@@ -123,10 +115,7 @@ class LearnedFace:
 def learn_face(patients: Sequence[BenchmarkPatient]) -> LearnedFace:
     """The training data of the patients of a part.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Fewer than four patients; scipy is not installed.
+    Raises `CaseError`: Fewer than four patients; scipy is not installed.
     """
     if len(patients) < LEAST_TRAINED:
         raise CaseInputError(

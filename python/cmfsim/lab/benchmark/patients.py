@@ -35,13 +35,7 @@ def _sd_of(sources: Iterable[Source], name: str) -> float:
 
 @dataclass(frozen=True)
 class BenchmarkPatient:
-    """One patient of a population.
-
-    Attributes
-    ----------
-    name : str
-    folder : Path
-    """
+    """One patient of a population."""
 
     name: str
     folder: Path
@@ -141,10 +135,7 @@ def patients_of(
 ) -> list[BenchmarkPatient]:
     """The patients of some parts who have a truth.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) One of them has no folder, or none is there.
+    Raises `CaseError`: One of them has no folder, or none is there.
     """
     names = population.named(MADE, *parts)
     for name in names:

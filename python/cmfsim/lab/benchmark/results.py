@@ -28,17 +28,10 @@ FIGURES = ("mean", "p95", "within", "normal")
 class MethodResult:
     """The scores of one method.
 
-    Attributes
-    ----------
-    method : str
-    scores : mapping of str to mapping of str to RegionScore
-        By patient, then by region.
-    missing : tuple of str
-        Patients without a prediction.
-    failed : mapping of str to str
-        The reasons that the method gives for some of them, by patient.
-    band : MethodBand or None
-        Calibration of its standard deviations on the calibration part, where it states any.
+    scores: By patient, then by region.
+    missing: Patients without a prediction.
+    failed: The reasons that the method gives for some of them, by patient.
+    band: Calibration of its standard deviations on the calibration part, where it states any.
     """
 
     method: str

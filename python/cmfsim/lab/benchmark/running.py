@@ -45,11 +45,8 @@ PREDICTIONS, RESULTS = "predictions", "benchmark"
 class Benchmark:
     """The results of a benchmark, and their files.
 
-    Attributes
-    ----------
-    table : BenchmarkTable
-    files : tuple of Path
-        CSV, Markdown, JSON and calibrations of bands, the same bytes each time; and the run times.
+    files: CSV, Markdown, JSON and calibrations of bands, the same bytes each time; and the run
+        times.
     """
 
     table: BenchmarkTable

@@ -22,18 +22,12 @@ DECIMALS = 6
 class RegionScore:
     """Errors of a prediction in a region of one patient.
 
-    Attributes
-    ----------
-    mean, p95 : float, mm
-        Of the length of the difference from the true displacement, over vertices.
-    within : float
-        Share of vertices with 2 mm or less.
-    normal : float, mm
-        Mean size of the difference along the normal of the skin: without sliding along itself.
-    covered : bool or None
-        Whether the true skin lies within the stated band at all vertices; None without a band.
-    half_width : float, mm, or None
-        Mean of that band.
+    mean, p95: mm, of the length of the difference from the true displacement, over vertices.
+    within: Share of vertices with 2 mm or less.
+    normal: mm. Mean size of the difference along the normal of the skin: without sliding along
+        itself.
+    covered: Whether the true skin lies within the stated band at all vertices; None without a band.
+    half_width: mm, or None. Mean of that band.
     """
 
     mean: float
@@ -63,18 +57,9 @@ def score(
 ) -> dict[str, RegionScore]:
     """The scores of a prediction by region.
 
-    Parameters
-    ----------
-    patient : BenchmarkPatient
-    prediction : SkinPrediction
-    factors : mapping of str to BandFactor
-        How many standard deviations of the prediction its band has in a region; none without a
+    factors: How many standard deviations of the prediction its band has in a region; none without a
         calibration.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The prediction is of another skin.
+    Raises `CaseError`: The prediction is of another skin.
     """
     prediction.check_vertices(patient.skin)
     off = prediction.displacement - patient.truth

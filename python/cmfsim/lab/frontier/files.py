@@ -23,12 +23,8 @@ SUMMARY, TABLE, PAGE, PICTURE = "frontier.json", "frontier.csv", "frontier.md", 
 def write_frontier(folder: Path, found: Frontier) -> list[str]:
     """The names of the files written: table, page, picture and, last, all figures as JSON.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) matplotlib is missing.
-    OSError
-        The folder cannot be written to.
+    Raises `CaseError`: matplotlib is missing.
+    Raises `OSError`: The folder cannot be written to.
     """
 
     def fill(fresh: Path) -> Sequence[str]:
@@ -52,16 +48,8 @@ def chart_frontier(path: str | os.PathLike[str], found: Frontier) -> None:
     are of the grid; hollow ones have one other factor changed. The line joins what no other choice
     beats in that panel's time, the ring is the base.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`, `.svg` or `.pdf`.
-    found : Frontier
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) matplotlib is missing, another ending, no choice that has an error.
+    path: Ends in `.png`, `.svg` or `.pdf`.
+    Raises `CaseError`: matplotlib is missing, another ending, no choice that has an error.
     """
     rows = [row for row in found.rows if row.mean and not row.is_reference]
     if not rows:

@@ -21,13 +21,7 @@ ERROR_STEP = 1e-3
 
 @dataclass(frozen=True)
 class Spread:
-    """Repeated measurements of one quantity.
-
-    Attributes
-    ----------
-    median, low, high : float
-    count : int
-    """
+    """Repeated measurements of one quantity."""
 
     median: float
     low: float
@@ -255,15 +249,8 @@ def pareto_front(first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
 
     Rows that are equal in both do not beat each other.
 
-    Parameters
-    ----------
-    first, second : (k,) float64
-        Costs: the lower the better.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Unlike lengths, NaN.
+    first, second: (k,). Costs: the lower the better.
+    Raises `CaseError`: Unlike lengths, NaN.
 
     Examples
     --------

@@ -32,11 +32,8 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
     They are vertices of the detailed face, so that they are the same however the tissue is meshed.
     Without all of the skin's landmarks the face is all of them, in one part.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) There is no detailed face: the case is an image, and scikit-image is
-        not installed. No point of it lies on the face.
+    Raises `CaseError`: There is no detailed face: the case is an image, and scikit-image is not
+        installed. No point of it lies on the face.
     """
     face = patient.face
     if face is None:
@@ -73,20 +70,9 @@ def skin_errors(
 ) -> dict[str, DistanceStatistics]:
     """Figures of |u - u_ref| at the same points, mm: over each region that has points.
 
-    Parameters
-    ----------
-    moved, reference : (k, 3) float64, mm
-        Displacements by a prediction and by the reference.
-    regions : mapping of str to (k,) bool
-
-    Returns
-    -------
-    dict of str to DistanceStatistics
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Another number of points, NaN.
+    moved, reference: (k, 3), mm. Displacements by a prediction and by the reference.
+    regions: mapping of str to (k,) bool.
+    Raises `CaseError`: Another number of points, NaN.
     """
     ours, theirs = as_rows("moved", moved, 3), as_rows("reference", reference, 3)
     if len(ours) != len(theirs):

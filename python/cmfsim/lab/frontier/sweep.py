@@ -39,13 +39,9 @@ def reference_choice(
 ) -> Choice:
     """The reference of a sweep: quadratic tets, large deformation, many samples.
 
-    Parameters
-    ----------
-    base : Choice
-        Its contact, its tolerance, mixing and model are the reference's.
-    edge_length : float, mm
-    kinematics : str
-        "corotational" where a hyperelastic solution is out of reach.
+    base: Its contact, its tolerance, mixing and model are the reference's.
+    edge_length: mm.
+    kinematics: "corotational" where a hyperelastic solution is out of reach.
     """
     return replace(
         base,

@@ -123,10 +123,7 @@ def peak_memory() -> float | None:
 def machine(threads: int | None) -> dict[str, Any]:
     """Processor, cores and threads, versions and commit: plain values.
 
-    Parameters
-    ----------
-    threads : int or None
-        That processes were given; all cores if None.
+    threads: That processes were given; all cores if None.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
@@ -180,13 +177,9 @@ def run_job(job: Mapping[str, Any], *, threads: int | None, time_limit: float) -
 
     A process that is killed or takes longer than the limit has an error for an answer too.
 
-    Parameters
-    ----------
-    job : mapping
-        What `cmfsim.lab.frontier.timing.measured` takes; `answer` is the file's path.
-    threads : int or None
-        All cores if None.
-    time_limit : float, s
+    job: What `cmfsim.lab.frontier.timing.measured` takes; `answer` is the file's path.
+    threads: All cores if None.
+    time_limit: s.
     """
     path = Path(job["answer"])
     path.parent.mkdir(parents=True, exist_ok=True)

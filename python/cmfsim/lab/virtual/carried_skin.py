@@ -23,19 +23,11 @@ def carried(
     A point takes the linear field of the tet that holds it; a point outside that of the tet it is
     least outside of, with its weights cut to 0…1, so that nothing is carried beyond the mesh.
 
-    Parameters
-    ----------
-    points : (k, 3) float64, mm
-        At rest.
-    nodes : (n, 3) float64, mm
-    tets : (m, 4) uint32
-    displacements : (n, 3) float64, mm
-        Of the nodes.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Misshapen arrays; scipy is not installed.
+    points: (k, 3), mm, at rest.
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32.
+    displacements: (n, 3), mm, of the nodes.
+    Raises `CaseError`: Misshapen arrays; scipy is not installed.
     """
     places = as_rows("points", points, 3)
     corners = as_rows("nodes", nodes, 3)
@@ -71,18 +63,9 @@ def scanned(
 ) -> SurfaceData:
     """The surface as a scanner would give it: vertices off along their normals.
 
-    Parameters
-    ----------
-    surface : SurfaceData
-    white, smooth : float, mm
-        Standard deviations of the noise that is new at each vertex, and of the noise that changes
-        over a few edges (waves of the reconstruction).
-    seed : int or list of int
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A negative deviation; scipy is not installed.
+    white, smooth: mm. Standard deviations of the noise that is new at each vertex, and of the noise
+        that changes over a few edges (waves of the reconstruction).
+    Raises `CaseError`: A negative deviation; scipy is not installed.
     """
     for name, value in (("white", white), ("smooth", smooth)):
         if as_number(f"{name} noise", value) < 0.0:

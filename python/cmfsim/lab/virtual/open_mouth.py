@@ -40,15 +40,8 @@ TEETH_SPACING, TEETH_REACH = 1.0, 12.0
 class MouthSlit:
     """The slit between the lips of a phantom.
 
-    Attributes
-    ----------
-    head : PhantomHead
-        With a gap between the lips of `LEAST_GAP` or more.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The gap is smaller.
+    head: With a gap between the lips of `LEAST_GAP` or more.
+    Raises `CaseError`: The gap is smaller.
     """
 
     head: PhantomHead
@@ -107,18 +100,9 @@ def _arch(u: Floats) -> Floats:
 def with_open_mouth(head: PhantomHead, anatomy: Anatomy, bite: float) -> Anatomy:
     """The anatomy without tissue in the slit between the lips and between the tooth rows.
 
-    Parameters
-    ----------
-    head : PhantomHead
-    anatomy : Anatomy
-        Level images of it.
-    bite : float, mm
-        There is no tissue where the distances to both tooth rows add up to less than this.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The gap between the lips is smaller than `LEAST_GAP`.
+    anatomy: Level images of it.
+    bite: mm. There is no tissue where the distances to both tooth rows add up to less than this.
+    Raises `CaseError`: The gap between the lips is smaller than `LEAST_GAP`.
     """
     slit = MouthSlit(head)
     skin = anatomy.skin

@@ -36,19 +36,12 @@ REACH, SPACING, ROOM = 12.0, 1.5, 8.0
 class Operation:
     """The action of the bones on the tissue.
 
-    Attributes
-    ----------
-    held : (k,) int64
-        Nodes attached to bone, or fixed where the tissue ends.
-    owner : (k,) int64
-        Segment to which each is joined, as an index into `motion`; −1 if it does not move.
-    motion : mapping of str to callable
-        Rigid motion (4, 4) of each segment after a fraction of it, 0 to 1.
-    contact : BoneContact
-    stripped : int
-        Number of nodes that the operation detached from bone.
-    points : (k, 3) float64, mm
-        The held nodes at rest.
+    held: (k,) int64. Nodes attached to bone, or fixed where the tissue ends.
+    owner: (k,) int64. Segment to which each is joined, as an index into `motion`; −1 if it does not
+        move.
+    motion: Rigid motion (4, 4) of each segment after a fraction of it, 0 to 1.
+    stripped: Number of nodes that the operation detached from bone.
+    points: (k, 3), mm. The held nodes at rest.
     """
 
     held: NDArray[np.int64]
@@ -72,11 +65,8 @@ class Operation:
 def screw(matrix: Floats, centre: Floats) -> Callable[[float], Floats]:
     """The rigid motion (4, 4) after a fraction of it: rotation and translation grow together.
 
-    Parameters
-    ----------
-    matrix : (4, 4) float64, mm
-        The whole motion.
-    centre : (3,) float64, mm
+    matrix: (4, 4), mm. The whole motion.
+    centre: (3,), mm.
     """
     whole = decompose_motion(matrix, centre)
 
@@ -93,10 +83,7 @@ def bone_distances(nodes: Floats, segments: Mapping[str, BoneSegment]) -> dict[s
 
     A segment's level is a distance only within two voxels of its surface, this one up to `REACH`.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    segments : mapping of str to BoneSegment
+    nodes: (n, 3), mm.
     """
     lowest = nodes.min(axis=0) - ROOM
     shape = np.ceil((np.ptp(nodes, axis=0) + 2.0 * ROOM) / SPACING).astype(int) + 1
@@ -117,13 +104,10 @@ def without_bite(
 ) -> NDArray[np.bool_]:
     """Which tets are tissue, (m,): those outside the gap between the tooth rows.
 
-    Parameters
-    ----------
-    nodes, tets : (n, 3) mm, (m, 4)
-    upper, lower : ImageData
-        Depths inside the bones that bear the teeth.
-    gap : float, mm
-        A tet lies between them if the distances of its centroid to both add up to less than this.
+    nodes, tets: (n, 3) mm, (m, 4).
+    upper, lower: Depths inside the bones that bear the teeth.
+    gap: mm. A tet lies between them if the distances of its centroid to both add up to less than
+        this.
     """
     middles = nodes[tets].mean(axis=1)
     return -upper.sample(middles) - lower.sample(middles) >= gap
@@ -142,15 +126,11 @@ def without_gaps(
     tet lies between two bones if the distances of its centroid to both add up to less than their
     shift plus `BETWEEN`, and the bones are not on the same side of it.
 
-    Parameters
-    ----------
-    nodes, tets : (n, 3) mm, (m, 4)
-    distances : mapping of str to ImageData
-        As returned by `bone_distances`.
-    motions : mapping of str to (4, 4) float64, mm
-        Of each of them.
-    kept_between : collection of str
-        Bones between which tissue is kept: jaws that no cut separates, if the mouth is open.
+    nodes, tets: (n, 3) mm, (m, 4).
+    distances: As returned by `bone_distances`.
+    motions: mapping of str to (4, 4), mm, of each of them.
+    kept_between: Bones between which tissue is kept: jaws that no cut separates, if the mouth is
+        open.
     """
     middles = nodes[tets].mean(axis=1)
     kept = np.ones(len(middles), dtype=bool)
@@ -192,26 +172,15 @@ def operate(
     Joined and fixed nodes near a cut whose sides separate are stripped off the bone. Like sliding
     nodes, they are then free, and bone can only push them.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    tets : (m, 4) uint32
-    boundary : (t, 3) uint32
-        Boundary triangles.
-    kinds : NodeKinds
-    distances : mapping of str to ImageData
-        Depth inside each segment.
-    centres : mapping of str to (3,) float64, mm
-        Centre about which each segment rotates.
-    plan : mapping of str to (4, 4) float64, mm
-        Segments that are not named do not move.
-    bared : (k,) whole numbers, optional
-        Other free nodes that may touch bone, because the tissue next to them was opened.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The plan names an unknown segment; scipy is not installed.
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32.
+    boundary: (t, 3) uint32. Boundary triangles.
+    distances: Depth inside each segment.
+    centres: mapping of str to (3,), mm. Centre about which each segment rotates.
+    plan: mapping of str to (4, 4), mm. Segments that are not named do not move.
+    bared: (k,) whole numbers. Other free nodes that may touch bone, because the tissue next to them
+        was opened.
+    Raises `CaseError`: The plan names an unknown segment; scipy is not installed.
     """
     for name in plan:
         if name not in distances:

@@ -17,15 +17,10 @@ DRAWN = 1000
 class Relocation:
     """The motion of a segment in a planner's numbers, as in Table 2 of Kim et al. (2010).
 
-    Attributes
-    ----------
-    translation : tuple of 3 float, mm
-        Left, backwards, up.
-    angle : float, degrees
-        About `axis` by the right-hand rule, through the landmark `centre`.
-    axis : tuple of 3 float
-    centre : str
-        A skull landmark.
+    translation: tuple of 3 float, mm. Left, backwards, up.
+    angle: degrees, about `axis` by the right-hand rule, through the landmark `centre`.
+    axis: tuple of 3 float.
+    centre: A skull landmark.
     """
 
     translation: Triple
@@ -41,21 +36,13 @@ class TrueTissue:
     The values by default are those of the phantom and of the models: what a model assumes is then
     true of the person.
 
-    Attributes
-    ----------
-    muscle_young : (float, float) or None, MPa
-        Of muscle along and across its fibres; None: those of the phantom.
-    fat_poisson : float
-    skin_young, skin_thickness : float, MPa and mm
-        Of a layer of skin; none if the thickness is 0.
-    offsets : mapping of str to 3 float, mm
-        By muscle, the distance left, backwards and up by which it lies elsewhere.
-    absent : tuple of str
-        Muscles that the person does not have.
-    slides_on : str
-        Where tissue slides at the tooth rows: "sheet" or "bone", as `KindOptions` has it.
-    vestibule : float, mm
-        By how much the zone in which it slides is deeper than models assume.
+    muscle_young: MPa, of muscle along and across its fibres; None: those of the phantom.
+    skin_young, skin_thickness: MPa and mm, of a layer of skin; none if the thickness is 0.
+    offsets: mapping of str to 3 float, mm, by muscle, the distance left, backwards and up by which
+        it lies elsewhere.
+    absent: Muscles that the person does not have.
+    slides_on: Where tissue slides at the tooth rows: "sheet" or "bone", as `KindOptions` has it.
+    vestibule: mm, by how much the zone in which it slides is deeper than models assume.
     """
 
     muscle_young: tuple[float, float] | None = None
@@ -75,27 +62,17 @@ class TrueTissue:
 class VirtualPatient:
     """A synthetic person with an operation.
 
-    Attributes
-    ----------
-    number : int
-    label : str
-        Of the operation, in the paper's letters: MxA, MxSB maxilla advanced, set back; MA, MSB the
-        same for the mandible; G genioplasty.
-    parameters : HeadParameters
-    muscle_thickness, muscle_stiffness : float
-        Of the true muscles, relative to those of the phantom and to the default moduli.
-    osteotomies : tuple of str
-        Procedures, in their order.
-    plan : mapping of str to Relocation
-        By segment.
-    separate_lips : bool
-        Whether the true lips are separate down to the teeth and touch each other. Otherwise they
-        are connected behind the slit in the skin, as on a CT.
-    departures : mapping of str to Relocation
-        By segment, how the operation departs from the plan. The case file has only the plan.
-    thickness_change : float
-        Swelling of the soft tissue after the operation, as a share of its depth.
-    tissue : TrueTissue
+    label: Of the operation, in the paper's letters: MxA, MxSB maxilla advanced, set back; MA, MSB
+        the same for the mandible; G genioplasty.
+    muscle_thickness, muscle_stiffness: Of the true muscles, relative to those of the phantom and to
+        the default moduli.
+    osteotomies: Procedures, in their order.
+    plan: By segment.
+    separate_lips: Whether the true lips are separate down to the teeth and touch each other.
+        Otherwise they are connected behind the slit in the skin, as on a CT.
+    departures: By segment, how the operation departs from the plan. The case file has only the
+        plan.
+    thickness_change: Swelling of the soft tissue after the operation, as a share of its depth.
     """
 
     number: int
@@ -266,10 +243,7 @@ PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
 def patient_named(number: int) -> VirtualPatient:
     """One of the virtual patients.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A number other than 1 to 6.
+    Raises `CaseError`: A number other than 1 to 6.
     """
     if number not in PATIENTS:
         raise CaseInputError(

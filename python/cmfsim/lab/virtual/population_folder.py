@@ -44,14 +44,8 @@ GRID, SKIN_SPACING = 0.25, 0.375
 class PatientOutcome:
     """The outcome of a patient, and the number of finished patients.
 
-    Attributes
-    ----------
-    name : str
-    status : str
-        "made", "kept" (there from an earlier run, of the same settings) or "failed".
-    reason : str
-        Why it failed.
-    done, count : int
+    status: "made", "kept" (there from an earlier run, of the same settings) or "failed".
+    reason: Why it failed.
     """
 
     name: str

@@ -73,30 +73,17 @@ ZONE = ("upper_front", "upper_molars", "lower_front", "lower_molars")
 class PostoperativeTruth:
     """A virtual patient after the operation, without scanner noise.
 
-    Attributes
-    ----------
-    nodes, tets : (n, 3) float64, mm, (m, 4) uint32
-        The true mesh at rest.
-    displacements : (n, 3) float64, mm
-    fraction, fibre : (m,) and (m, 3) float64
-        Of muscle, true.
-    skin_before, skin : SurfaceData
-        The whole head's skin before and after, vertex by vertex.
-    skin_landmarks, skull_landmarks : mapping of str to (3,) float64, mm
-        After the operation.
-    segments : mapping of str to BoneSegment
-        Before it.
-    motions : mapping of str to (4, 4) float64, mm
-        Actual motion of every segment: the plan plus the patient's departures from it; the identity
-        for segments that do not move.
-    equilibrium : Equilibrium
-    operation : Operation
-    volume_ratios : (m,) float64
-        Ratio of each tet's volume after the operation to that before.
-    last_step : float, mm
-        Largest motion of the skin in the last Newton iteration.
-    lips : LipContact or None
-        The contact of the lips, if they are separate.
+    nodes, tets: (n, 3), mm, (m, 4) uint32. The true mesh at rest.
+    displacements: (n, 3), mm.
+    fraction, fibre: (m,) and (m, 3), of muscle, true.
+    skin_before, skin: The whole head's skin before and after, vertex by vertex.
+    skin_landmarks, skull_landmarks: mapping of str to (3,), mm, after the operation.
+    segments: Before it.
+    motions: mapping of str to (4, 4), mm. Actual motion of every segment: the plan plus the
+        patient's departures from it; the identity for segments that do not move.
+    volume_ratios: (m,). Ratio of each tet's volume after the operation to that before.
+    last_step: mm. Largest motion of the skin in the last Newton iteration.
+    lips: The contact of the lips, if they are separate.
     """
 
     nodes: Floats
@@ -144,32 +131,18 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     that pushes and never pulls, periosteum stripped at the cuts, no tissue between the tooth rows,
     and skin that swells.
 
-    Parameters
-    ----------
-    patient : VirtualPatient
-        How the true muscles differ from those of the phantom, and the departures from the plan.
-    head : PhantomHead
-    case : Case
-        Its osteotomies, plan and landmarks are used; its image is not read.
-    edge_length : float, mm
-        Of the true mesh.
-    refine : bool
-        Whether tets are smaller where tissue is thin; always so if the lips are separate.
-    grid : float, mm
-        Spacing of the level images from which the mesh is made.
-    skin_spacing : float, mm
-        Of the marching cubes that make the skin.
-    options : EquilibriumOptions, optional
-        By default, `STEPS_WITH_LIPS` steps if the lips are separate.
-    lip_contact : bool
-        False lets separate lips pass through each other, to show the effect of their contact.
-    progress : callable, optional
-        Called with the name of each stage as it begins.
-
-    Raises
-    ------
-    CmfsimError
-        (also `ValueError` if the input is at fault) Any error of a stage.
+    patient: How the true muscles differ from those of the phantom, and the departures from the
+        plan.
+    case: Its osteotomies, plan and landmarks are used; its image is not read.
+    edge_length: mm, of the true mesh.
+    refine: Whether tets are smaller where tissue is thin; always so if the lips are separate.
+    grid: mm. Spacing of the level images from which the mesh is made.
+    skin_spacing: mm, of the marching cubes that make the skin.
+    options: By default, `STEPS_WITH_LIPS` steps if the lips are separate.
+    lip_contact: False lets separate lips pass through each other, to show the effect of their
+        contact.
+    progress: Called with the name of each stage as it begins.
+    Raises `CmfsimError`: Any error of a stage.
     """
     stage = progress or no_progress
     length = as_positive("edge_length", edge_length)
@@ -430,9 +403,7 @@ def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
 
     A flap attached by a single edge or node would move without resistance.
 
-    Parameters
-    ----------
-    tets : (m, 4)
+    tets: (m, 4).
     """
     body = tet_bodies(tets)
     largest: NDArray[np.bool_] = body == np.argmax(np.bincount(body))

@@ -44,15 +44,10 @@ SMOOTH = 4.0
 class SkinProfiles:
     """How far ahead the skin lies in front of a mouth.
 
-    Attributes
-    ----------
-    across : (p,) float64, mm
-        To the left, symmetric about the middle.
-    heights : (q,) float64, mm
-    ahead : (p, q) float64, mm
-        Of the foremost tissue or bone; the ray's end where there is none.
-    depth : (p, q) float64, mm
-        Its depth under the chords between points at most `CHORD` above and below.
+    across: (p,), mm, to the left, symmetric about the middle.
+    heights: (q,), mm.
+    ahead: (p, q), mm, of the foremost tissue or bone; the ray's end where there is none.
+    depth: (p, q), mm. Its depth under the chords between points at most `CHORD` above and below.
     """
 
     across: Floats
@@ -77,10 +72,7 @@ class SkinProfiles:
 class MouthLine:
     """The line where the lips meet on the skin, from the right corner to the left.
 
-    Attributes
-    ----------
-    across, ahead, heights : (k,) float64, mm
-        In the mouth's frame.
+    across, ahead, heights: (k,), mm, in the mouth's frame.
     """
 
     across: Floats
@@ -104,11 +96,7 @@ class MouthLine:
 def skin_profiles(anatomy: Anatomy, frame: MouthFrame) -> SkinProfiles:
     """The profiles of the skin in front of a mouth.
 
-    Parameters
-    ----------
-    anatomy : Anatomy
-        Cavities that open to the front count as outside.
-    frame : MouthFrame
+    anatomy: Cavities that open to the front count as outside.
     """
     count = round(ASIDE / COLUMN)
     across = np.linspace(-COLUMN * count, COLUMN * count, 2 * count + 1)
@@ -162,11 +150,7 @@ def crease_line(profiles: SkinProfiles, frame: MouthFrame) -> MouthLine | None:
 
     It ends at the corners of the mouth, where the crease ends.
 
-    Parameters
-    ----------
-    profiles : SkinProfiles
-    frame : MouthFrame
-        Lips meet between the fronts of its arches.
+    frame: Lips meet between the fronts of its arches.
     """
     heights = profiles.heights
     between = (heights >= frame.reach_down) & (heights <= frame.reach_up)

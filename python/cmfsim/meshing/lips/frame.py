@@ -13,18 +13,13 @@ from cmfsim.values.dental_arch import DentalArch
 class MouthFrame:
     """Axes of a mouth, with its origin half-way between the fronts of the two arches.
 
-    Attributes
-    ----------
-    origin : (3,) float64, mm
-    axes : (3, 3) float64
-        Rows: unit vectors to the left, ahead and up, at right angles. The frame is left-handed in
-        LPS, where ahead is −y.
-    reach_up, reach_down : float, mm
-        Heights of the fronts of the upper and lower arch: between them the lips meet.
-    half_width : float, mm
-        Half the distance between the second molars.
-    molars : float, mm
-        Forward position of the second molars relative to the origin; negative.
+    origin: (3,), mm.
+    axes: (3, 3). Rows: unit vectors to the left, ahead and up, at right angles. The frame is
+        left-handed in LPS, where ahead is −y.
+    reach_up, reach_down: mm. Heights of the fronts of the upper and lower arch: between them the
+        lips meet.
+    half_width: mm. Half the distance between the second molars.
+    molars: mm. Forward position of the second molars relative to the origin; negative.
     """
 
     origin: Floats
@@ -46,10 +41,7 @@ class MouthFrame:
 def mouth_frame(arches: Mapping[str, DentalArch]) -> MouthFrame:
     """The frame of a mouth from its two dental arches.
 
-    Parameters
-    ----------
-    arches : mapping of str to DentalArch
-        "upper" and "lower".
+    arches: "upper" and "lower".
     """
     upper, lower = arches["upper"], arches["lower"]
     up = upper.out - lower.out

@@ -131,12 +131,8 @@ def _region(mine: Indices, other: Indices, kinds: NodeKinds, held: NDArray[np.bo
 def seam_faces(nodes: ArrayLike, triangles: ArrayLike) -> NDArray[np.bool_]:
     """Which boundary triangles lie on a seam, (t,): those that face another at the same place.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-        At rest.
-    triangles : (t, 3) uint32
-        Boundary of a mesh.
+    nodes: (n, 3), mm, at rest.
+    triangles: (t, 3) uint32. Boundary of a mesh.
     """
     points = as_rows("nodes", nodes, 3)
     corners = as_index_rows("boundary triangles", triangles, 3, len(points), "nodes")

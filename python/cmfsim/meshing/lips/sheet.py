@@ -47,15 +47,11 @@ LEAST_GAP, WITHIN = 3.0, 1.0
 class LipSheet:
     """The sheet between the lips, and what is known of it.
 
-    Attributes
-    ----------
-    surface : SurfaceData
-        Open, with normals pointing up.
-    thickness : float, mm
-        Median length of its rows from the mouth's line to the arches: the thickness of the lips.
-    opening : float, mm
-        Median height of the gap between the lips in the middle of the mouth, close to its end; 0
-        where they are closed.
+    surface: Open, with normals pointing up.
+    thickness: mm. Median length of its rows from the mouth's line to the arches: the thickness of
+        the lips.
+    opening: mm. Median height of the gap between the lips in the middle of the mouth, close to its
+        end; 0 where they are closed.
     """
 
     surface: SurfaceData
@@ -71,14 +67,7 @@ def lip_sheet(
     Where the skin shows a gap between the lips the sheet is its mid-surface, and goes on behind its
     end at the same height.
 
-    Parameters
-    ----------
-    anatomy : Anatomy
-    frame : MouthFrame
-    profiles : SkinProfiles
-    line : MouthLine
-    depth : float, mm
-        How far the sheet extends behind the teeth, into the cleft between the tooth rows.
+    depth: mm. How far the sheet extends behind the teeth, into the cleft between the tooth rows.
     """
     base = np.column_stack([line.across, line.ahead])
     centre = np.array([0.5 * (line.across[0] + line.across[-1]), line.ahead.max() - CENTRE])

@@ -41,13 +41,8 @@ DEPTH = 20.0
 class Septum:
     """The nodes of the septum.
 
-    Attributes
-    ----------
-    kinds : NodeKinds
-        Of all nodes; those of the septum that were free stay with the skull.
-    nodes : (k,) uint32
-        Nodes of the septum, including those that lie on the skull.
-    findings : tuple of Finding
+    kinds: Of all nodes; those of the septum that were free stay with the skull.
+    nodes: (k,) uint32. Nodes of the septum, including those that lie on the skull.
     """
 
     kinds: NodeKinds
@@ -66,19 +61,13 @@ def septum(
 ) -> Septum:
     """The septum of a nose whose floor was cut off the skull; empty if nothing was.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    kinds : NodeKinds
-    segments : sequence of BoneSegment
-    moved : collection of str
-        Names of the segments that are cut or moved.
-    landmarks : mapping of str to mapping of str to (3,) float64, mm
-        "skull": nasion, rhinion, mid_philtrum, supradentale; "skin": pronasale, subnasale.
-    by_vertex : collection of str
-        Names of the segments that are followed vertex by vertex. If the skull is one of them, there
-        is no septum: it lies up to 15 mm off the bone, where the noise of a triangle's rotation
-        would move it by millimetres.
+    nodes: (n, 3), mm.
+    moved: Names of the segments that are cut or moved.
+    landmarks: mapping of str to mapping of str to (3,), mm. "skull": nasion, rhinion, mid_philtrum,
+        supradentale; "skin": pronasale, subnasale.
+    by_vertex: Names of the segments that are followed vertex by vertex. If the skull is one of
+        them, there is no septum: it lies up to 15 mm off the bone, where the noise of a triangle's
+        rotation would move it by millimetres.
 
     Notes
     -----
@@ -265,11 +254,7 @@ def cut_off_skull(
     The skull is the segment that reaches highest. What was cut off it has a face in common with it;
     jaws and teeth that touch it have not.
 
-    Parameters
-    ----------
-    segments : sequence of BoneSegment
-    moved : collection of str
-        Names of the segments that are cut or moved.
+    moved: Names of the segments that are cut or moved.
     """
     skull = max(segments, key=lambda segment: float(segment.surface.vertices[:, 2].max()))
     others = [s for s in segments if s is not skull and s.name in moved]

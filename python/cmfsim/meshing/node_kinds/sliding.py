@@ -78,10 +78,7 @@ def _in_arch(
 ) -> NDArray[np.bool_]:
     """Which points lie between the vestibule of an arch and the bite, and not behind or beside it.
 
-    Parameters
-    ----------
-    alone : bool
-        The bone bears this arch and not the other: behind the teeth it ends at the bite.
+    alone: The bone bears this arch and not the other: behind the teeth it ends at the bite.
     """
     upper = arch.jaw == "upper"
     front_depth = options.upper_front if upper else options.lower_front

@@ -41,17 +41,9 @@ def smooth_step(value: Level | float, start: float, end: float) -> Level:
 def smooth_curve(points: ArrayLike, steps: int = 4, *, closed: bool = False) -> Floats:
     """Points on the Catmull–Rom curve through rows of numbers, `steps` per interval.
 
-    Parameters
-    ----------
-    points : (n, k) float64
-        Places, and what belongs to them (radii), in any unit.
-    steps : int
-    closed : bool
-        Whether the curve returns to its first point, which then is not repeated.
-
-    Returns
-    -------
-    ((n − 1) steps + 1, k) float64, closed curves (n steps + 1, k)
+    points: (n, k). Places, and what belongs to them (radii), in any unit.
+    closed: Whether the curve returns to its first point, which then is not repeated.
+    Returns: ((n − 1) steps + 1, k), closed curves (n steps + 1, k).
     """
     rows = np.asarray(points, dtype=np.float64)
     if closed:
@@ -85,12 +77,8 @@ def turn_about(axis: str, degrees: float) -> Floats:
 class Table:
     """A smooth function of one coordinate through rounded table values.
 
-    Attributes
-    ----------
-    places, values : (n,)
-        Ascending places, mm.
-    rounding : float, mm
-        Standard deviation of the Gaussian that rounds the corners.
+    places, values: (n,). Ascending places, mm.
+    rounding: mm. Standard deviation of the Gaussian that rounds the corners.
     """
 
     places: Sequence[float]

@@ -68,15 +68,11 @@ def _root(total: Level, n: Level | float) -> Level:
 class Egg:
     """A superellipsoid whose radii differ between the lower and the upper side of each axis.
 
-    Attributes
-    ----------
-    centre : (3,) mm
-    low, high : (3,) mm
-        Radii towards smaller and larger coordinates; `high` as `low` where left out.
-    power : float
-        2 is an ellipsoid, more is boxier.
-    turn : (3, 3) or None
-        Rows are the egg's own axes.
+    centre: (3,) mm.
+    low, high: (3,) mm. Radii towards smaller and larger coordinates; `high` as `low` where left
+        out.
+    power: 2 is an ellipsoid, more is boxier.
+    turn: (3, 3) or None. Rows are the egg's own axes.
     """
 
     centre: Sequence[float]
@@ -126,10 +122,7 @@ class Egg:
 class Reaches:
     """Boxes of many things, to find those that come near an asked box.
 
-    Attributes
-    ----------
-    low, high : (n, 3) mm
-        Grown by how far each thing matters.
+    low, high: (n, 3) mm. Grown by how far each thing matters.
     """
 
     low: Floats
@@ -153,13 +146,9 @@ class Reaches:
 class Tube:
     """A tube of elliptic or round section along a polyline.
 
-    Attributes
-    ----------
-    points : (n, 3) mm
-    normals : (n, 3)
-        Unit vectors along which the section is thin.
-    thick, wide : (n,) mm
-        Half axes of the section, along the normal and across it.
+    points: (n, 3) mm.
+    normals: (n, 3). Unit vectors along which the section is thin.
+    thick, wide: (n,) mm. Half axes of the section, along the normal and across it.
     """
 
     points: Floats
@@ -206,11 +195,8 @@ class Tube:
 class Plane:
     """The half-space on the side that the normal looks away from.
 
-    Attributes
-    ----------
-    point : (3,) mm
-    normal : (3,)
-        Unit vector, outward.
+    point: (3,) mm.
+    normal: (3,). Unit vector, outward.
     """
 
     point: Sequence[float]
@@ -232,13 +218,9 @@ class Plane:
 class Loft:
     """A body whose horizontal sections are superellipses that change with height.
 
-    Attributes
-    ----------
-    middle : float, mm
-        y of the widest place of every section.
-    front, back, width, power : Table
-        Of z: y of the foremost and hindmost point, half width, and the exponent of the section.
-    box : Box
+    middle: mm. y of the widest place of every section.
+    front, back, width, power: Of z: y of the foremost and hindmost point, half width, and the
+        exponent of the section.
     """
 
     middle: float
@@ -271,16 +253,10 @@ class Loft:
 class Engraving:
     """A groove or ridge along a curve drawn on the face as seen from in front.
 
-    Attributes
-    ----------
-    curve : (n, 2) mm
-        x and z.
-    width : float, mm
-        Half width, where the groove ends with no corner.
-    depth : (n,) mm
-        How far the surface moves in; negative moves out.
-    behind : float, mm
-        y beyond which nothing is engraved.
+    curve: (n, 2) mm. x and z.
+    width: mm. Half width, where the groove ends with no corner.
+    depth: (n,) mm. How far the surface moves in; negative moves out.
+    behind: mm. y beyond which nothing is engraved.
     """
 
     curve: Floats
@@ -317,13 +293,8 @@ class Engraving:
 class Step:
     """What one shape does to the shapes before it.
 
-    Attributes
-    ----------
-    how : str
-        "join" adds the shape, "cut" takes it away, "meet" keeps what lies in both.
-    shape : Shape
-    melt : float, mm
-        Width of the rounding.
+    how: "join" adds the shape, "cut" takes it away, "meet" keeps what lies in both.
+    melt: mm. Width of the rounding.
     """
 
     how: str

@@ -71,11 +71,7 @@ def _hinge(t: Level) -> Level:
 class JawWarp:
     """The map from this person's jaw to the drawn one: width, length and opening.
 
-    Attributes
-    ----------
-    parameters : HeadParameters
-    soft : bool
-        Whether it acts on skin, where it fades towards upper lip and neck.
+    soft: Whether it acts on skin, where it fades towards upper lip and neck.
     """
 
     parameters: HeadParameters

@@ -117,11 +117,8 @@ def untouched(
 ) -> tuple[Finding, ...]:
     """A finding for each moved segment that lies beyond the mesh and holds none of its nodes.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A moved segment that holds no node and is named in the case, or lies at
-        the mesh: the face would not follow it.
+    Raises `CaseError`: A moved segment that holds no node and is named in the case, or lies at the
+        mesh: the face would not follow it.
     """
     findings = []
     segments = {segment.name: segment for segment in bones.segments}

@@ -231,11 +231,8 @@ def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:
 def kind_options_of(case: Case) -> KindOptions:
     """The options of [node_kinds].
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) An unknown option, or a value of another kind or out of range, with
-        its line.
+    Raises `CaseError`: An unknown option, or a value of another kind or out of range, with its
+        line.
     """
     for key, value in case.node_kinds.items():
         try:

@@ -188,17 +188,9 @@ def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
     Results of one key may be shown together. Folders may be moved: paths count from the case's own,
     and where the results go does not count, nor does the band around them.
 
-    Parameters
-    ----------
-    case : Case
-        Changes that were made to it in memory count as those in its file.
-    hashes : mapping of str to str, optional
-        Its `input_hashes`, where they are known already.
-
-    Raises
-    ------
-    OSError
-        A file that the case names cannot be read.
+    case: Changes that were made to it in memory count as those in its file.
+    hashes: Its `input_hashes`, where they are known already.
+    Raises `OSError`: A file that the case names cannot be read.
     """
     folder = case.file.parent
     content = {
@@ -219,10 +211,7 @@ def plan_key(case: Case) -> str:
     A plan of one key means the same for every case of that key, whatever its mesh, tissue, muscles
     or own plan.
 
-    Raises
-    ------
-    OSError
-        A file that the case names cannot be read.
+    Raises `OSError`: A file that the case names cannot be read.
     """
     about = replace(
         case, plan={}, achieved=False, muscles=None, postoperative=None, mesh=CaseMesh()
@@ -258,19 +247,10 @@ def _path_from(path: Path, folder: Path) -> str:
 def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) -> None:
     """Finds before the work what would keep results from being written, or spoil an input.
 
-    Parameters
-    ----------
-    case : Case
-    is_written : callable
-        Whether a file of a name is written: of a model where left out.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The output folder is a file, a link that leads out of the case's folder,
-        or holds an input of a name that is written there.
-    OSError
-        It cannot be written to.
+    is_written: Whether a file of a name is written: of a model where left out.
+    Raises `CaseError`: The output folder is a file, a link that leads out of the case's folder, or
+        holds an input of a name that is written there.
+    Raises `OSError`: It cannot be written to.
     """
     folder = case.output
     check_below(folder, case.file.parent)

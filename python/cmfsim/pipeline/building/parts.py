@@ -25,16 +25,9 @@ from cmfsim.values.surface_data import SurfaceData
 class Head:
     """A case with what was read of it.
 
-    Attributes
-    ----------
-    case : Case
-    landmarks : mapping of str to mapping of str to (3,) float64, mm
-        "skull" and "skin".
-    anatomy : Anatomy
-    proposed : ProposedLandmarks or None
-        The landmarks, where they were found automatically.
-    skin : SurfaceData or None
-        The skin in full detail, where finding them has made it.
+    landmarks: mapping of str to mapping of str to (3,), mm. "skull" and "skin".
+    proposed: The landmarks, where they were found automatically.
+    skin: The skin in full detail, where finding them has made it.
     """
 
     case: Case
@@ -53,13 +46,7 @@ class Head:
 class MeshedTissue:
     """The soft tissue of a head before its bones are known to be cut.
 
-    Attributes
-    ----------
-    region : TissueRegion
-    level : ImageData
-    findings : tuple of Finding
-    filled : tuple or None
-        The tets that fill it, their report and the findings on them; None where they have to
+    filled: The tets that fill it, their report and the findings on them; None where they have to
         follow the seam between the lips.
     """
 

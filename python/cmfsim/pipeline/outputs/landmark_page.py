@@ -23,15 +23,10 @@ def head_content(
 ) -> LandmarkContent:
     """The content of the page of a head.
 
-    Parameters
-    ----------
-    name : str
-        Of the case.
-    head : ProposedHead
-    placed : mapping of (kind, label) to point (mm) and state
-        Sites that a person has placed or accepted already.
-    built_for : str
-        The state of the case.
+    name: Of the case.
+    placed: mapping of (kind, label) to point (mm) and state. Sites that a person has placed or
+        accepted already.
+    built_for: The state of the case.
     """
     distribution = head_distribution(head)
     average = average_head()
@@ -86,12 +81,8 @@ def _sites(
 def write_landmark_page(path: Path, content: LandmarkContent) -> int:
     """The size in bytes of a page of landmarks, written to a file in one step.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Numbers that are not finite.
-    OSError
-        The folder cannot be written to.
+    Raises `CaseError`: Numbers that are not finite.
+    Raises `OSError`: The folder cannot be written to.
     """
     data = landmark_page_text(content).encode()
     with replacing(path) as file:

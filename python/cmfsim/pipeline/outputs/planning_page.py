@@ -41,10 +41,7 @@ def write_planning_page(
 def page_state(path: str | os.PathLike[str]) -> str | None:
     """What the planning page at a path was made for (`plan_key`); None where there is no page.
 
-    Raises
-    ------
-    OSError
-        The file is there and cannot be read.
+    Raises `OSError`: The file is there and cannot be read.
     """
     if not Path(path).is_file():
         return None

@@ -92,16 +92,10 @@ class WrittenPrediction:
 class WrittenResults:
     """What was written to an output folder.
 
-    Attributes
-    ----------
-    predictions : list of WrittenPrediction
-        In the order in which they were solved.
-    files : list of str
-        Of a comparison, its report included.
-    report : str or None
-        The name of the report; none where none was made.
-    left_out : list of str
-        Files that were removed, since they belonged to something else.
+    predictions: In the order in which they were solved.
+    files: Of a comparison, its report included.
+    report: The name of the report; none where none was made.
+    left_out: Files that were removed, since they belonged to something else.
     """
 
     predictions: list[WrittenPrediction] = field(default_factory=list)
@@ -114,11 +108,7 @@ class WrittenResults:
 class _Clock:
     """The seconds of each stage of predictions, and of the work after them, by place.
 
-    Attributes
-    ----------
-    seconds : dict of str to dict of str to float
-    place : str or None
-        Of the prediction that is worked on; None for all of them.
+    place: Of the prediction that is worked on; None for all of them.
     """
 
     seconds: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -200,29 +190,16 @@ def write_results(
 ) -> WrittenResults:
     """What was written of predictions, their comparison and the report of both.
 
-    Parameters
-    ----------
-    output : Path
-        The case's output folder: predictions of several models lie in a folder for each.
-    predictions : iterable of Prediction, or callable
-        Written one by one, as each is solved. A callable gives them; it takes a function to be
-        called with the muscles before any is solved, which begins their picture.
-    models : sequence of str
-        That were asked for, whether or not all could be predicted.
-    stage : callable
-        Called with the name of each stage as it begins.
-    evaluation : callable, optional
-        Gives the comparison, once the predictions are there.
-    with_report : bool
-    pictures : callable
-        Whether those of a model are drawn, by its name.
-    slicer : bool
-        Whether each prediction is written as a bundle for 3D Slicer as well, `prediction.mrb`.
-
-    Raises
-    ------
-    CmfsimError, OSError
-        What a prediction or a file ends in; the folder is then as it was.
+    output: The case's output folder: predictions of several models lie in a folder for each.
+    predictions: or callable. Written one by one, as each is solved. A callable gives them; it takes
+        a function to be called with the muscles before any is solved, which begins their picture.
+    models: That were asked for, whether or not all could be predicted.
+    stage: Called with the name of each stage as it begins.
+    evaluation: Gives the comparison, once the predictions are there.
+    pictures: Whether those of a model are drawn, by its name.
+    slicer: Whether each prediction is written as a bundle for 3D Slicer as well, `prediction.mrb`.
+    Raises `CmfsimError`, `OSError`: What a prediction or a file ends in; the folder is then as it
+        was.
     """
     written = WrittenResults()
     clock = _Clock()
@@ -456,10 +433,8 @@ def _links(folder: Path, found: Mapping[Path, Mapping[str, Any]]) -> dict[str, s
 def write_case_report(folder: Path) -> str | None:
     """The name of the report made of the results in a folder; none without Jinja2.
 
-    Raises
-    ------
-    FileNotFoundError, CaseError
-        As `predictions_of`: there is no prediction; some belong to different plans.
+    Raises `FileNotFoundError`, `CaseError`: As `predictions_of`: there is no prediction; some
+        belong to different plans.
     """
     found = predictions_of(folder)
     key = next(iter(found.values()))["case_key"]

@@ -101,16 +101,9 @@ class Frame:
 class DicomHeader:
     """What a DICOM file states before its pixels.
 
-    Attributes
-    ----------
-    path : Path
-    tags : mapping of str to str or int
-        By name; absent where the file does not state it.
-    has_pixels : bool
-    frames : tuple of Frame
-        Of an enhanced multi-frame image, in the order of its pixels.
-    odd : tuple of (int, int)
-        The first byte of each private element of no known kind, and that after its last.
+    tags: By name; absent where the file does not state it.
+    frames: Of an enhanced multi-frame image, in the order of its pixels.
+    odd: The first byte of each private element of no known kind, and that after its last.
     """
 
     path: Path
@@ -176,10 +169,7 @@ def numbers_of(text: str, count: int) -> NDArray[np.float64] | None:
 def dicom_header(path: Path) -> DicomHeader | None:
     """What a DICOM file states; None where the file is no DICOM.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) A DICOM file that is cut short, damaged or packed as a whole.
+    Raises `ImageError`: A DICOM file that is cut short, damaged or packed as a whole.
     """
     with path.open("rb") as stream:
         begin = stream.read(PREAMBLE + 4)

@@ -79,16 +79,8 @@ def read_dicom_folder(
 ) -> tuple[ImageData, str, tuple[Finding, ...]]:
     """The CT of a folder, its modality, and findings on how it lay there.
 
-    Parameters
-    ----------
-    folder : Path
-    series : str, optional
-        UID or number of the series that is meant.
-
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) No CT, several that may be meant, slices that do not make a volume.
+    series: UID or number of the series that is meant.
+    Raises `ImageError`: No CT, several that may be meant, slices that do not make a volume.
     """
     headers, findings = _headers(folder, series)
     chosen, more = _chosen(folder, _series(headers), series)
@@ -100,10 +92,7 @@ def read_dicom_folder(
 def read_dicom_file(path: Path) -> tuple[ImageData, str, tuple[Finding, ...]]:
     """The CT of a DICOM file of several frames.
 
-    Raises
-    ------
-    ImageError
-        (also `ValueError`) No DICOM image, one slice, no CT, frames that do not make a volume.
+    Raises `ImageError`: No DICOM image, one slice, no CT, frames that do not make a volume.
     """
     header = dicom_header(path)
     if header is None or not header.has_pixels:
@@ -138,10 +127,7 @@ def dicom_places(folders: Sequence[Path]) -> list[tuple[Path, str | None]]:
     Folders that have parts of one series are one place: the folder that all of them lie in. The
     series is None where the place holds nothing else.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-        That directly hold DICOM files.
+    folders: That directly hold DICOM files.
     """
     held = {folder: _series_in(folder) for folder in folders}
     # A DICOMDIR alone is no image.

@@ -28,17 +28,10 @@ def cells_by_type(
 ) -> tuple[tuple[Cells, ...], tuple[Integers, ...]]:
     """Cells grouped by type, and the number of each in the file.
 
-    Parameters
-    ----------
-    types : (m,) int64
-    counts : (m,) int64
-        Number of corners of each cell.
-    corners : (sum of counts,) int64
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A cell with another number of corners than its type has.
+    types: (m,) int64.
+    counts: (m,) int64. Number of corners of each cell.
+    corners: (sum of counts,) int64.
+    Raises `CaseError`: A cell with another number of corners than its type has.
     """
     starts = np.cumsum(counts) - counts
     blocks, rows = list[Cells](), list[Integers]()

@@ -56,10 +56,7 @@ SECONDS, MEMORY = 4.0, 2**30
 def read_vtk_legacy(path: Path) -> PlainMesh:
     """The mesh of a file; polygons and strips of a surface become triangles.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Not such a file, another kind of data, whatever VTK complains of, other
+    Raises `CaseError`: Not such a file, another kind of data, whatever VTK complains of, other
         counts than stated, an index that is not there; VTK is not installed.
     """
     third_party(LIBRARIES[0].partition(".")[0], "files of .vtk are read", "mesh")

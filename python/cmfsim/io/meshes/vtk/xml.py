@@ -77,17 +77,9 @@ class _Element:
 def read_vtk_xml(data: bytes, kind: str) -> PlainMesh:
     """The mesh of a file; polygons of a surface become triangles.
 
-    Parameters
-    ----------
-    data : bytes
-    kind : str
-        "PolyData" (`.vtp`) or "UnstructuredGrid" (`.vtu`).
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Not such a file; a document type or another encoding than UTF-8; an
-        array of another length than stated; an index that is not there.
+    kind: "PolyData" (`.vtp`) or "UnstructuredGrid" (`.vtu`).
+    Raises `CaseError`: Not such a file; a document type or another encoding than UTF-8; an array of
+        another length than stated; an index that is not there.
     """
     root, file = _parsed(data)
     if root.name != "VTKFile" or root.attributes.get("type") != kind:

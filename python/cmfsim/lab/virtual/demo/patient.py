@@ -111,11 +111,7 @@ skin = "after.ply"
 class DemoTruth:
     """A face after the operation.
 
-    Attributes
-    ----------
-    skin : SurfaceData
-    landmarks : mapping of str to (3,) float64, mm
-        On the skin.
+    landmarks: mapping of str to (3,), mm, on the skin.
     """
 
     skin: SurfaceData
@@ -125,19 +121,10 @@ class DemoTruth:
 def read_demo_truth(head: Mapping[str, float], path: Path | None = None) -> DemoTruth | None:
     """The face after the operation; None where the package holds none.
 
-    Parameters
-    ----------
-    head : mapping of str to float
-        Parameters of the head that it must belong to.
-    path : Path, optional
-        Another archive than the package's own.
-
-    Raises
-    ------
-    FileNotFoundError
-        There is no file at `path`.
-    CaseError
-        (also `ValueError`) Not such an archive, or of another head.
+    head: Parameters of the head that it must belong to.
+    path: Another archive than the package's own.
+    Raises `FileNotFoundError`: There is no file at `path`.
+    Raises `CaseError`: Not such an archive, or of another head.
     """
     if path is None:
         own = files("cmfsim.lab.virtual.demo").joinpath(TRUTH_FILE)
@@ -183,12 +170,7 @@ def _check_head(path: Path, text: str, head: Mapping[str, float]) -> None:
 class DemoCase:
     """The embedded case on disk, with the anatomy that its surfaces were made from.
 
-    Attributes
-    ----------
-    case : Case
-    anatomy : Anatomy
-    truth : DemoTruth or None
-        None where the package holds no face after the operation.
+    truth: None where the package holds no face after the operation.
     """
 
     case: Case
@@ -201,22 +183,12 @@ def write_demo_case(
 ) -> DemoCase:
     """The embedded case, written as `case.toml` with surfaces, and without any landmark.
 
-    Parameters
-    ----------
-    folder : path
-        Made if it is not there; empty, or an earlier demo's.
-    edge_length : float, mm
-        Of the tets.
-    truth : Path, optional
-        An archive with the face after the operation, instead of the package's own.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A folder with other files in it; an archive of another head;
-        scikit-image is missing.
-    OSError
-        The folder cannot be made or written to.
+    folder: Made if it is not there; empty, or an earlier demo's.
+    edge_length: mm, of the tets.
+    truth: An archive with the face after the operation, instead of the package's own.
+    Raises `CaseError`: A folder with other files in it; an archive of another head; scikit-image is
+        missing.
+    Raises `OSError`: The folder cannot be made or written to.
 
     Examples
     --------

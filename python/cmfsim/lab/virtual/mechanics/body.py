@@ -20,18 +20,10 @@ class HyperelasticBody:
     Forces come from scikit-fem (Gustafsson & McBain 2020): the equilibrium that the truth satisfies
     is that library's, not the mass tensors'. The stiffness only leads Newton's method there.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    tets : (m, 4) uint32
-        Positively oriented.
-    tissue : HyperelasticTissue
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Misshapen arrays, a tet without volume, tissue of another number of
-        tets; scikit-fem or scipy is not installed.
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32. Positively oriented.
+    Raises `CaseError`: Misshapen arrays, a tet without volume, tissue of another number of tets;
+        scikit-fem or scipy is not installed.
     """
 
     def __init__(self, nodes: ArrayLike, tets: ArrayLike, tissue: HyperelasticTissue) -> None:
@@ -105,13 +97,9 @@ class HyperelasticBody:
     ) -> Any:
         """∂ forces / ∂ displacements, (3n, 3n) in 3 × 3 blocks (scipy BSR), N/mm.
 
-        Parameters
-        ----------
-        displacements : (n, 3) float64, mm
-        added : (n, 3, 3) float64, N/mm, optional
-            What else resists at each node, such as contact.
-        convex : bool
-            Of every tet, as `HyperelasticTissue.tangent` takes it.
+        displacements: (n, 3), mm.
+        added: (n, 3, 3), N/mm. What else resists at each node, such as contact.
+        convex: Of every tet, as `HyperelasticTissue.tangent` takes it.
         """
         n, m = len(self.nodes), len(self.tets)
         own, shared = np.empty((9, 4, m)), np.empty((9, 6, m))

@@ -29,12 +29,8 @@ DIFFERENCE = 1e-2
 class SmoothDistance:
     """The distance outside a bone, negative inside, twice continuously differentiable near it.
 
-    Parameters
-    ----------
-    level : ImageData
-        Positive inside, about a distance near the surface.
-    relief : float, mm
-        Standard deviation of the Gaussian that the level is blurred with.
+    level: Positive inside, about a distance near the surface.
+    relief: mm. Standard deviation of the Gaussian that the level is blurred with.
     """
 
     def __init__(self, level: ImageData, relief: float = RELIEF) -> None:
@@ -78,19 +74,12 @@ class BoneContact:
 
     A node that starts inside the blurred bone may stay at that depth.
 
-    Attributes
-    ----------
-    points : (n, 3) float64, mm
-        All nodes at rest.
-    nodes : (k,) whole numbers
-        Nodes that may touch bone.
-    area : (k,) float64, mm²
-        Boundary area around each.
-    bones : mapping of str to SmoothDistance
-        At rest.
-    motion : mapping of str to callable
-        The rigid motion (4, 4) of each bone after a fraction of it, 0 to 1.
-    stiffness : float, MPa/mm
+    points: (n, 3), mm. All nodes at rest.
+    nodes: (k,) whole numbers. Nodes that may touch bone.
+    area: (k,), mm². Boundary area around each.
+    bones: At rest.
+    motion: The rigid motion (4, 4) of each bone after a fraction of it, 0 to 1.
+    stiffness: MPa/mm.
     """
 
     points: Floats

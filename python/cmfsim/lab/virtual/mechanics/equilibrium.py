@@ -71,17 +71,11 @@ class NoContact:
 class EquilibriumOptions:
     """Options of the search for equilibrium.
 
-    Attributes
-    ----------
-    steps : int
-        Number of steps into which the motion is divided.
-    tolerance : float
-        Largest residual at the end: the norm of the forces on free nodes, relative to the largest
-        norm of the forces on held nodes so far.
-    loose : float
-        The same at the end of all other steps.
-    most_rounds : int
-        Maximum number of Newton iterations in a step.
+    steps: Number of steps into which the motion is divided.
+    tolerance: Largest residual at the end: the norm of the forces on free nodes, relative to the
+        largest norm of the forces on held nodes so far.
+    loose: The same at the end of all other steps.
+    most_rounds: Maximum number of Newton iterations in a step.
     """
 
     steps: int = 2
@@ -100,19 +94,11 @@ class EquilibriumOptions:
 class Equilibrium:
     """The tissue in equilibrium with the bones moved.
 
-    Attributes
-    ----------
-    displacements : (n, 3) float64, mm
-    residual : float
-        As defined for `EquilibriumOptions.tolerance`.
-    energy : float, N·mm
-        Elastic energy plus that of contact.
-    history : tuple of (float, float)
-        Fraction of the motion and residual, for each Newton iteration.
-    last_step : (n, 3) float64, mm
-        Change of the displacements in the last Newton iteration.
-    linear_iterations : int
-    seconds : float
+    displacements: (n, 3), mm.
+    residual: As defined for `EquilibriumOptions.tolerance`.
+    energy: N·mm. Elastic energy plus that of contact.
+    history: Fraction of the motion and residual, for each Newton iteration.
+    last_step: (n, 3), mm. Change of the displacements in the last Newton iteration.
     """
 
     displacements: Floats
@@ -133,22 +119,11 @@ def find_equilibrium(
 ) -> Equilibrium:
     """The equilibrium of a body whose held nodes have moved along a path.
 
-    Parameters
-    ----------
-    body : HyperelasticBody
-    held : (k,) whole numbers
-        Nodes with prescribed displacements.
-    path : callable
-        Their displacements (k, 3) mm after a fraction of the motion, 0 to 1; zero at 0.
-    contact : Contact, optional
-    options : EquilibriumOptions, optional
-
-    Raises
-    ------
-    SolverError
-        Newton's method does not converge, or a tet is inverted at the end (with its index).
-    CaseError
-        (also `ValueError`) PyAMG or scikit-fem is not installed.
+    held: (k,) whole numbers. Nodes with prescribed displacements.
+    path: Their displacements (k, 3) mm after a fraction of the motion, 0 to 1; zero at 0.
+    Raises `SolverError`: Newton's method does not converge, or a tet is inverted at the end (with
+        its index).
+    Raises `CaseError`: PyAMG or scikit-fem is not installed.
     """
     return _Search(body, held, path, contact or NoContact(), options or EquilibriumOptions()).run()
 

@@ -26,12 +26,8 @@ PERMUTATIONS = (
 class Moduli:
     """Small-strain constants of one tissue.
 
-    Attributes
-    ----------
-    young_along, young_across : float, MPa
-        Along and across the fibre.
-    poisson : float
-        Of loading along the stiffer direction, and across the fibre.
+    young_along, young_across: MPa, along and across the fibre.
+    poisson: Of loading along the stiffer direction, and across the fibre.
     """
 
     young_along: float
@@ -79,11 +75,7 @@ MUSCLE = Moduli(0.79, 0.5, 0.43)
 class SkinLayer:
     """A layer of skin in a mesh, whose share of a tet replaces fat and muscle there.
 
-    Attributes
-    ----------
-    moduli : Moduli
-    share : (m,) float64
-        Part of each tet's volume that is skin, 0 to 1.
+    share: (m,). Part of each tet's volume that is skin, 0 to 1.
     """
 
     moduli: Moduli
@@ -106,12 +98,8 @@ class HyperelasticTissue:
     it is Spencer's law λ/2 (tr ε)² + μ ε:ε + α tr ε (a·ε a) + 2 d |ε a|² + β/2 (a·ε a)². Energies
     of fat and muscle in one tet add by volume.
 
-    Attributes
-    ----------
-    lambda_, mu, alpha, difference, beta : (m,) float64, MPa
-        λ, μ = μ_T, α, d = μ_L − μ_T and β.
-    fibre : (3, m) float64
-        Unit vectors a; any where α = d = β = 0.
+    lambda_, mu, alpha, difference, beta: (m,), MPa. λ, μ = μ_T, α, d = μ_L − μ_T and β.
+    fibre: (3, m). Unit vectors a; any where α = d = β = 0.
     """
 
     lambda_: Floats
@@ -134,22 +122,11 @@ class HyperelasticTissue:
     ) -> "HyperelasticTissue":
         """The tissue of tets that are part muscle, part fat, and part skin at the surface.
 
-        Parameters
-        ----------
-        fraction : (m,) float64
-            Part of each tet's volume that is muscle, 0 to 1.
-        fibre : (m, 3) float64
-            Unit vectors; not read where the fraction is 0.
-        stiffness : float
-            Of this person's muscle, in the ordinary muscle's.
-        muscle, fat : Moduli
-        skin : SkinLayer, optional
-
-        Raises
-        ------
-        CaseError
-            (also `ValueError`) Shapes that do not match, a fraction out of range, a fibre that is
-            no unit vector, stiffness not positive.
+        fraction: (m,). Part of each tet's volume that is muscle, 0 to 1.
+        fibre: (m, 3). Unit vectors; not read where the fraction is 0.
+        stiffness: Of this person's muscle, in the ordinary muscle's.
+        Raises `CaseError`: Shapes that do not match, a fraction out of range, a fibre that is no
+            unit vector, stiffness not positive.
         """
         p = np.asarray(fraction, dtype=np.float64)
         a = np.asarray(fibre, dtype=np.float64)
@@ -197,10 +174,7 @@ class HyperelasticTissue:
     def energy(self, gradient: Floats) -> Floats:
         """ψ of each tet, (m,) MPa.
 
-        Parameters
-        ----------
-        gradient : (3, 3, m) float64
-            F.
+        gradient: (3, 3, m). F.
         """
         _, det = cofactor(gradient)
         _, c, i4 = self._fibre_strain(gradient)
@@ -216,10 +190,7 @@ class HyperelasticTissue:
     def stress(self, gradient: Floats) -> Floats:
         """The first Piola–Kirchhoff stress P = ∂ψ/∂F, (3, 3, m) MPa.
 
-        Parameters
-        ----------
-        gradient : (3, 3, m) float64
-            F.
+        gradient: (3, 3, m). F.
         """
         cof, det = cofactor(gradient)
         m, c, i4 = self._fibre_strain(gradient)
@@ -233,12 +204,8 @@ class HyperelasticTissue:
     def tangent(self, gradient: Floats, *, convex: bool = False) -> Floats:
         """∂P/∂F, (m, 9, 9) MPa, symmetric, over the entries of F row by row.
 
-        Parameters
-        ----------
-        gradient : (3, 3, m) float64
-            F.
-        convex : bool
-            Sets negative eigenvalues to 0, so that every step along it falls in energy (Teran,
+        gradient: (3, 3, m). F.
+        convex: Sets negative eigenvalues to 0, so that every step along it falls in energy (Teran,
             Sifakis, Irving & Fedkiw 2005).
         """
         f, a, d = gradient, self.fibre, self.difference

@@ -38,14 +38,9 @@ ON_EDGE = 1e-9
 class Lip:
     """The surface of one lip.
 
-    Attributes
-    ----------
-    triangles : (t, 3) whole numbers
-        Boundary triangles, outward normals.
-    nodes : (k,) whole numbers
-        Nodes of the triangles that may touch the other lip.
-    area : (k,) float64, mm²
-        Boundary area around each.
+    triangles: (t, 3) whole numbers. Boundary triangles, outward normals.
+    nodes: (k,) whole numbers. Nodes of the triangles that may touch the other lip.
+    area: (k,), mm². Boundary area around each.
     """
 
     triangles: NDArray[np.int64]
@@ -88,19 +83,10 @@ def lips_of(
 ) -> tuple[Lip, Lip]:
     """The upper and the lower lip: boundary triangles whose three nodes belong to one of them.
 
-    Parameters
-    ----------
-    slit : MouthSlit
-    nodes : (n, 3) float64, mm
-    boundary : (t, 3) uint32
-        Boundary triangles of the mesh.
-    area : (n,) float64, mm²
-        Boundary area around each node.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The mesh has no upper or no lower lip, or the two are not separate.
+    nodes: (n, 3), mm.
+    boundary: (t, 3) uint32. Boundary triangles of the mesh.
+    area: (n,), mm². Boundary area around each node.
+    Raises `CaseError`: The mesh has no upper or no lower lip, or the two are not separate.
     """
     side, inner = slit.lips(nodes)[boundary], slit.lips(nodes, MARGIN)
     lips = []
@@ -117,19 +103,13 @@ def lips_of(
 class _Touch:
     """Nodes of one lip that are inside the other, with their closest points on it.
 
-    Attributes
-    ----------
-    corners : (c, 4) int64
-        The node, and the three of the triangle.
-    parts : (c, 4) float64
-        1, and the negative weights of the closest point: parts @ places is the vector from the
-        closest point to the node.
-    normal : (c, 3) float64
-        Unit vectors along which the distance grows.
-    swing : (c, 3, 3) float64
-        Projections onto the directions in which a moving node rotates the normal: none on a face,
-        one on an edge, two at a corner.
-    depth, area : (c,) float64, mm and mm²
+    corners: (c, 4) int64. The node, and the three of the triangle.
+    parts: (c, 4). 1, and the negative weights of the closest point: parts @ places is the vector
+        from the closest point to the node.
+    normal: (c, 3). Unit vectors along which the distance grows.
+    swing: (c, 3, 3). Projections onto the directions in which a moving node rotates the normal:
+        none on a face, one on an edge, two at a corner.
+    depth, area: (c,), mm and mm².
     """
 
     corners: NDArray[np.int64]
@@ -147,14 +127,9 @@ class LipContact:
     The nodes of each lip are pushed out of the other with half the pressure, so that neither lip is
     the master. Pressure depends on depth as in `BoneContact`, but is higher.
 
-    Attributes
-    ----------
-    points : (n, 3) float64, mm
-        All nodes at rest, where the lips do not penetrate each other.
-    upper, lower : Lip
-    stiffness : float, MPa/mm
-    onset : float, mm
-        Depth over which the stiffness grows to its full value.
+    points: (n, 3), mm. All nodes at rest, where the lips do not penetrate each other.
+    stiffness: MPa/mm.
+    onset: mm. Depth over which the stiffness grows to its full value.
     """
 
     points: Floats
@@ -383,10 +358,7 @@ def _block_matrix(rows: NDArray[np.int64], columns: NDArray[np.int64], data: Flo
 class ContactSum:
     """Several contacts together.
 
-    Attributes
-    ----------
-    contacts : tuple of Contact
-        One or more.
+    contacts: One or more.
     """
 
     contacts: tuple[Contact, ...]

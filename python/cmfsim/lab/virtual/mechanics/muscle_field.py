@@ -39,11 +39,7 @@ FAR = -24.0
 def thickened(muscles: Mapping[str, Muscle], factor: float) -> dict[str, Muscle]:
     """Muscles whose straps are thicker by a factor, along the same courses.
 
-    Parameters
-    ----------
-    muscles : mapping of str to Muscle
-    factor : float
-        Of the thickness, not of the width; above 0.
+    factor: Of the thickness, not of the width; above 0.
     """
     times = as_positive("factor of muscle thickness", factor)
     return {
@@ -57,13 +53,10 @@ def thickened(muscles: Mapping[str, Muscle], factor: float) -> dict[str, Muscle]
 def skin_share(nodes: ArrayLike, tets: ArrayLike, depth: Floats, thickness: float) -> Floats:
     """The part of each tet that lies within a depth below the skin, (m,), asked at eleven places.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    tets : (m, 4) uint32
-    depth : (n,) float64, mm
-        Of the nodes below the skin.
-    thickness : float, mm
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32.
+    depth: (n,), mm, of the nodes below the skin.
+    thickness: mm.
     """
     points = as_rows("nodes", nodes, 3)
     rows = as_index_rows("tets", tets, 4, len(points), "nodes")
@@ -88,22 +81,13 @@ def muscle_field(
     tet is asked for its level. Fractions of muscles that overlap add up to 1 at most; the fibre is
     the principal axis of Σ p a aᵀ over them.
 
-    Parameters
-    ----------
-    head : PhantomHead
-    muscles : mapping of str to Muscle
-        Of this head, perhaps `thickened`.
-    nodes : (n, 3) float64, mm
-    tets : (m, 4) uint32
-    depth : (n,) float64, mm
-        Of the nodes below the skin.
-    offsets : mapping of str to 3 float, mm, optional
-        By muscle, the distance left, backwards and up by which it lies elsewhere.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Misshapen arrays; an offset of no muscle.
+    muscles: Of this head, perhaps `thickened`.
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32.
+    depth: (n,), mm, of the nodes below the skin.
+    offsets: mapping of str to 3 float, mm, by muscle, the distance left, backwards and up by which
+        it lies elsewhere.
+    Raises `CaseError`: Misshapen arrays; an offset of no muscle.
     """
     points = as_rows("nodes", nodes, 3)
     rows = as_index_rows("tets", tets, 4, len(points), "nodes")

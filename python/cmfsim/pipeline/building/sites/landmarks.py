@@ -55,20 +55,10 @@ def found_landmarks(
     warning, where the head shows no face: what cannot do without them is refused where it is
     reached.
 
-    Parameters
-    ----------
-    case : Case
-    anatomy : Anatomy
-    stages : Stages
-    placed : mapping of str to mapping of str to (3,) float64, mm
-        The landmarks that the case gives, if any: "skull" and "skin".
-    is_read : bool
-        Whether the anatomy was made of the case's own files: the jaws of another one stay.
-
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) What was taken for the mandible in the image cannot be one, and the plan
+    placed: mapping of str to mapping of str to (3,), mm. The landmarks that the case gives, if any:
+        "skull" and "skin".
+    is_read: Whether the anatomy was made of the case's own files: the jaws of another one stay.
+    Raises `LandmarkError`: What was taken for the mandible in the image cannot be one, and the plan
         needs it.
     """
     # A case with landmarks loads nothing of the synthetic heads that others are compared with.

@@ -42,19 +42,10 @@ def check_bones_of_sites(
 ) -> None:
     """Refuses sites of one jaw that lie on the bone of the other.
 
-    Parameters
-    ----------
-    case : Case
-    skull : mapping of str to (3,) float64, mm
-    anatomy : Anatomy
-        Bones without a jaw in their names, and heads of one bone, are not checked.
-    by_hand : bool
-        Whether a person placed the sites.
-
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) With the sites and their distances from both bones.
+    skull: mapping of str to (3,), mm.
+    anatomy: Bones without a jaw in their names, and heads of one bone, are not checked.
+    by_hand: Whether a person placed the sites.
+    Raises `LandmarkError`: With the sites and their distances from both bones.
     """
     jaws: dict[str, list[ImageData]] = {"upper": [], "lower": []}
     for name, level in anatomy.bones.items():
@@ -93,10 +84,7 @@ def check_pieces(
 ) -> None:
     """Refuses a cut whose piece lacks the sites that it is cut for, or holds the other jaw.
 
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) With the piece, and the sites and distances or the volume.
+    Raises `LandmarkError`: With the piece, and the sites and distances or the volume.
     """
     made = {cut.segment: (procedure, cut) for procedure in procedures for cut in procedure.cuts}
     bodies = {segment.name: segment for segment in segments}

@@ -37,14 +37,8 @@ ON_TEETH = 3.0
 class CaseLipContact:
     """The lips of a case, and what they may not enter.
 
-    Attributes
-    ----------
-    regions : mapping of str to LipRegion
-        "upper" and "lower"; none where the lips are not separated.
-    kinds : NodeKinds
-        Of all nodes, those that may lift off the teeth free.
-    touching : tuple of TouchingData
-    obstacles : tuple of ObstacleData
+    regions: "upper" and "lower"; none where the lips are not separated.
+    kinds: Of all nodes, those that may lift off the teeth free.
     """
 
     regions: Mapping[str, LipRegion]
@@ -87,10 +81,7 @@ def separated_at_seam(
     Kinds are found before: the faces of the lips along the edges of teeth look at these without
     being attached to them.
 
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) A surface given as a file runs through no tissue.
+    Raises `MeshError`: A surface given as a file runs through no tissue.
     """
     if seam.surface is None:
         return mesh, kinds, ()
@@ -141,18 +132,9 @@ def lip_contact(
 ) -> CaseLipContact:
     """The lips of a separated mesh, free to lift off the teeth, and what they may not enter.
 
-    Parameters
-    ----------
-    mesh : TetMesh
-    kinds : NodeKinds
-    seam : LipSeam
-    height : float, mm
-        How far from the seam the lips reach.
-    arches : DentalArches or None
-    walls : CaseContacts
-        The sheets of the arches.
-    segments : sequence of BoneSegment
-        Those that the kinds were found with.
+    height: mm. How far from the seam the lips reach.
+    walls: The sheets of the arches.
+    segments: Those that the kinds were found with.
     """
     if seam.surface is None:
         return CaseLipContact({}, kinds)

@@ -20,14 +20,9 @@ def on_skin(
 ) -> NDArray[np.bool_]:
     """Which boundary triangles are skin: their centroids lie nearer to it than to anything else.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    triangles : (t, 3) uint32
-        The boundary of the mesh.
-    anatomy : Anatomy
-    level : ImageData
-        Of the tissue that was meshed.
+    nodes: (n, 3), mm.
+    triangles: (t, 3) uint32. The boundary of the mesh.
+    level: Of the tissue that was meshed.
     """
     centroids = nodes[triangles].mean(axis=1)
     others = [*anatomy.bones.values(), *([] if anatomy.air is None else [anatomy.air])]

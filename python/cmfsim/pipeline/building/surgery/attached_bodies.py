@@ -21,10 +21,7 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     A body hangs together by the faces of its tets: what an edge or a node joins to the rest swings
     about it.
 
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) Nothing of it is held.
+    Raises `MeshError`: Nothing of it is held.
     """
     tets = mesh.tets
     body = tet_bodies(tets)

@@ -36,18 +36,10 @@ Motions = Mapping[str, Floats | MovedSurface]
 class PlannedBones:
     """The bone segments of a case with their motions.
 
-    Attributes
-    ----------
-    segments : tuple of BoneSegment
-    motions : mapping of str to (4, 4) float64, mm, or MovedSurface
-        Of the segments that the plan moves.
-    findings : tuple of Finding
-    achieved : AchievedPlan or None
-        How they were found, where the plan is the achieved one.
-    fits : mapping of str to AchievedMotion
-        How the motions that a plan gives by surfaces were found.
-    sources : mapping of str to str
-        Where each motion comes from and how it was understood, in words.
+    motions: mapping of str to (4, 4), mm, or MovedSurface, of the segments that the plan moves.
+    achieved: How they were found, where the plan is the achieved one.
+    fits: How the motions that a plan gives by surfaces were found.
+    sources: Where each motion comes from and how it was understood, in words.
     """
 
     segments: tuple[BoneSegment, ...]
@@ -63,18 +55,10 @@ def planned_bones(
 ) -> PlannedBones:
     """The segments of a case with the motions that its plan, or the operation, gives them.
 
-    Parameters
-    ----------
-    case : Case
-    segments : tuple of BoneSegment
-        Cut already.
-    after : Postoperative, optional
-        What `read_postoperative` gives, where it is known already.
-
-    Raises
-    ------
-    CaseError, BoundaryError, RegistrationError
-        (also `ValueError`) A segment that there is not; a motion that cannot be read or meant.
+    segments: Cut already.
+    after: What `read_postoperative` gives, where it is known already.
+    Raises `CaseError`, `BoundaryError`, `RegistrationError`: A segment that there is not; a motion
+        that cannot be read or meant.
     """
     known = [segment.name for segment in segments]
     for name in case.plan:
@@ -259,10 +243,7 @@ def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None
 def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
     """Findings about a bone that is followed vertex by vertex.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Its surfaces are no bone that moved: mirrored, shuffled, in two units.
+    Raises `CaseError`: Its surfaces are no bone that moved: mirrored, shuffled, in two units.
     """
     found = list(check_pairs(name, case.where(plan_key(case, name)), moved))
     for finding in found:

@@ -35,17 +35,10 @@ MOST_STEPS = 300
 class Postoperative:
     """Face and bones after the operation.
 
-    Attributes
-    ----------
-    skin : SurfaceData or None
-        In the frame of the data before the operation, as all that follows.
-    landmarks : dict of str to (3,) float64, mm
-        Of the skin; empty where none are given.
-    bones : mapping of str to SurfaceData
-        By bone or segment; of an image "bone" alone, which is all of it.
-    alignment : (4, 4) float64, mm
-        What took the frame after the operation to that before it.
-    findings : tuple of Finding
+    skin: In the frame of the data before the operation, as all that follows.
+    landmarks: dict of str to (3,), mm, of the skin; empty where none are given.
+    bones: By bone or segment; of an image "bone" alone, which is all of it.
+    alignment: (4, 4), mm. What took the frame after the operation to that before it.
     """
 
     skin: SurfaceData | None
@@ -60,12 +53,8 @@ def read_postoperative(case: Case) -> Postoperative:
 
     Data that are not aligned yet are registered to the data before by the skull above the jaws.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The case has no [postoperative], or nothing to align by.
-    RegistrationError
-        The scans do not fit each other.
+    Raises `CaseError`: The case has no [postoperative], or nothing to align by.
+    Raises `RegistrationError`: The scans do not fit each other.
     """
     given = case.postoperative
     if given is None:

@@ -31,16 +31,9 @@ def without_clefts(
 ) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
     """The mesh without the tets in the clefts next to moving segments, and a finding about them.
 
-    Parameters
-    ----------
-    mesh : TetMesh
-    kinds : NodeKinds
-    segments : sequence of BoneSegment
-        Those that the kinds were found with.
-    moved : collection of str
-        Names of the segments that may move.
-    width : float, mm
-        As for `cleft_tets`.
+    segments: Those that the kinds were found with.
+    moved: Names of the segments that may move.
+    width: mm. As for `cleft_tets`.
     """
     nodes, tets = mesh.nodes, mesh.tets
     inside = cleft_tets(nodes, tets, kinds, segments, moved=moved, width=width)
@@ -69,16 +62,9 @@ def without_crushed(
     Linear tissue turns inside out there at no harm to the rest; in large deformation no position of
     the nodes between two bones that meet leaves these tets a volume.
 
-    Parameters
-    ----------
-    mesh : TetMesh
-    kinds : NodeKinds
-    segments : sequence of BoneSegment
-        Those that the kinds were found with.
-    motions : mapping of str to (4, 4) float64, mm, or MovedSurface
-        Of the segments that move.
-    width : float, mm
-        As for `crushed_tets`.
+    segments: Those that the kinds were found with.
+    motions: mapping of str to (4, 4), mm, or MovedSurface, of the segments that move.
+    width: mm. As for `crushed_tets`.
     """
     crushed = crushed_tets(mesh.nodes, mesh.tets, kinds, segments, motions=motions, width=width)
     if not crushed.any():
@@ -118,16 +104,10 @@ def crushed_tets(
     volume. Only tets are judged of which every node has two segments within three times `width`,
     taken together: other tissue moves out of the way.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    tets : (m, 4) uint32
-    kinds : NodeKinds
-    segments : sequence of BoneSegment
-    motions : mapping of str to (4, 4) float64, mm, or MovedSurface
-        Of the segments that move.
-    width : float, mm
-        The width of a cleft; 0: no tet.
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32.
+    motions: mapping of str to (4, 4), mm, or MovedSurface, of the segments that move.
+    width: mm. The width of a cleft; 0: no tet.
     """
     crushed = np.zeros(len(tets), dtype=bool)
     if width <= 0.0 or not motions:
@@ -193,15 +173,9 @@ def cleft_tets(
     Those are tets that hold nodes of both, and those whose centroid has both within `width`, taken
     together: a cut in the bone and the slit between the tooth rows look the same.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    tets : (m, 4) uint32
-    kinds : NodeKinds
-    segments : sequence of BoneSegment
-    moved : collection of str
-    width : float, mm
-        0: no tet.
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32.
+    width: mm. 0: no tet.
     """
     inside = np.zeros(len(tets), dtype=bool)
     if width <= 0.0 or not moved:

@@ -24,13 +24,7 @@ RADIUS_IN_EDGES = 0.5
 
 @dataclass(frozen=True, eq=False)
 class CaseContacts:
-    """The sheets that tissue may slide on, by segment.
-
-    Attributes
-    ----------
-    sheets : mapping of str to ContactSheet
-    findings : tuple of Finding
-    """
+    """The sheets that tissue may slide on, by segment."""
 
     sheets: Mapping[str, ContactSheet] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
@@ -95,19 +89,8 @@ def arch_sheets(
     A sheet is that of the whole bone before it is cut, so that it goes on smoothly past the cuts;
     each piece carries it with its own motion.
 
-    Parameters
-    ----------
-    anatomy : Anatomy
-    segments : sequence of BoneSegment
-    arches : DentalArches
-    options : KindOptions
-    edge_length : float, mm
-        Of the tissue's tets.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) No bone at an arch.
+    edge_length: mm, of the tissue's tets.
+    Raises `CaseError`: No bone at an arch.
     """
     if not options.sliding or options.contact_surface == "bone" or not arches.by_jaw:
         return CaseContacts()

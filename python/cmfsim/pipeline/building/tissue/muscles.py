@@ -23,15 +23,9 @@ from cmfsim.values.patient_model import PatientModel
 class PlacedMuscles:
     """A template's muscles in a head.
 
-    Attributes
-    ----------
-    muscles : MorphedMusculature
-        Where they are used: fitted, if that helps.
-    fit : MuscleFit or None
-    prepared : PreparedMuscles
-        The same muscles with what a mesh is sampled by.
-    seconds : mapping of str to float
-        Of each step.
+    muscles: Where they are used: fitted, if that helps.
+    prepared: The same muscles with what a mesh is sampled by.
+    seconds: Of each step.
     """
 
     muscles: MorphedMusculature
@@ -54,12 +48,8 @@ def placed_muscles(
 
     Those that the landmarks do not place are left out with a finding.
 
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) The landmarks do not fit the template's.
-    CaseError
-        (also `ValueError`) There is no such template.
+    Raises `LandmarkError`: The landmarks do not fit the template's.
+    Raises `CaseError`: There is no such template.
     """
     begun = time.perf_counter()
     template = MuscleTemplate.load(given.template)

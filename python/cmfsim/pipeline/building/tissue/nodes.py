@@ -182,18 +182,10 @@ def end_findings(
 ) -> list[Finding]:
     """Findings on bones that move close to where tissue is fixed, and on tissue that ends loose.
 
-    Parameters
-    ----------
-    nodes : (n, 3) float64, mm
-    triangles : (t, 3) uint32
-        Boundary of the tissue's mesh, outward.
-    kinds : NodeKinds
-    anatomy : Anatomy
-        Its grid ends where the image does.
-    region : TissueRegion
-    segments : sequence of BoneSegment
-    moved : collection of str
-        Names of the segments that move.
+    nodes: (n, 3), mm.
+    triangles: (t, 3) uint32. Boundary of the tissue's mesh, outward.
+    anatomy: Its grid ends where the image does.
+    moved: Names of the segments that move.
     """
     near = _near_ends(anatomy, region, [s for s in segments if s.name in moved])
     return [*near, *_loose_ends(nodes, triangles, kinds, anatomy)]

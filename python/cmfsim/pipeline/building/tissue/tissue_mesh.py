@@ -141,15 +141,8 @@ def needed_halvings(level: ImageData, anatomy: Anatomy) -> Counts:
     muscle over it, where the motions of the jaws differ most. No landmark is asked for, nor that
     the image show the lips apart.
 
-    Parameters
-    ----------
-    level : ImageData
-        Of the tissue, on the anatomy's grid.
-    anatomy : Anatomy
-
-    Returns
-    -------
-    (nx, ny, nz) uint8
+    level: Of the tissue, on the anatomy's grid.
+    Returns: (nx, ny, nz) uint8.
     """
     tissue = level.values > 0.0
     upper = np.zeros(tissue.shape, dtype=bool)
@@ -172,17 +165,10 @@ def needed_halvings(level: ImageData, anatomy: Anatomy) -> Counts:
 def lip_halvings(level: ImageData, seam: LipSeam, edge_length: float) -> Counts:
     """How often the edge is halved at least along the seam between the lips, where these are thin.
 
-    Parameters
-    ----------
-    level : ImageData
-        Of the tissue.
-    seam : LipSeam
-        With a surface.
-    edge_length : float, mm
-
-    Returns
-    -------
-    (nx, ny, nz) uint8
+    level: Of the tissue.
+    seam: With a surface.
+    edge_length: mm.
+    Returns: (nx, ny, nz) uint8.
     """
     values = level.values
     needed = np.zeros(values.shape, dtype=np.uint8)
