@@ -218,10 +218,6 @@ def measure_motion(
         The motion counts as rigid if the best rigid motion reproduces every vertex to this
         tolerance.
 
-    Returns
-    -------
-    AchievedMotion
-
     Raises
     ------
     RegistrationError
@@ -340,10 +336,6 @@ def achieved_plan(
         Further segments before the operation, whose motion is not needed. A cut face towards one
         of them is not visible in a scan, so it is not reported as off the bone; those in `segments`
         are known already.
-
-    Returns
-    -------
-    AchievedPlan
 
     Raises
     ------

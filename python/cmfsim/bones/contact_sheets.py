@@ -119,10 +119,6 @@ def contact_sheet(
     arch : DentalArch
     options : SheetOptions, optional
 
-    Returns
-    -------
-    ContactSheet
-
     Raises
     ------
     CaseError

@@ -92,10 +92,6 @@ def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examinatio
     models : sequence of str, optional
         As for `diagnose`.
 
-    Returns
-    -------
-    Examination
-
     Examples
     --------
     >>> import cmfsim

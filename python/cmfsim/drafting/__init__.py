@@ -49,10 +49,6 @@ def init_case(
     progress : callable
         Called with the name of each stage.
 
-    Returns
-    -------
-    CaseDraft
-
     Raises
     ------
     FileNotFoundError

@@ -227,10 +227,6 @@ def compare_skins(
     max_distance : float, mm, optional
         Vertices further apart are excluded and counted. Default: no limit.
 
-    Returns
-    -------
-    SkinComparison
-
     Raises
     ------
     RegistrationError

@@ -37,10 +37,6 @@ def calibrate(scores: ArrayLike, coverage: float) -> BandFactor:
     coverage : float
         The share of cases that should lie within the band, above 0 and below 1.
 
-    Returns
-    -------
-    BandFactor
-
     Raises
     ------
     CalibrationError
@@ -72,10 +68,6 @@ def calibrate(scores: ArrayLike, coverage: float) -> BandFactor:
 
 def cases_needed(coverage: float) -> int:
     """The smallest number of calibration cases for a coverage: 9 for 90 %, 19 for 95 %.
-
-    Parameters
-    ----------
-    coverage : float
 
     Examples
     --------

@@ -95,10 +95,6 @@ class ModelComparison:
         ----------
         first, second : str
             Models, or "no change".
-
-        Returns
-        -------
-        PairedTest
         """
         for name in (first, second):
             check_one_of("model", name, tuple(self.errors))
@@ -154,10 +150,6 @@ def compare_models(  # noqa: PLR0913 (options by name)
     thickening : (v,) float64, mm, optional
         How far each vertex is moved outward, along its normal, before anything is compared: in
         every prediction, and in "no change" (`fitted_thickness`).
-
-    Returns
-    -------
-    ModelComparison
 
     Raises
     ------

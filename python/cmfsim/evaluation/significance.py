@@ -186,10 +186,6 @@ def paired_change(first: ArrayLike, second: ArrayLike) -> PairedChange:
     first, second : (n,) float64, mm
         Mean error of each patient.
 
-    Returns
-    -------
-    PairedChange
-
     Raises
     ------
     CaseError

@@ -107,10 +107,6 @@ def distance_statistics(
     limits : tuple of float, mm
         For the shares within.
 
-    Returns
-    -------
-    DistanceStatistics
-
     Raises
     ------
     CaseError

@@ -158,10 +158,6 @@ def error_table(patients: Mapping[str, ModelComparison]) -> ErrorTable:
     patients : mapping of str to ModelComparison
         Each with the same models.
 
-    Returns
-    -------
-    ErrorTable
-
     Raises
     ------
     CaseError

@@ -61,10 +61,6 @@ def read_surface(
         Of the numbers in the file: "LPS" or "RAS". Default: the frame in the file's header, as 3D
         Slicer writes it (`SPACE=RAS`); LPS if it states none.
 
-    Returns
-    -------
-    SurfaceData
-
     Raises
     ------
     FileNotFoundError
@@ -132,10 +128,6 @@ def read_moved_surface(
         Of the numbers in both files.
     frame : str, optional
         As in `read_surface`.
-
-    Returns
-    -------
-    MovedSurface
 
     Raises
     ------
@@ -270,11 +262,6 @@ def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
 
     An existing file is replaced in one step. PLY, OBJ and VTP keep every digit; STL has single
     precision and repeats the vertices of each triangle.
-
-    Parameters
-    ----------
-    path : path
-    surface : SurfaceData
 
     Raises
     ------

@@ -26,10 +26,6 @@ def mesh_report(mesh: TetMesh, making: Mapping[str, Any] | None = None) -> MeshR
     making : mapping, optional
         The values that `_core.stuff_image` returns together with the mesh.
 
-    Returns
-    -------
-    MeshReport
-
     Examples
     --------
     >>> import cmfsim

@@ -54,14 +54,7 @@ class MeshOptions:
 
 @dataclass(frozen=True, eq=False)
 class TissueMesh:
-    """A mesh, the report of its quality, and findings.
-
-    Attributes
-    ----------
-    mesh : TetMesh
-    report : MeshReport
-    findings : tuple of Finding
-    """
+    """A mesh, the report of its quality, and findings."""
 
     mesh: TetMesh
     report: MeshReport
@@ -145,10 +138,6 @@ def mesh_from_level(
     needed : (nx, ny, nz) array of whole numbers, optional
         How often it is at least halved, thin or not, in the cube that contains each voxel's centre:
         no more often than in the options.
-
-    Returns
-    -------
-    TissueMesh
 
     Raises
     ------

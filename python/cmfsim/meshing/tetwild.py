@@ -23,10 +23,6 @@ def mesh_with_tetwild(surface: SurfaceData, edge_length: float = 3.0) -> TetMesh
     surface : SurfaceData
     edge_length : float, mm
 
-    Returns
-    -------
-    TetMesh
-
     Raises
     ------
     MeshError

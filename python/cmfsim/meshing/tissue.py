@@ -79,11 +79,6 @@ class TissueRegion:
 def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tuple[Finding, ...]]:
     """The level image of the soft tissue in front of the posterior plane, and findings.
 
-    Parameters
-    ----------
-    anatomy : Anatomy
-    region : TissueRegion
-
     Returns
     -------
     level : ImageData

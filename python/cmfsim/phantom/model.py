@@ -83,10 +83,6 @@ class PhantomHead:
     canals and z = 0 is the Frankfort plane. Without asymmetry the right half is the exact mirror
     image of the left.
 
-    Attributes
-    ----------
-    parameters : HeadParameters
-
     Examples
     --------
     >>> import cmfsim

@@ -130,10 +130,6 @@ def band_regions(patient: PatientModel) -> dict[str, NDArray[np.bool_]]:
     They are placed on the skin before the operation, as those of an evaluation, by the skin
     landmarks of the case or by proposed ones; empty if there are neither.
 
-    Parameters
-    ----------
-    patient : PatientModel
-
     Returns
     -------
     dict of str to (k,) bool

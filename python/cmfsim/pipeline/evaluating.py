@@ -174,10 +174,6 @@ def evaluate(
     **options
         As for `predict`.
 
-    Returns
-    -------
-    CaseEvaluation
-
     Raises
     ------
     CmfsimError

@@ -116,10 +116,6 @@ def make_planning_page(
     **options
         As for `predict`.
 
-    Returns
-    -------
-    PlanningPage
-
     Raises
     ------
     CmfsimError

@@ -47,10 +47,6 @@ def predict(
         Those of `BuildOptions`: `progress`, called with the name of each stage as it begins,
         or True for a bar; `check`, whether the doctor checks the case first; and others.
 
-    Returns
-    -------
-    Prediction
-
     Raises
     ------
     CmfsimError

@@ -41,10 +41,6 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     model : str
         "H", "M", "H+S" or "M+S" (Kim et al. 2010, section 3.2).
 
-    Returns
-    -------
-    Scene
-
     Raises
     ------
     CaseError
@@ -88,10 +84,6 @@ def predict_patient(
     solver : StaticSolver, optional
         Of `model_scene(patient, model)`, with any plan, if it already exists: a new plan then needs
         no factorisation.
-
-    Returns
-    -------
-    Prediction
 
     Raises
     ------

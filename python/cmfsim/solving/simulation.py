@@ -38,10 +38,6 @@ _log = logging.getLogger(__name__)
 def scene_solver(scene: Scene) -> StaticSolver:
     """The solver of a scene, ready for its plan and for others.
 
-    Parameters
-    ----------
-    scene : Scene
-
     Returns
     -------
     StaticSolver
@@ -96,10 +92,6 @@ def _boundary(scene: Scene) -> Boundary:
 
 def scene_plan(scene: Scene) -> dict[str, NDArray[np.float64] | SurfaceMotion]:
     """The plan of a scene in the form that `StaticSolver.solve` takes.
-
-    Parameters
-    ----------
-    scene : Scene
 
     Returns
     -------

@@ -56,14 +56,7 @@ class CaseOutcome:
 
 @dataclass(frozen=True)
 class StudyReport:
-    """The outcome of every case of a cohort, in its order.
-
-    Attributes
-    ----------
-    cohort : Cohort
-    outcomes : tuple of CaseOutcome
-    seconds : float
-    """
+    """The outcome of every case of a cohort, in its order."""
 
     cohort: Cohort
     outcomes: tuple[CaseOutcome, ...]
@@ -112,10 +105,6 @@ def run_study(
     progress : callable, optional
         Called with each outcome as soon as it is known.
 
-    Returns
-    -------
-    StudyReport
-
     Raises
     ------
     CaseError
@@ -143,14 +132,7 @@ def run_study(
 
 @dataclass(frozen=True)
 class StudyOptions:
-    """Where and how many at a time the cases of a study run; see `run_study`.
-
-    Attributes
-    ----------
-    workers : int or None
-    scheduler : str or None
-    fresh : bool
-    """
+    """Where and how many at a time the cases of a study run; see `run_study`."""
 
     workers: int | None = None
     scheduler: str | None = None

@@ -40,14 +40,6 @@ def study_table(report: StudyReport) -> ErrorTable:
     Cases that failed are absent. If one model of a case failed, the other models are listed, and
     averages exclude the case.
 
-    Parameters
-    ----------
-    report : StudyReport
-
-    Returns
-    -------
-    ErrorTable
-
     Raises
     ------
     CaseError
@@ -93,14 +85,6 @@ def write_study_report(report: StudyReport) -> list[str]:
     colours on the faces; further patients in `figure10-2.png`, …), `study.json` and `report.html`.
     If no case was compared, only the last two are written. If pictures cannot be drawn, or Jinja2
     is missing, the rest is written with a warning.
-
-    Parameters
-    ----------
-    report : StudyReport
-
-    Returns
-    -------
-    list of str
 
     Raises
     ------

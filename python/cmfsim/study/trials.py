@@ -162,10 +162,6 @@ def sensitivity(
     **options
         As for `predict`.
 
-    Returns
-    -------
-    SensitivityReport
-
     Raises
     ------
     CaseError

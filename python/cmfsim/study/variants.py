@@ -145,10 +145,6 @@ def run_variants(
     progress : callable, optional
         Called with variant and outcome as soon as it is known.
 
-    Returns
-    -------
-    VariantsReport
-
     Raises
     ------
     CaseError
@@ -280,14 +276,6 @@ def write_variants_report(report: VariantsReport) -> list[str]:
     `variants.csv` (a row for each patient, region, model and variant), `variants.md` (tables for
     reading), `variants.json` (both, with intervals and tests) and `report.html`. Without Jinja2,
     the last is missing, with a warning.
-
-    Parameters
-    ----------
-    report : VariantsReport
-
-    Returns
-    -------
-    list of str
 
     Raises
     ------

@@ -38,10 +38,6 @@ class BandOptions:
     def check(self, models: Sequence[str]) -> None:
         """Refuses a calibration that is not for these models or this coverage.
 
-        Parameters
-        ----------
-        models : sequence of str
-
         Raises
         ------
         CalibrationError

@@ -174,10 +174,6 @@ def clinical_motion(
     source : str
         Where the motion comes from, in words.
 
-    Returns
-    -------
-    ClinicalMotion
-
     Raises
     ------
     BoundaryError

@@ -171,12 +171,7 @@ class MuscleModuli:
         _check_poisson(self.poisson)
 
     def over(self, base: "MuscleModuli") -> "MuscleModuli":
-        """These moduli, and those of `base` where these are None.
-
-        Parameters
-        ----------
-        base : MuscleModuli
-        """
+        """These moduli, and those of `base` where these are None."""
         return MuscleModuli(
             base.young_along if self.young_along is None else self.young_along,
             base.young_across if self.young_across is None else self.young_across,
@@ -261,12 +256,7 @@ class TissueModuli:
         return TissueModuli(fat, muscle, muscles)
 
     def is_preset(self, preset: str) -> bool:
-        """Whether every constant is the preset's.
-
-        Parameters
-        ----------
-        preset : str
-        """
+        """Whether every constant is the preset's."""
         base, own = PRESET_MODULI[preset], self.resolved(preset)
         return own.fat == base.fat and all(
             moduli == base.muscle for moduli in (own.muscle, *own.muscles.values())

@@ -128,10 +128,6 @@ def decompose_motion(matrix: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> 
     centre : (3,) float64, mm
         The centre of the rotation. It affects the translation, not the angle.
 
-    Returns
-    -------
-    RigidMotion
-
     Raises
     ------
     BoundaryError

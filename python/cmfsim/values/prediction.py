@@ -136,10 +136,6 @@ class Prediction(Frozen):
         plan : mapping of str to (4, 4) float64, mm, (j, 3) float64, mm, or MovedSurface
             Segments by name; those that are not named stay.
 
-        Returns
-        -------
-        Prediction
-
         Raises
         ------
         CaseError

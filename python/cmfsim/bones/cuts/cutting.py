@@ -101,10 +101,6 @@ def cut_bones(
         Skull landmarks, LPS; needed where procedures are given by name.
     options : CutOptions, optional
 
-    Returns
-    -------
-    CutBones
-
     Raises
     ------
     CaseError
@@ -176,10 +172,6 @@ def segments_from_surfaces(
     surfaces : mapping of str to SurfaceData
         As in `Anatomy.surfaces`; a level without one gets the surface of its zero set, and "skin"
         is ignored.
-
-    Returns
-    -------
-    tuple of BoneSegment
 
     Raises
     ------

@@ -154,10 +154,6 @@ def free_cut(
     rest : str, optional
         Name of the remaining bone; by default its own name.
 
-    Returns
-    -------
-    Procedure
-
     Raises
     ------
     CaseError

@@ -107,10 +107,6 @@ def procedure_options(kind: str) -> dict[str, float]:
     kind : str
         "le_fort_1", "le_fort_3", "bsso" or "genioplasty".
 
-    Returns
-    -------
-    dict of str to float
-
     Raises
     ------
     CaseError
@@ -147,10 +143,6 @@ def place_procedure(
         Skull landmarks, LPS; left and right as labelled.
     options : mapping of str to float, optional
         Distances (mm) and angles (degrees) other than the defaults of `procedure_options`.
-
-    Returns
-    -------
-    Procedure
 
     Raises
     ------

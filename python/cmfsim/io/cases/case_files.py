@@ -182,10 +182,6 @@ class Case:
         changes : CaseChanges, optional
             Of settings in the file. Paths in it are resolved against the folder of the case, too.
 
-        Returns
-        -------
-        Case
-
         Raises
         ------
         FileNotFoundError

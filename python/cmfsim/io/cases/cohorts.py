@@ -226,10 +226,6 @@ class Cohort:
             Of the file, or of a folder that holds a `cohort.toml`. A folder without one is the
             cohort of the cases in its folders, `NAME/case.toml`, with all models.
 
-        Returns
-        -------
-        Cohort
-
         Raises
         ------
         FileNotFoundError

@@ -67,10 +67,6 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     path : path
         TOML scenes need the extra `mesh` (meshio).
 
-    Returns
-    -------
-    Scene
-
     Raises
     ------
     FileNotFoundError

@@ -31,14 +31,6 @@ _CALIBRATION = Closed(
 def read_calibration(path: str | os.PathLike[str]) -> Calibration:
     """The calibration in a file.
 
-    Parameters
-    ----------
-    path : path
-
-    Returns
-    -------
-    Calibration
-
     Raises
     ------
     FileNotFoundError
@@ -77,11 +69,6 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
 
 def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
     """Writes a calibration; the same calibration always gives the same bytes.
-
-    Parameters
-    ----------
-    path : path
-    calibration : Calibration
 
     Raises
     ------

@@ -50,10 +50,6 @@ def write_model(
     draw : callable, optional
         Draws pictures into the folder that it is given, and returns their names.
 
-    Returns
-    -------
-    list of str
-
     Raises
     ------
     OSError

@@ -159,10 +159,6 @@ def write_prediction(
     draw : callable, optional
         Draws pictures into the folder that it is given, and returns their names.
 
-    Returns
-    -------
-    list of str
-
     Raises
     ------
     OSError

@@ -21,14 +21,6 @@ RESULT_FORMAT = "cmfsim-result"
 def read_result(path: str | os.PathLike[str]) -> SceneResult:
     """The result in a `.npz` file that `write_result` made.
 
-    Parameters
-    ----------
-    path : path
-
-    Returns
-    -------
-    SceneResult
-
     Raises
     ------
     FileNotFoundError
@@ -92,11 +84,6 @@ def write_result(path: str | os.PathLike[str], result: SceneResult) -> None:
     """Writes a result as `.npz` (everything), `.vtu` (tissue) or `.vtp` (its boundary).
 
     An existing file is replaced in one step.
-
-    Parameters
-    ----------
-    path : path
-    result : SceneResult
 
     Raises
     ------

@@ -93,10 +93,6 @@ def run_benchmark(
     progress : callable, optional
         Called with a line of text.
 
-    Returns
-    -------
-    Benchmark
-
     Raises
     ------
     FileNotFoundError

@@ -107,10 +107,6 @@ class Choice:
 def case_choice(case: Case) -> Choice:
     """The settings of a case: the defaults of the package where its file has none.
 
-    Parameters
-    ----------
-    case : Case
-
     Returns
     -------
     Choice

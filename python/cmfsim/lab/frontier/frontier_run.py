@@ -73,10 +73,6 @@ def frontier(  # noqa: PLR0913 (options by name)
     progress : callable, optional
         Called with the name of each job as it begins.
 
-    Returns
-    -------
-    Frontier
-
     Raises
     ------
     CaseError

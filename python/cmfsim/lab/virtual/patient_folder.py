@@ -87,10 +87,6 @@ def virtual_patients(
     progress : callable, optional
         Called with the name of each stage as it begins.
 
-    Returns
-    -------
-    list of Path
-
     Raises
     ------
     CmfsimError
@@ -192,10 +188,6 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
         Of the marching cubes that make the skin.
     options : EquilibriumOptions, optional
     progress : callable, optional
-
-    Returns
-    -------
-    Path
 
     Raises
     ------

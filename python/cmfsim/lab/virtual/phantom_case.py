@@ -55,10 +55,6 @@ def write_phantom_case(
     seed : int
         Of its noise.
 
-    Returns
-    -------
-    Path
-
     Raises
     ------
     OSError

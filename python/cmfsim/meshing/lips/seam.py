@@ -77,10 +77,6 @@ def lip_seam(
     depth : float, mm
         How far it extends behind the teeth.
 
-    Returns
-    -------
-    LipSeam
-
     Raises
     ------
     CaseError

@@ -58,10 +58,6 @@ def dental_arches(
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks, LPS: `supradentale`, `infradentale`, `supra_m2_L/R` and `sub_m2_L/R`.
 
-    Returns
-    -------
-    DentalArches
-
     Raises
     ------
     CaseError

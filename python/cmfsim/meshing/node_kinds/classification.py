@@ -95,10 +95,6 @@ def classify_nodes(  # noqa: PLR0913 (options by name)
         deeper behind them, on the palate or where teeth bite, are joined or fixed as other nodes
         on the bone are.
 
-    Returns
-    -------
-    ClassifiedNodes
-
     Raises
     ------
     CaseError

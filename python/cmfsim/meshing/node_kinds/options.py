@@ -184,10 +184,6 @@ def kind_options(table: Mapping[str, Any]) -> KindOptions:
         Names of `KindOptions`. `regions` holds tables: `segment` with `low` and `high`, or with
         `centre` and `radius`.
 
-    Returns
-    -------
-    KindOptions
-
     Raises
     ------
     CaseError

@@ -54,10 +54,6 @@ def build_model(case: CaseOrPath, **options: "Unpack[BuildKeywords]") -> Patient
     **options
         Those of `BuildOptions`.
 
-    Returns
-    -------
-    PatientModel
-
     Raises
     ------
     CmfsimError

@@ -32,10 +32,6 @@ def build_case(case: CaseOrPath, **options: "Unpack[BuildKeywords]") -> PatientM
     **options
         Those of `BuildOptions`.
 
-    Returns
-    -------
-    PatientModel
-
     Raises
     ------
     CmfsimError

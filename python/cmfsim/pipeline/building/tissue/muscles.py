@@ -94,10 +94,6 @@ def with_muscles(
         Returns the muscles in the head, if the caller places them in parallel with other work; only
         the time spent waiting for them counts in the timings.
 
-    Returns
-    -------
-    PatientModel
-
     Raises
     ------
     LandmarkError
