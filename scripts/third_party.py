@@ -68,7 +68,6 @@ PYTHON: Mapping[str, str] = {
     "distributed": "BSD-3-Clause",
     "scikit-fem": "BSD-3-Clause",
     "pyamg": "MIT",
-    "pytetwild": "MPL-2.0",
     "starlette": "BSD-3-Clause",
     "uvicorn": "BSD-3-Clause",
     "playwright": "Apache-2.0",

@@ -137,7 +137,6 @@ from cmfsim.meshing import anatomy_from_surfaces as anatomy_from_surfaces
 from cmfsim.meshing import mesh_from_labels as mesh_from_labels
 from cmfsim.meshing import mesh_from_level as mesh_from_level
 from cmfsim.meshing import mesh_report as mesh_report
-from cmfsim.meshing import mesh_with_tetwild as mesh_with_tetwild
 from cmfsim.meshing import part_mesh as part_mesh
 from cmfsim.meshing import signed_level as signed_level
 from cmfsim.meshing import tissue_level as tissue_level

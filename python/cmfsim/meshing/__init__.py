@@ -7,7 +7,6 @@ from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
 from cmfsim.meshing.quality import mesh_findings, mesh_report, report_of_part
 from cmfsim.meshing.separation import part_mesh, separated_mesh
 from cmfsim.meshing.stuffing import MeshOptions, TissueMesh, mesh_from_labels, mesh_from_level
-from cmfsim.meshing.tetwild import mesh_with_tetwild
 from cmfsim.meshing.tissue import TissueRegion, near_skin, tissue_level
 
 __all__ = [
@@ -19,7 +18,6 @@ __all__ = [
     "mesh_from_labels",
     "mesh_from_level",
     "mesh_report",
-    "mesh_with_tetwild",
     "near_skin",
     "part_mesh",
     "report_of_part",

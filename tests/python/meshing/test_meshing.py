@@ -1,6 +1,5 @@
 """From labels, levels and surfaces to tets: against volumes that are known, and bad input."""
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -457,29 +456,6 @@ def test_near_skin_is_a_shell():
     assert near[r > 60.0].all()
     assert near[(r < 60.0) & (r > 52.0)].all()
     assert not near[r < 46.0].any()
-
-
-def test_tets_of_tetwild_fill_a_surface(tmp_path, monkeypatch):
-    """The optional mesher: volume, orientation, edge."""
-    if importlib.util.find_spec("pytetwild") is None:
-        pytest.skip("needs pytetwild: pip install '.[tetwild]'")
-    vertices, triangles = head_case.icosphere(2)
-    surface = cmfsim.SurfaceData(10.0 * vertices, triangles)
-    monkeypatch.chdir(tmp_path)
-    mesh = cmfsim.mesh_with_tetwild(surface, 4.0)
-    assert list(tmp_path.iterdir()) == []
-    assert float(np.sum(mesh.volumes)) == pytest.approx(4.0 / 3.0 * np.pi * 1000.0, rel=0.06)
-    assert np.asarray(mesh.volumes).min() > 0.0
-    assert 1.5 < cmfsim.mesh_report(mesh).mean_edge < 6.0
-    with pytest.raises(ValueError, match="edge_length"):
-        cmfsim.mesh_with_tetwild(surface, 0.0)
-
-
-def test_without_tetwild_the_package_to_install_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pytetwild", None)
-    vertices, triangles = head_case.icosphere(1)
-    with pytest.raises(cmfsim.MeshError, match=r"pip install '\.\[tetwild\]'"):
-        cmfsim.mesh_with_tetwild(cmfsim.SurfaceData(vertices, triangles))
 
 
 def test_distances_up_to_a_bound_are_those_of_scipy_and_the_others_infinite():
