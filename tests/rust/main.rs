@@ -11,16 +11,21 @@ mod algebra {
     mod krylov;
 }
 mod contact {
+    mod creases;
     mod settling;
     mod sliding;
     mod touching;
+    mod unilateral;
 }
 mod geometry {
+    mod motion;
     mod surface;
+    mod winding;
 }
 mod mechanics {
     mod bar;
     mod convergence;
+    mod element_limits;
     mod elements;
     mod patch;
     mod squeezed;

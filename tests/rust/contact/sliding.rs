@@ -8,21 +8,22 @@ use crate::meshes::{
     stays, surface, tensors, with_method,
 };
 use mtm_core::{
-    Boundary, ContactMode, ContactOptions, ErrorKind, FibreElastic, Gap, MassTensors, Method,
-    Motion, MtmError, Plan, RigidMotion, Solution, StaticOptions, Surface, SurfaceMotion, TetMesh,
+    Boundary, ContactMode, ContactOptions, FibreElastic, Gap, Method, Motion, Plan, RigidMotion,
+    Solution, StaticOptions, Surface, SurfaceMotion, TetMesh,
 };
 use nalgebra::Matrix3;
 
-const METHODS: [Method; 3] = [Method::Cholesky, Method::Pcg, Method::Relaxation];
-const POISSON: f64 = 0.45;
+pub(super) const METHODS: [Method; 3] = [Method::Cholesky, Method::Pcg, Method::Relaxation];
 
-fn unilateral(method: Method) -> StaticOptions {
+pub(super) const POISSON: f64 = 0.45;
+
+pub(super) fn unilateral(method: Method) -> StaticOptions {
     let contact = ContactOptions { mode: ContactMode::Unilateral, ..near_exact() };
     StaticOptions { method, contact, ..StaticOptions::default() }
 }
 
 /// Largest share of a sliding node's internal force that lies in the tangent plane of its surface.
-fn tangential_share(found: &Solution) -> f64 {
+pub(super) fn tangential_share(found: &Solution) -> f64 {
     let c = &found.contact;
     let largest = c.forces.iter().fold(0.0_f64, |m, f| m.max(f.abs()));
     c.nodes
@@ -35,27 +36,15 @@ fn tangential_share(found: &Solution) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// Largest distance of the sliding nodes from `moved`, mm.
-fn off_surface(mesh: &TetMesh, nodes: &[u32], found: &Solution, moved: &Surface) -> f64 {
-    let ends: Vec<[f64; 3]> = nodes
-        .iter()
-        .map(|&j| {
-            let j = j as usize;
-            (Vec3::from(mesh.nodes()[j]) + Vec3::from(found.displacements[j])).into()
-        })
-        .collect();
-    moved.closest(&ends).iter().map(|c| c.distance).fold(0.0, f64::max)
-}
-
 /// A block on a floor, all turned by `turn`: the mesh, the floor's nodes and the lid's.
-fn block(turn: &RigidMotion) -> (Arc<TetMesh>, Vec<u32>, Vec<u32>) {
+pub(super) fn block(turn: &RigidMotion) -> (Arc<TetMesh>, Vec<u32>, Vec<u32>) {
     let shape = BoxShape { cells: [5, 5, 4], size: [5.0, 5.0, 4.0], jitter: 0.15 };
     let (nodes, tets) = shape.tets();
     let mesh = meshes::checked((carried(turn, &nodes), tets));
     (mesh, shape.side(2, false), shape.side(2, true))
 }
 
-fn floor(turn: &RigidMotion, n: usize, skew: f64) -> Arc<Surface> {
+pub(super) fn floor(turn: &RigidMotion, n: usize, skew: f64) -> Arc<Surface> {
     let (vertices, triangles) = plane(n, 12.0, skew);
     surface((carried(turn, &vertices), triangles))
 }
@@ -206,7 +195,7 @@ fn shell_that_moves_with_its_sphere_is_not_strained() {
 }
 
 /// A spherical shell whose skin is joined and whose inner nodes slide on a finer ball.
-fn shell(levels: usize) -> (Arc<TetMesh>, Arc<Boundary>, Arc<Surface>) {
+pub(super) fn shell(levels: usize) -> (Arc<TetMesh>, Arc<Boundary>, Arc<Surface>) {
     let shape = ShellShape { levels, layers: 3, inner: 10.0, outer: 16.0 };
     let ball = surface(sphere(levels + 1, 10.0));
     let slide = sliding("ball", shape.layer(0), &ball, Gap::Rest);
@@ -214,7 +203,7 @@ fn shell(levels: usize) -> (Arc<TetMesh>, Arc<Boundary>, Arc<Surface>) {
 }
 
 /// Twist and push of the shell: no closed form, the invariants alone.
-fn twist() -> Plan {
+pub(super) fn twist() -> Plan {
     plan([
         ("skin", Motion::Rigid(rigid([0.2, 0.1, 1.0], 5.0, [0.0; 3], [0.6, 0.0, 0.3]))),
         ("ball", Motion::Rigid(rigid([1.0, 0.0, 0.0], 3.0, [0.0; 3], [-0.2, 0.1, 0.0]))),
@@ -383,7 +372,7 @@ fn prescribed_gap_is_kept() {
 }
 
 /// Signorini's conditions (1933): g ≥ 0, f ≥ 0, f g = 0 at every node.
-fn assert_signorini(name: &str, found: &Solution) -> (usize, usize) {
+pub(super) fn assert_signorini(name: &str, found: &Solution) -> (usize, usize) {
     let c = &found.contact;
     let largest = c.forces.iter().fold(0.0_f64, |m, f| m.max(f.abs()));
     for i in 0..c.nodes.len() {
@@ -394,438 +383,6 @@ fn assert_signorini(name: &str, found: &Solution) -> (usize, usize) {
     }
     let held = c.active.iter().filter(|a| **a).count();
     (held, c.nodes.len() - held)
-}
-
-#[test]
-fn unilateral_contact_neither_penetrates_nor_pulls() {
-    let turn = RigidMotion::identity();
-    let (mesh, base, lid) = block(&turn);
-    let slide = sliding("floor", base, &floor(&turn, 7, 0.2), Gap::Uniform(0.0));
-    let bounds = boundary(vec![], vec![joined("lid", lid), slide]);
-    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    // The lid tips: one edge is pressed, the other lifted.
-    let tip = rigid([0.0, 1.0, 0.0], 8.0, [2.5, 2.5, 4.0], [0.0, 0.0, 0.0]);
-    let motion = plan([("lid", Motion::Rigid(tip)), ("floor", stays())]);
-    let mut answers = Vec::new();
-    for method in METHODS {
-        let found = solve(&tensors, &bounds, unilateral(method), &motion, None).unwrap();
-        let (held, free) = assert_signorini(&format!("{method:?}"), &found);
-        assert!(held > 5 && free > 5, "{method:?}: {held} held, {free} free");
-        assert!(tangential_share(&found) <= 1e-6);
-        answers.push(found.displacements);
-    }
-    for other in &answers[1..] {
-        let e = largest_difference(&answers[0], other);
-        assert!(e <= 1e-6, "{e:e} mm");
-    }
-    // Held on both sides the same tip pulls: the modes do differ.
-    let found = solve(&tensors, &bounds, with_method(Method::Cholesky), &motion, None).unwrap();
-    assert!(found.contact.forces.iter().any(|&f| f < 0.0));
-}
-
-/// A ball that moves within its shell: pressed on one side, lifted on the other.
-#[test]
-fn unilateral_contact_on_a_sphere_lifts_off_behind_the_ball() {
-    let (mesh, bounds, _) = shell(2);
-    let tensors = tensors(&mesh, &isotropic(0.01, 0.4));
-    let push = rigid([0.0, 0.0, 1.0], 0.0, [0.0; 3], [0.0, 0.0, 0.5]);
-    let motion = plan([("skin", stays()), ("ball", Motion::Rigid(push))]);
-    for method in [Method::Cholesky, Method::Pcg] {
-        let found = solve(&tensors, &bounds, unilateral(method), &motion, None).unwrap();
-        assert_signorini(&format!("{method:?}"), &found);
-        for (i, &node) in found.contact.nodes.iter().enumerate() {
-            let z = mesh.nodes()[node as usize][2];
-            let held = found.contact.active[i];
-            assert!(held == (z > 0.0) || z.abs() < 6.0, "{method:?}: node at z {z}: {held}");
-        }
-    }
-}
-
-/// A lid that rises by t takes the block along: no contact force, u = t.
-#[test]
-fn unilateral_block_lifts_off_whole() {
-    let turn = RigidMotion::identity();
-    let (mesh, base, lid) = block(&turn);
-    let slide = sliding("floor", base, &floor(&turn, 7, 0.2), Gap::Uniform(0.0));
-    let bounds = boundary(vec![], vec![joined("lid", lid), slide]);
-    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    let rise = rigid([0.0, 1.0, 0.0], 0.0, [0.0; 3], [0.1, 0.0, 0.7]);
-    let motion = plan([("lid", Motion::Rigid(rise)), ("floor", stays())]);
-    for method in METHODS {
-        let found = solve(&tensors, &bounds, unilateral(method), &motion, None).unwrap();
-        let e = largest_difference(&found.displacements, &vec![[0.1, 0.0, 0.7]; mesh.n_nodes()]);
-        assert!(e <= 1e-7, "{method:?}: {e:e} mm");
-        assert!(found.contact.forces.iter().all(|&f| f == 0.0) && found.contact_gap() == 0.0);
-        assert!(found.contact.gaps.iter().all(|g| (g - 0.7).abs() <= 1e-7));
-    }
-}
-
-/// A node that ends past the border of an open surface has no partner there: an error says which, where
-/// and by how much.
-#[test]
-fn node_past_the_border_is_refused() {
-    let turn = RigidMotion::identity();
-    let (mesh, base, lid) = block(&turn);
-    let small = surface({
-        let (vertices, triangles) = plane(6, 3.0, 0.0);
-        (vertices.iter().map(|v| [v[0] + 2.0, v[1] + 2.0, 0.0]).collect(), triangles)
-    });
-    // The floor reaches from −1 to 5 on both axes, as far as the block: it fits at rest …
-    let slide = sliding("floor", base, &small, Gap::Uniform(0.0));
-    let bounds = boundary(vec![], vec![joined("lid", lid), slide]);
-    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    let options = with_method(Method::Cholesky);
-    solve(&tensors, &bounds, options, &plan([("lid", stays()), ("floor", stays())]), None).unwrap();
-    // … and no longer when the floor withdraws by 3 mm.
-    let away = rigid([0.0, 0.0, 1.0], 0.0, [0.0; 3], [-3.0, 0.0, 0.0]);
-    let motion = plan([("lid", stays()), ("floor", Motion::Rigid(away))]);
-    let error = solve(&tensors, &bounds, options, &motion, None).unwrap_err();
-    let MtmError::ContactSurface { segment, problem } = &error else { panic!("{error}") };
-    assert_eq!(segment, "floor");
-    assert!(problem.contains("node ") && problem.contains("past its border"), "{problem}");
-    assert_eq!(error.kind(), ErrorKind::Contact);
-}
-
-fn inside_out((vertices, triangles): meshes::Triangles) -> Arc<Surface> {
-    surface((vertices, triangles.into_iter().map(|[a, b, c]| [a, c, b]).collect()))
-}
-
-/// Normals point out of the bone; a surface turned inside out would pull where it should push.
-#[test]
-fn inverted_contact_surface_is_refused() {
-    let shape = ShellShape { levels: 1, layers: 2, inner: 10.0, outer: 16.0 };
-    let tensors_ = tensors(&shape.mesh(), &isotropic(0.01, POISSON));
-    let ball = inside_out(sphere(1, 10.0));
-    let slide = sliding("ball", shape.layer(0), &ball, Gap::Uniform(0.0));
-    let bounds = boundary(vec![], vec![joined("skin", shape.layer(2)), slide]);
-    let error = solver(&tensors_, &bounds, with_method(Method::Cholesky)).err().unwrap();
-    assert!(matches!(&error, MtmError::ContactSurface { segment, .. } if segment == "ball"));
-    assert!(error.to_string().contains("42 of 42"), "{error}");
-
-    // An open sheet has no inside: its side matters only where nodes may lift off.
-    let turn = RigidMotion::identity();
-    let (mesh, base, lid) = block(&turn);
-    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    let sheet = inside_out(plane(4, 12.0, 0.0));
-    let slide = sliding("floor", base, &sheet, Gap::Uniform(0.0));
-    let bounds = boundary(vec![], vec![joined("lid", lid), slide]);
-    let error = solver(&tensors, &bounds, unilateral(Method::Cholesky)).err().unwrap();
-    assert!(matches!(&error, MtmError::ContactSurface { segment, .. } if segment == "floor"));
-    assert!(solver(&tensors, &bounds, with_method(Method::Cholesky)).is_ok());
-}
-
-/// A coarse ball under thin layers of tissue: the tets round a sliding node lie mostly beside it and
-/// below, and still the surface faces the tissue.
-#[test]
-fn coarse_convex_contact_surface_faces_the_tissue() {
-    let shape = ShellShape { levels: 0, layers: 8, inner: 10.0, outer: 16.0 };
-    let ball = surface(sphere(0, 10.0));
-    let slide = sliding("ball", shape.layer(0), &ball, Gap::Uniform(0.0));
-    let bounds = boundary(vec![], vec![joined("skin", shape.layer(8)), slide]);
-    let tensors = tensors(&shape.mesh(), &isotropic(0.01, POISSON));
-    assert!(solver(&tensors, &bounds, unilateral(Method::Cholesky)).is_ok());
-}
-
-/// Too few iterations for a surface that keeps turning under its nodes: an error, not a half answer.
-#[test]
-fn contact_that_does_not_settle_is_an_error_with_its_nodes() {
-    let (mesh, bounds, _) = shell(2);
-    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    let contact = ContactOptions { max_iterations: 1, ..near_exact() };
-    for method in METHODS {
-        let options = StaticOptions { contact, ..with_method(method) };
-        let error = solve(&tensors, &bounds, options, &twist(), None).unwrap_err();
-        let MtmError::ContactNotConverged { iterations, nodes, gap, .. } = &error else {
-            panic!("{error}")
-        };
-        assert_eq!(*iterations, 1);
-        assert!(!nodes.is_empty() && nodes.len() <= 10 && *gap > 0.0, "{error}");
-        assert!(nodes.iter().all(|&j| j < 162), "sliding nodes are the first 162: {nodes:?}");
-        assert!(!error.is_input());
-    }
-}
-
-/// Newton steps that run out within what a face shows give a result that is exact throughout the body, with its
-/// gap, whether or not its steps were solved roughly until then; further away, an error with both figures.
-#[test]
-fn steps_that_run_out_near_a_solution_give_a_result() {
-    let (mesh, bounds, _) = shell(2);
-    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    let limit = 1e-4 * mesh.diagonal();
-    for method in [Method::Cholesky, Method::Pcg] {
-        let exact = solve(&tensors, &bounds, with_method(method), &twist(), None).unwrap();
-        let mut results = 0;
-        for max_iterations in 1..exact.contact_iterations {
-            let contact = ContactOptions { max_iterations, ..near_exact() };
-            let options = StaticOptions { contact, ..with_method(method) };
-            match solve(&tensors, &bounds, options, &twist(), None) {
-                Ok(found) => {
-                    results += 1;
-                    assert!(!found.contact.converged);
-                    assert!(found.contact_gap().max(found.contact.unbalanced) <= limit);
-                    let e = largest_difference(&found.displacements, &exact.displacements);
-                    assert!(e <= 10.0 * limit, "{method:?}, {max_iterations}: {e:e} mm");
-                }
-                Err(MtmError::ContactNotConverged { gap, unbalanced, .. }) => {
-                    assert!(gap.max(unbalanced) > limit, "{method:?}: {gap:e}, {unbalanced:e}");
-                }
-                Err(error) => panic!("{error}"),
-            }
-        }
-        assert!(results > 0, "{method:?}");
-    }
-}
-
-/// Spikes as tall as they are wide under a body pushed across them: whatever comes out is settled or an
-/// error, never a state between.
-#[test]
-fn spiky_contact_surface_settles_or_is_refused() {
-    let turn = RigidMotion::identity();
-    let (mesh, base, lid) = block(&turn);
-    let (vertices, triangles) = plane(24, 12.0, 0.0);
-    let spikes: Vec<[f64; 3]> = vertices
-        .iter()
-        .enumerate()
-        .map(|(i, v)| [v[0], v[1], if i % 2 == 0 { 0.0 } else { -1.0 }])
-        .collect();
-    let spiky = surface((spikes, triangles));
-    let slide = sliding("floor", base.clone(), &spiky, Gap::Uniform(0.0));
-    let bounds = boundary(vec![], vec![joined("lid", lid), slide]);
-    let tensors: Arc<MassTensors> = tensors(&mesh, &isotropic(0.01, POISSON));
-    let shift = rigid([0.0, 0.0, 1.0], 3.0, [2.0, 2.0, 0.0], [0.7, 0.3, -0.4]);
-    let motion = plan([("lid", Motion::Rigid(shift)), ("floor", stays())]);
-    for options in [with_method(Method::Cholesky), unilateral(Method::Cholesky)] {
-        match solve(&tensors, &bounds, options, &motion, None) {
-            Ok(found) => {
-                let held = found.contact.nodes.iter().zip(&found.contact.active);
-                let held: Vec<u32> = held.filter(|(_, a)| **a).map(|(&j, _)| j).collect();
-                let off = off_surface(&mesh, &held, &found, &spiky);
-                assert!(
-                    off <= 0.5,
-                    "{off:e} mm off spikes of 1 mm, which are finer than the tissue"
-                );
-                assert!(found.contact.converged && tangential_share(&found) <= 1e-5);
-            }
-            Err(error) => assert!(matches!(error, MtmError::ContactNotConverged { .. }), "{error}"),
-        }
-    }
-}
-
-/// A node amid six joined ones: with cubic symmetry its stiffness is k I, so that it ends at the point
-/// of the contact surface that is closest to where it would float. The mesh and k.
-fn star(
-    centre: Vec3,
-    tensors_of: impl Fn(&Arc<TetMesh>) -> Arc<MassTensors>,
-) -> (Arc<MassTensors>, f64) {
-    let mut nodes: Vec<[f64; 3]> = vec![centre.into()];
-    for axis in 0..3 {
-        for side in [-1.0, 1.0] {
-            let mut x = centre;
-            x[axis] += side;
-            nodes.push(x.into());
-        }
-    }
-    let mut tets = Vec::new();
-    for (x, y, z) in (0..8).map(|i| (1 + (i & 1), 3 + (i >> 1 & 1), 5 + (i >> 2 & 1))) {
-        tets.push(meshes::oriented(&nodes, [0, x, y, z]));
-    }
-    let tensors = tensors_of(&meshes::checked((nodes, tets)));
-    let (columns, blocks) = tensors.matrix().row(0);
-    let own = blocks[columns.iter().position(|&c| c == 0).unwrap()];
-    assert!((own[0] - own[8]).abs() <= 1e-12 * own[0] && own[1].abs() <= 1e-12 * own[0], "{own:?}");
-    (tensors, own[0])
-}
-
-/// Where the star's node ends, its contact force vector, and the stiffness that holds it.
-fn drawn_to(
-    goal: Vec3,
-    wall: &Arc<Surface>,
-    gap: f64,
-    options: StaticOptions,
-) -> (Vec3, Vec3, f64) {
-    let centre = Vec3::new(0.3, 0.1, 1.5);
-    let (tensors, k) = star(centre, |mesh| tensors(mesh, &isotropic(0.01, POISSON)));
-    let slide = sliding("bone", vec![0], wall, Gap::Uniform(gap));
-    let bounds = boundary(vec![], vec![joined("body", (1..7).collect()), slide]);
-    let shift = rigid([0.0, 0.0, 1.0], 0.0, [0.0; 3], (goal - centre).into());
-    let motion = plan([("body", Motion::Rigid(shift)), ("bone", stays())]);
-    let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
-    let c = &found.contact;
-    assert!(found.contact_gap() <= 1e-8, "{:e} mm", found.contact_gap());
-    assert!(found.residual <= 1e-6, "{:e}", found.residual);
-    let end = centre + Vec3::from(found.displacements[0]);
-    (end, Vec3::from(c.normals[0]) * c.forces[0], k)
-}
-
-/// Two planes that meet in a valley along y.
-fn groove(slope: f64) -> Arc<Surface> {
-    let (vertices, triangles) = plane(4, 12.0, 0.0);
-    surface((vertices.iter().map(|v| [v[0], v[1], v[0].abs() * slope]).collect(), triangles))
-}
-
-/// How far a crease is rounded off, mm: about the lattice spacing, half an edge of the star.
-const ROUNDED: f64 = 0.5;
-
-/// A node drawn into a groove rests near its bottom and slides along it: y and the force k (u − t) as if y
-/// were free. Drawn onto one wall, away from the crease, it is held by that wall exactly.
-#[test]
-fn node_in_a_groove_rests_near_its_bottom() {
-    let angle = 40.0_f64.to_radians();
-    let wall = groove(angle.tan());
-    for method in METHODS {
-        for options in [with_method(method), unilateral(method)] {
-            let goal = Vec3::new(0.1, 0.7, -1.0);
-            let (end, force, k) = drawn_to(goal, &wall, 0.0, options);
-            assert!(end.x.abs() <= ROUNDED && (end.y - 0.7).abs() <= 1e-7, "{options:?}: {end}");
-            assert!((-0.1..=ROUNDED).contains(&end.z), "{options:?}: {end}");
-            assert!((force - (end - goal) * k).norm() <= 1e-6 * k, "{options:?}: {force}");
-
-            let goal = Vec3::new(4.0, 0.7, 1.0);
-            let n = Vec3::new(-angle.sin(), 0.0, angle.cos());
-            let exact = goal - n * n.dot(&goal);
-            let (end, force, k) = drawn_to(goal, &wall, 0.0, options);
-            assert!((end - exact).norm() <= 1e-7, "{options:?}: {end}");
-            assert!((force - (exact - goal) * k).norm() <= 1e-7 * k, "{options:?}: {force}");
-        }
-        // A node that may lift off is not held where it floats above both walls.
-        let goal = Vec3::new(0.1, 0.7, 1.5);
-        let (end, force, _) = drawn_to(goal, &wall, 0.0, unilateral(method));
-        assert!(force.norm() == 0.0 && (end - goal).norm() <= 1e-7, "{end}");
-    }
-}
-
-/// Bone far thinner than the tissue resolves, here a ball of a tenth of an edge across: the node slides on the plane
-/// through the place where it touches, as far as it is drawn. The field of such bone is a bowl with no direction, and
-/// steps on it used to run out.
-#[test]
-fn node_on_a_speck_of_bone_slides_on_its_tangent_plane() {
-    let (speck, triangles) = meshes::sphere(2, 0.05);
-    let speck: Vec<[f64; 3]> =
-        speck.iter().map(|v| [v[0] + 0.3, v[1] + 0.1, v[2] + 1.45]).collect();
-    let speck = surface((speck, triangles));
-    let touched = Vec3::new(0.3, 0.1, 1.5);
-    for method in METHODS {
-        for goal in [Vec3::new(0.9, -0.3, 0.7), Vec3::new(-0.5, 0.6, 2.1)] {
-            let (end, force, k) = drawn_to(goal, &speck, 0.0, with_method(method));
-            let n = force.normalize();
-            assert!(n.z.abs() >= 0.97, "the normal of the ball's top: {n}");
-            let exact = goal - n * n.dot(&(goal - touched));
-            // The facets lie a little below the ball's top, and the node at its gap of zero on them.
-            assert!((end - exact).norm() <= 0.01, "{method:?}: {end} for {exact}");
-            assert!((force - (end - goal) * k).norm() <= 1e-6 * k, "{method:?}: {force}");
-        }
-    }
-}
-
-/// Three walls that carry a block about, and nothing else: it is not strained, and its residual is rounding
-/// over what the walls' way would cost each node alone, though no force acts in the end.
-#[test]
-fn block_that_walls_alone_carry_has_a_residual_of_rounding() {
-    let shape = BoxShape::cube(3);
-    let segments = [0, 1, 2].map(|axis| {
-        let (mut vertices, triangles) = plane(4, 6.0, 0.0);
-        for v in &mut vertices {
-            v.rotate_right((axis + 1) % 3);
-        }
-        // A node of two walls would be held by both: each edge goes to the first of its walls.
-        let own = |p: [usize; 3]| p[axis] == 0 && p[..axis].iter().all(|&i| i > 0);
-        let wall = surface((vertices, triangles));
-        sliding(["x", "y", "z"][axis], shape.nodes_where(own), &wall, Gap::Uniform(0.0))
-    });
-    let tensors = tensors(&shape.mesh(), &isotropic(0.01, POISSON));
-    let way = rigid([0.0, 0.0, 1.0], 0.0, [0.0; 3], [0.3, -0.2, 0.5]);
-    let motion = plan(["x", "y", "z"].map(|name| (name, Motion::Rigid(way))));
-    let bounds = boundary(vec![], segments.to_vec());
-    let found = solve(&tensors, &bounds, with_method(Method::Cholesky), &motion, None).unwrap();
-    let away = vec![[0.3, -0.2, 0.5]; found.displacements.len()];
-    assert!(largest_difference(&found.displacements, &away) <= 1e-9);
-    assert!(found.contact.forces.iter().all(|f| f.abs() <= 1e-9));
-    assert!(found.residual <= 1e-9, "{:e}", found.residual);
-}
-
-/// Three walls that meet in a pit: a node drawn into it rests near the corner, whatever the direction.
-#[test]
-fn node_in_a_corner_rests_near_it() {
-    let angle = 45.0_f64.to_radians();
-    let mut vertices = vec![[0.0; 3]];
-    for k in 0..3 {
-        let turn = f64::from(k) * 120.0_f64.to_radians();
-        vertices.push([12.0 * turn.cos(), 12.0 * turn.sin(), 6.0 * angle.tan()]);
-    }
-    let pit = surface((vertices, vec![[0, 1, 2], [0, 2, 3], [0, 3, 1]]));
-    for method in METHODS {
-        for options in [with_method(method), unilateral(method)] {
-            let goal = Vec3::new(0.05, -0.08, -1.0);
-            let (end, force, k) = drawn_to(goal, &pit, 0.0, options);
-            assert!(end.norm() <= 1.5 * ROUNDED, "{options:?}: {end}");
-            assert!((force - (end - goal) * k).norm() <= 1e-6 * k, "{options:?}: {force}");
-        }
-    }
-}
-
-/// A block pressed on a row of sharp teeth and pushed across them, each node at its distance at rest.
-fn on_teeth() -> (Arc<TetMesh>, Arc<Boundary>, Arc<Surface>, Plan) {
-    let (mesh, base, lid) = block(&RigidMotion::identity());
-    let (vertices, triangles) = plane(12, 12.0, 0.0);
-    let height = |x: f64| if (x / 2.0).round() as i64 % 2 == 0 { -1.5 } else { 0.0 };
-    let teeth: Vec<[f64; 3]> = vertices.iter().map(|v| [v[0], v[1], height(v[0])]).collect();
-    let row = surface((teeth, triangles));
-    let at_rest: Vec<[f64; 3]> = base.iter().map(|&j| mesh.nodes()[j as usize]).collect();
-    let gaps = row.closest(&at_rest).iter().map(|c| c.signed_distance).collect();
-    let slide = sliding("teeth", base, &row, Gap::PerNode(gaps));
-    let bounds = boundary(vec![], vec![joined("lid", lid), slide]);
-    let shift = rigid([0.0, 0.0, 1.0], 2.0, [2.0, 2.0, 0.0], [0.4, 0.2, -0.6]);
-    (mesh, bounds, row, plan([("lid", Motion::Rigid(shift)), ("teeth", stays())]))
-}
-
-/// Tissue on a row of teeth converges, with nodes in the valleys, and all ways of solving agree.
-#[test]
-fn tissue_on_a_row_of_teeth_converges_with_nodes_in_the_valleys() {
-    let (mesh, bounds, _, motion) = on_teeth();
-    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    let mut answers: Vec<Solution> = Vec::new();
-    for method in [Method::Cholesky, Method::Pcg] {
-        let found = solve(&tensors, &bounds, with_method(method), &motion, None).unwrap();
-        assert!(found.contact_gap() <= 1e-6, "{method:?}: {:e} mm", found.contact_gap());
-        assert!(found.residual <= 1e-6 && tangential_share(&found) <= 1e-6);
-        answers.push(found);
-    }
-    let e = largest_difference(&answers[0].displacements, &answers[1].displacements);
-    assert!(e <= 1e-6, "{e:e} mm");
-    let found = solve(&tensors, &bounds, unilateral(Method::Cholesky), &motion, None).unwrap();
-    assert_signorini("teeth", &found);
-}
-
-/// The same bits for any number of threads, with nodes in creases.
-#[test]
-fn creases_do_not_depend_on_the_number_of_threads() {
-    let (mesh, bounds, _, motion) = on_teeth();
-    let answers: Vec<Vec<u64>> = [1, 2, 3]
-        .map(|threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| {
-                let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-                let options = with_method(Method::Cholesky);
-                let found = solve(&tensors, &bounds, options, &motion, None).unwrap();
-                meshes::bits(&found.displacements)
-            })
-        })
-        .into();
-    assert!(answers[0] == answers[1] && answers[0] == answers[2]);
-}
-
-/// The plan operator keeps the walls of its reference: there it equals the solution.
-#[test]
-fn plan_operator_equals_the_solution_in_creases() {
-    let (mesh, bounds, _, motion) = on_teeth();
-    let tensors = tensors(&mesh, &isotropic(0.01, POISSON));
-    for method in [Method::Cholesky, Method::Pcg] {
-        let solver = solver(&tensors, &bounds, with_method(method)).unwrap();
-        let found = solver.solve(&motion, None, GO_ON).unwrap();
-        let operator = solver.plan_operator(None, Some(&motion), GO_ON).unwrap();
-        let e = largest_difference(&operator.apply(&motion).unwrap(), &found.displacements);
-        assert!(e <= 1e-6, "{method:?}: {e:e} mm");
-    }
 }
 
 /// A node exactly on its surface at rest is off it by rounding after a turn, in no direction that means

@@ -4,18 +4,17 @@ use std::collections::HashMap;
 use std::f64::consts::PI;
 
 use mtm_core::{
-    Closest, ErrorKind, Feature, MtmError, RigidMotion, Surface, SurfaceMotion, WindingOptions,
-    WindingTree, winding_number_exact,
+    Closest, ErrorKind, Feature, MtmError, Surface, SurfaceMotion, WindingOptions, WindingTree,
 };
-use nalgebra::{Matrix4, Rotation3, Vector3};
+use nalgebra::Vector3;
 
-type Vec3 = Vector3<f64>;
+pub(super) type Vec3 = Vector3<f64>;
 
 /// Deterministic numbers in −1 to 1 (SplitMix64).
-struct Numbers(u64);
+pub(super) struct Numbers(pub(super) u64);
 
 impl Numbers {
-    fn next(&mut self) -> f64 {
+    pub(super) fn next(&mut self) -> f64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -23,13 +22,13 @@ impl Numbers {
         ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
     }
 
-    fn points(&mut self, n: usize, scale: f64) -> Vec<[f64; 3]> {
+    pub(super) fn points(&mut self, n: usize, scale: f64) -> Vec<[f64; 3]> {
         (0..n).map(|_| [0; 3].map(|_| scale * self.next())).collect()
     }
 }
 
 /// Unit sphere: an icosahedron with each triangle split in four `levels` times.
-fn icosphere(levels: usize) -> (Vec<[f64; 3]>, Vec<[u32; 3]>) {
+pub(super) fn icosphere(levels: usize) -> (Vec<[f64; 3]>, Vec<[u32; 3]>) {
     let g = (1.0 + 5.0_f64.sqrt()) / 2.0;
     let mut vertices: Vec<[f64; 3]> = vec![
         [-1.0, g, 0.0],
@@ -87,7 +86,7 @@ fn icosphere(levels: usize) -> (Vec<[f64; 3]>, Vec<[u32; 3]>) {
     (vertices, triangles)
 }
 
-fn sphere(levels: usize) -> Surface {
+pub(super) fn sphere(levels: usize) -> Surface {
     let (vertices, triangles) = icosphere(levels);
     Surface::new(vertices, triangles).unwrap()
 }
@@ -109,7 +108,7 @@ fn cube(diagonals: u32) -> (Vec<[f64; 3]>, Vec<[u32; 3]>) {
 }
 
 /// n × n squares of the plane z = 0 from 0 to 1, normals up.
-fn plane(n: u32) -> (Vec<[f64; 3]>, Vec<[u32; 3]>) {
+pub(super) fn plane(n: u32) -> (Vec<[f64; 3]>, Vec<[u32; 3]>) {
     let at = |i: u32, j: u32| i * (n + 1) + j;
     let mut vertices = Vec::new();
     let mut triangles = Vec::new();
@@ -145,15 +144,7 @@ fn brute_force_distance(surface: &Surface, p: Vec3) -> f64 {
     best
 }
 
-fn rigid(axis: [f64; 3], angle: f64, t: [f64; 3]) -> [[f64; 4]; 4] {
-    let r = Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(Vec3::from(axis)), angle);
-    let mut m = Matrix4::identity();
-    m.fixed_view_mut::<3, 3>(0, 0).copy_from(r.matrix());
-    m.fixed_view_mut::<3, 1>(0, 3).copy_from(&Vec3::from(t));
-    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
-}
-
-fn gap(a: [f64; 3], b: [f64; 3]) -> f64 {
+pub(super) fn gap(a: [f64; 3], b: [f64; 3]) -> f64 {
     (Vec3::from(a) - Vec3::from(b)).norm()
 }
 
@@ -387,20 +378,6 @@ fn moved_surface_equals_one_built_afresh() {
 }
 
 #[test]
-fn transformed_surface_follows_a_rigid_motion() {
-    let rest = sphere(3);
-    let matrix = rigid([1.0, 2.0, 0.5], 1.1, [30.0, -4.0, 7.0]);
-    let motion = RigidMotion::new("maxilla", &matrix).unwrap();
-    let moved = rest.transformed(&matrix).unwrap();
-    for p in Numbers(8).points(500, 2.0) {
-        let (before, after) = (rest.closest_one(p), moved.closest_one(motion.apply(p)));
-        assert!(gap(after.point, motion.apply(before.point)) < 1e-13);
-        assert!(gap(after.normal, motion.rotate(before.normal)) < 1e-12);
-    }
-    assert!((moved.volume().unwrap() - rest.volume().unwrap()).abs() < 1e-12);
-}
-
-#[test]
 fn creases_stay_where_the_rest_shape_has_them() {
     // Two squares in a plane folded up by 80°: a fresh surface has a crease there, the moved one has not.
     let flat =
@@ -414,67 +391,6 @@ fn creases_stay_where_the_rest_shape_has_them() {
     let (left, right) = ([0.0, 0.5, 0.5], [0.5, 0.0, 0.5]);
     assert!(gap(moved.normal_at(0, left), moved.normal_at(3, right)) < 1e-13);
     assert!(gap(fresh.normal_at(0, left), fresh.normal_at(3, right)) > 1.0);
-}
-
-#[test]
-fn winding_number_tells_inside_from_outside() {
-    let surface = sphere(4);
-    let tree = WindingTree::new(&surface);
-    for p in Numbers(9).points(2000, 1.5) {
-        let r = Vec3::from(p).norm();
-        let expected = if r < 0.997 { 1.0 } else { 0.0 };
-        if !(0.997..=1.0).contains(&r) {
-            let found = tree.winding_number_one(p);
-            assert!((found - expected).abs() < 1e-2, "{p:?}: {found}");
-        }
-    }
-}
-
-#[test]
-fn winding_number_survives_a_hole_and_a_flipped_triangle() {
-    let (vertices, mut triangles) = icosphere(3);
-    triangles.drain(0..20);
-    triangles[500].swap(0, 1);
-    let surface = Surface::new(vertices, triangles).unwrap();
-    let tree = WindingTree::new(&surface);
-    let points: Vec<[f64; 3]> = Numbers(10).points(1000, 1.5);
-    for (p, found) in points.iter().zip(tree.winding_number(&points)) {
-        let r = Vec3::from(*p).norm();
-        if !(0.8..1.2).contains(&r) {
-            assert_eq!(found > 0.5, r < 1.0, "{p:?}: {found}");
-        }
-    }
-}
-
-#[test]
-fn hierarchical_winding_number_is_close_to_the_exact_sum() {
-    let surface = sphere(4);
-    let mut points = Numbers(11).points(500, 1.2);
-    points.extend(surface.vertices().iter().take(200).map(|v| v.map(|x| x * 0.98)));
-    let exact = winding_number_exact(&surface, &points);
-    let worst = |beta: f64| {
-        let tree = WindingTree::with_options(&surface, &WindingOptions { beta }).unwrap();
-        let found = tree.winding_number(&points);
-        assert!(found.iter().chain(&exact).all(|w| w.is_finite()));
-        found.iter().zip(&exact).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
-    };
-    let errors = [2.0, 4.0, 1e9].map(worst);
-    assert!(errors[0] < 1e-2 && errors[1] < 0.2 * errors[0] && errors[2] < 1e-13, "{errors:?}");
-}
-
-#[test]
-fn winding_number_counts_overlaps_and_is_finite_on_the_surface() {
-    let (mut vertices, mut triangles) = icosphere(2);
-    let n = vertices.len() as u32;
-    vertices.extend(vertices.clone().iter().map(|v| [v[0] + 0.5, v[1], v[2]]));
-    triangles.extend(triangles.clone().iter().map(|t| t.map(|v| v + n)));
-    let surface = Surface::new(vertices.clone(), triangles).unwrap();
-    let tree = WindingTree::new(&surface);
-    assert!((tree.winding_number_one([0.25, 0.0, 0.0]) - 2.0).abs() < 1e-2);
-    assert!(tree.winding_number(&vertices).iter().all(|w| w.is_finite()));
-    let far = [1e6, -2e6, 3e5];
-    let (found, exact) = (tree.winding_number_one(far), winding_number_exact(&surface, &[far])[0]);
-    assert!(found.abs() < 1e-12 && exact.abs() < 1e-12, "{found} {exact}");
 }
 
 #[test]
@@ -494,80 +410,6 @@ fn results_do_not_depend_on_the_number_of_threads() {
         })
     };
     assert_eq!(run(1), run(2));
-}
-
-#[test]
-fn surface_motion_follows_a_rigid_motion_on_and_off_the_surface() {
-    let rest = sphere(2);
-    for angle in [0.0, PI / 2.0, PI, 3.0] {
-        let motion =
-            RigidMotion::new("mandible", &rigid([0.2, -1.0, 0.4], angle, [9.0, 1.0, -3.0]))
-                .unwrap();
-        let moved = rest.vertices().iter().map(|&v| motion.apply(v)).collect();
-        let followed = SurfaceMotion::new(rest.clone(), moved).unwrap();
-        let points = Numbers(13).points(500, 3.0);
-        for (p, u) in points.iter().zip(followed.displacement(&points)) {
-            assert!(gap(u, motion.displacement(*p)) < 1e-12, "{angle} {p:?}");
-        }
-    }
-}
-
-#[test]
-fn surface_motion_turns_by_the_polar_factor_and_moves_vertices_exactly() {
-    let rest =
-        Surface::new(vec![[0.0; 3], [2.0, 0.1, 0.0], [0.3, 1.0, 0.2]], vec![[0, 1, 2]]).unwrap();
-    let target = vec![[1.0, 0.0, 0.0], [1.5, 2.0, 0.7], [-0.4, 1.0, 1.2]];
-    let motion = SurfaceMotion::new(rest.clone(), target.clone()).unwrap();
-    for (u, k) in motion.displacement(rest.vertices()).iter().zip(0..) {
-        let expected = Vec3::from(target[k]) - Vec3::from(rest.vertices()[k]);
-        assert!((Vec3::from(*u) - expected).norm() < 1e-13);
-    }
-    let frame = |surface: &Surface| {
-        let [a, b, c] = [0, 1, 2].map(|k| Vec3::from(surface.vertices()[k]));
-        nalgebra::Matrix3::from_columns(&[b - a, c - a, surface.facet_normals()[0].into()])
-    };
-    let map = frame(motion.moved()) * frame(&rest).try_inverse().unwrap();
-    let svd = map.svd(true, true);
-    let polar = svd.u.unwrap() * svd.v_t.unwrap();
-    let above = |surface: &Surface, at: Vec3| at + Vec3::from(surface.facet_normals()[0]) * 0.5;
-    let centre = |surface: &Surface| {
-        surface.vertices().iter().fold(Vec3::zeros(), |sum, &v| sum + Vec3::from(v)) / 3.0
-    };
-    let u = motion.displacement(&[above(&rest, centre(&rest)).into()])[0];
-    let expected = above(motion.moved(), centre(motion.moved())) - above(&rest, centre(&rest));
-    assert!((Vec3::from(u) - expected).norm() < 1e-14);
-    // Beyond the corner the offset has a part in the plane, which the polar factor turns.
-    let offset = Vec3::new(-0.5, -0.4, 0.3);
-    let u = motion.displacement(&[offset.into()])[0];
-    let expected = Vec3::from(target[0]) + polar * offset - offset;
-    assert!((Vec3::from(u) - expected).norm() < 1e-14);
-}
-
-#[test]
-fn rigid_motion_refuses_what_is_not_one() {
-    let problem = |matrix: [[f64; 4]; 4]| match RigidMotion::new("chin", &matrix) {
-        Err(MtmError::Plan { segment, problem }) if segment == "chin" => problem,
-        other => panic!("{other:?}"),
-    };
-    let good = rigid([1.0, 0.0, 1.0], 0.3, [1.0, 2.0, 3.0]);
-    assert!(RigidMotion::new("chin", &good).is_ok());
-    let mut bad = good;
-    bad[1][3] = f64::NAN;
-    assert!(problem(bad).contains("[1][3]"));
-    let transposed = std::array::from_fn(|i| std::array::from_fn(|j| good[j][i]));
-    assert!(problem(transposed).contains("transpose"));
-    let mut bad = good;
-    bad[0][..3].iter_mut().for_each(|entry| *entry *= -1.0);
-    assert!(problem(bad).contains("reflection"));
-    for scale in [1.0 + 1.1e-4, 0.0, 1e200] {
-        let mut bad = good;
-        bad[..3].iter_mut().for_each(|row| row[..3].iter_mut().for_each(|entry| *entry *= scale));
-        assert!(problem(bad).contains("not rigid"), "{scale}");
-    }
-    let mut rounded = good;
-    rounded[..3].iter_mut().for_each(|row| row[0] = (row[0] * 1e7).round() / 1e7);
-    assert_ne!(RigidMotion::new("chin", &rounded).unwrap().matrix(), &rounded);
-    assert_eq!(RigidMotion::identity().displacement([5.0, -6.0, 7.0]), [0.0; 3]);
 }
 
 #[test]
