@@ -17,8 +17,7 @@ from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import carried
-from cmfsim.values.renumbering import used_nodes
-from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData, used_nodes
 
 # An edge is torn if its ends move apart by more than this, mm, and by more than this share of its
 # length: noise of 0.3 mm per vertex does the first to one edge in 10 000, and a turn of 15° the

@@ -1,22 +1,20 @@
 """The options of the command line."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
-from cmfsim.cli.band_options import add_band_options
+from cmfsim.cli.options import add_band_options, file, number, switch, whole
 from cmfsim.cli.patients import (
     case_commands,
     demo_command,
-    init_command,
     landmarks_command,
     plan_command,
     scene_commands,
     template_commands,
     view_command,
 )
-from cmfsim.cli.research import bench_command, phantom_command, study_commands
+from cmfsim.cli.research import bench_command, population_commands, study_commands
 from cmfsim.cli.research.population_commands import add_population_commands
 from cmfsim.io import result_suffixes
 from cmfsim.lab.frontier import EDGES, FACTORS
@@ -46,12 +44,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"cmfsim {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument(
-        "--json", action="store_true", help="print the result, or the error, as a JSON object"
-    )
-    common.add_argument(
-        "-q", "--quiet", action="store_true", help="print only warnings and errors, no progress"
-    )
+    switch(common, "--json", "print the result, or the error, as a JSON object")
+    switch(common, "-q --quiet", "print only warnings and errors, no progress")
     _add_case_commands(commands, common)
     _add_scene_commands(commands, common)
     _add_template_commands(commands, common)
@@ -62,9 +56,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     named = argparse.ArgumentParser(add_help=False, parents=[common])
-    named.add_argument(
-        "case", metavar="CASE", type=Path, help="case.toml, or the folder that contains it"
-    )
+    file(named, "case", "CASE", "case.toml, or the folder that contains it")
 
     _add_demo(commands, common)
     _add_init(commands, common)
@@ -81,13 +73,9 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     _add_landmarks(commands, named)
 
     changed = argparse.ArgumentParser(add_help=False, parents=[named])
-    changed.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, help="output folder (default: that of the case)"
-    )
-    changed.add_argument(
-        "--edge-length", metavar="H", type=float, help="tet edges, mm (default: those of the case)"
-    )
-    changed.add_argument("--no-doctor", action="store_true", help="skip the checks of the case")
+    file(changed, "-o --output", "OUT", "output folder (default: that of the case)")
+    number(changed, "--edge-length", "H", "tet edges, mm (default: those of the case)")
+    switch(changed, "--no-doctor", "skip the checks of the case")
 
     build = commands.add_parser(
         "build", parents=[changed], help="build the scene of a case from its images"
@@ -103,18 +91,16 @@ def _add_demo(commands: Any, common: argparse.ArgumentParser) -> None:
     demo = commands.add_parser(
         "demo", parents=[common], help="predict the face of a built-in case, and open the report"
     )
-    demo.add_argument(
+    file(
+        demo,
         "folder",
-        metavar="FOLDER",
-        type=Path,
+        "FOLDER",
+        f"new, empty or from an earlier demo (default {demo_command.DEMO_FOLDER})",
         nargs="?",
         default=demo_command.DEMO_FOLDER,
-        help=f"new, empty or from an earlier demo (default {demo_command.DEMO_FOLDER})",
     )
-    demo.add_argument(
-        "--edge-length", metavar="H", type=float, default=6.0, help="tet edges, mm (default 6)"
-    )
-    demo.add_argument("--no-open", action="store_true", help="do not open the report")
+    number(demo, "--edge-length", "H", "tet edges, mm (default 6)", default=6.0)
+    switch(demo, "--no-open", "do not open the report")
     demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)
 
 
@@ -125,10 +111,8 @@ def _add_init(commands: Any, common: argparse.ArgumentParser) -> None:
         help="write a commented case.toml for the files in a folder, or for a 3D Slicer scene",
         epilog="Anything unclear is written as a line with a question mark, which doctor rejects.",
     )
-    init.add_argument(
-        "folder", metavar="FOLDER", type=Path, help="folder, or 3D Slicer scene (.mrml, .mrb)"
-    )
-    init.add_argument("--force", action="store_true", help="replace an existing case.toml")
+    file(init, "folder", "FOLDER", "folder, or 3D Slicer scene (.mrml, .mrb)")
+    switch(init, "--force", "replace an existing case.toml")
     init.add_argument(
         "--cut",
         action="append",
@@ -146,27 +130,25 @@ def _add_init(commands: Any, common: argparse.ArgumentParser) -> None:
         "backwards, up, down, left, right in mm; pitch (front up), yaw (front to the left), roll "
         "(left side up) in degrees, about the teeth or the chin. Again for another segment",
     )
-    init.set_defaults(run=init_command.init)
+    init.set_defaults(run=case_commands.init)
 
 
 def _add_view(commands: Any, common: argparse.ArgumentParser) -> None:
     view = commands.add_parser(
         "view", parents=[common], help="display a prediction, model, scene, result or surface"
     )
-    view.add_argument(
+    file(
+        view,
         "path",
-        metavar="FOLDER_OR_FILE",
-        type=Path,
-        help="folder written by predict, build or demo; case.toml, scene, result or surface",
+        "FOLDER_OR_FILE",
+        "folder written by predict, build or demo; case.toml, scene, result or surface",
     )
     view.add_argument(
         "--model",
         choices=MODELS,
         help="which of several predictions (default: the last of H, M, H+S, M+S)",
     )
-    view.add_argument(
-        "--screenshot", metavar="PNG", type=Path, help="write a picture instead of opening a window"
-    )
+    file(view, "--screenshot", "PNG", "write a picture instead of opening a window")
     view.set_defaults(run=view_command.view)
 
 
@@ -174,17 +156,10 @@ def _add_phantom(commands: Any, common: argparse.ArgumentParser) -> None:
     phantom = commands.add_parser(
         "phantom", parents=[common], help="write the case of a synthetic head"
     )
-    phantom.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
-    phantom.add_argument(
-        "--person",
-        metavar="N",
-        type=int,
-        help="number of the person; each N gives a different head",
-    )
-    phantom.add_argument(
-        "--spacing", metavar="MM", type=float, default=1.0, help="CT voxel size (default 1)"
-    )
-    phantom.set_defaults(run=phantom_command.phantom)
+    file(phantom, "folder", "FOLDER", "output folder")
+    whole(phantom, "--person", "N", "number of the person; each N gives a different head")
+    number(phantom, "--spacing", "MM", "CT voxel size (default 1)", default=1.0)
+    phantom.set_defaults(run=population_commands.phantom)
 
 
 def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:
@@ -203,43 +178,31 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
         "(docs/evaluation.md). Errors of each patient, region and variant, and their changes, are "
         "written to variants.csv, variants.md, variants.json and report.html.",
     )
-    study.add_argument(
-        "cohort", metavar="COHORT", type=Path, help="cohort.toml, or a folder of cases"
-    )
-    study.add_argument(
-        "--workers", metavar="N", type=int, help="number of cases processed at a time"
-    )
+    file(study, "cohort", "COHORT", "cohort.toml, or a folder of cases")
+    whole(study, "--workers", "N", "number of cases processed at a time")
     study.add_argument(
         "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
     )
-    study.add_argument("--fresh", action="store_true", help="repeat finished cases")
+    switch(study, "--fresh", "repeat finished cases")
     study.add_argument(
         "--model",
         **MODEL_CHOICES,
         help="H, M, H+S, M+S or all; may be repeated (default: those of the cohort)",
     )
-    study.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        type=Path,
-        help="output folder (default: that of the cohort)",
-    )
-    study.add_argument(
+    file(study, "-o --output", "OUT", "output folder (default: that of the cohort)")
+    file(
+        study,
         "--variants",
-        metavar="FILE",
-        type=Path,
-        help="compare named changes of any keys of a case file with the cases as given",
+        "FILE",
+        "compare named changes of any keys of a case file with the cases as given",
     )
     study.set_defaults(run=study_commands.study)
 
     report = commands.add_parser(
         "report", parents=[common], help="regenerate the report of a results folder"
     )
-    report.add_argument("folder", metavar="FOLDER", type=Path, help="folder written by predict")
-    report.add_argument(
-        "--pdf", action="store_true", help="also write report.pdf, one page for the chart"
-    )
+    file(report, "folder", "FOLDER", "folder written by predict")
+    switch(report, "--pdf", "also write report.pdf, one page for the chart")
     report.set_defaults(run=study_commands.report)
 
 
@@ -253,9 +216,7 @@ def _add_predict(commands: Any, changed: argparse.ArgumentParser) -> None:
         help="H (homogeneous), M (muscles), H+S or M+S (with sliding), or all; may be repeated "
         "(default M+S)",
     )
-    predict.add_argument(
-        "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
-    )
+    file(predict, "--plan", "PLAN", "plan.toml to use instead of the case's plan")
     add_band_options(predict)
     _add_output_options(predict)
     predict.set_defaults(run=study_commands.predict)
@@ -269,36 +230,36 @@ def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
         epilog="The page is a single file that needs neither a server nor a network.",
     )
     plan.add_argument("--model", choices=MODELS, default="M+S", help="model (default M+S)")
-    plan.add_argument(
+    whole(
+        plan,
         "--trials",
-        metavar="N",
-        type=int,
+        "N",
+        f"exact solutions for measuring the error of the page (default {TRIALS})",
         default=TRIALS,
-        help=f"exact solutions for measuring the error of the page (default {TRIALS})",
     )
-    plan.add_argument(
+    whole(
+        plan,
         "--corrections",
-        metavar="N",
-        type=int,
-        default=CORRECTIONS,
-        help="exact solutions for correcting the face at plans other than the case's, if tissue "
+        "N",
+        "exact solutions for correcting the face at plans other than the case's, if tissue "
         f"slides; 0 for none (default {CORRECTIONS})",
+        default=CORRECTIONS,
     )
-    plan.add_argument(
+    file(
+        plan,
         "--towards",
-        metavar="FILE",
-        type=Path,
-        help="find the plan whose face is closest to a surface, or to named skin landmarks",
+        "FILE",
+        "find the plan whose face is closest to a surface, or to named skin landmarks",
     )
-    plan.add_argument(
+    switch(
+        plan,
         "--keep-bite",
-        action="store_true",
-        help="with --towards: keep the mandible in its planned position relative to the maxilla",
+        "with --towards: keep the mandible in its planned position relative to the maxilla",
     )
-    plan.add_argument(
+    switch(
+        plan,
         "--serve",
-        action="store_true",
-        help="solve plans exactly while the page is open, on this machine only, until Ctrl-C",
+        "solve plans exactly while the page is open, on this machine only, until Ctrl-C",
     )
     add_band_options(plan)
     plan.add_argument(
@@ -308,7 +269,7 @@ def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
         default=0,
         help="port from 1024 to 65535 (default: a free one)",
     )
-    plan.add_argument("--no-open", action="store_true", help="do not open the page")
+    switch(plan, "--no-open", "do not open the page")
     plan.set_defaults(run=plan_command.plan)
 
 
@@ -327,10 +288,10 @@ def _add_evaluate(commands: Any, changed: argparse.ArgumentParser) -> None:
         help="predict the face, and compare it with the post-operative face",
     )
     evaluate.add_argument("--model", **MODEL_CHOICES, help="as in predict (default all)")
-    evaluate.add_argument(
+    switch(
+        evaluate,
         "--fit-thickness",
-        action="store_true",
-        help="fit one change of thickness (swelling, weight) where nothing was operated on, and "
+        "fit one change of thickness (swelling, weight) where nothing was operated on, and "
         "also report the errors with this change",
     )
     _add_output_options(evaluate)
@@ -339,10 +300,8 @@ def _add_evaluate(commands: Any, changed: argparse.ArgumentParser) -> None:
 
 def _add_output_options(command: argparse.ArgumentParser) -> None:
     """Which files `predict` and `evaluate` write."""
-    command.add_argument("--no-report", action="store_true", help="do not write report.html")
-    command.add_argument(
-        "--slicer", action="store_true", help="also write prediction.mrb for 3D Slicer"
-    )
+    switch(command, "--no-report", "do not write report.html")
+    switch(command, "--slicer", "also write prediction.mrb for 3D Slicer")
 
 
 def _add_sensitivity(commands: Any, changed: argparse.ArgumentParser) -> None:
@@ -352,47 +311,41 @@ def _add_sensitivity(commands: Any, changed: argparse.ArgumentParser) -> None:
     sensitivity.add_argument(
         "--model", choices=("M", "M+S"), default="M+S", help="model (default M+S)"
     )
-    sensitivity.add_argument("--trials", metavar="N", type=int, default=3, help="(default 3)")
-    sensitivity.add_argument(
+    whole(sensitivity, "--trials", "N", "(default 3)", default=3)
+    number(
+        sensitivity,
         "--std",
-        metavar="MM",
-        type=float,
+        "MM",
+        "standard deviation of a landmark along each axis (default 2)",
         default=2.0,
-        help="standard deviation of a landmark along each axis (default 2)",
     )
     sensitivity.add_argument("--seed", type=int, default=0, help="random seed (default 0)")
-    sensitivity.add_argument(
+    file(
+        sensitivity,
         "--landmarks",
-        metavar="FILE",
-        type=Path,
+        "FILE",
+        "landmarks placed again by hand, one file per trial, instead of random ones",
         action="append",
-        help="landmarks placed again by hand, one file per trial, instead of random ones",
     )
     sensitivity.set_defaults(run=study_commands.sensitivity)
 
 
 def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     common = argparse.ArgumentParser(add_help=False, parents=[common])
-    common.add_argument("scene", metavar="SCENE", type=Path, help="scene.npz or scene.toml")
+    file(common, "scene", "SCENE", "scene.npz or scene.toml")
 
     solve = commands.add_parser("solve", parents=[common], help="solve a scene")
-    solve.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        type=Path,
+    file(
+        solve,
+        "-o --output",
+        "OUT",
+        f"result file; its suffix sets the format: {' '.join(result_suffixes())}",
         required=True,
-        help=f"result file; its suffix sets the format: {' '.join(result_suffixes())}",
     )
     solve.add_argument("--method", choices=METHODS, help="solver (default: that of the scene)")
     solve.add_argument("--contact", choices=CONTACTS, help="contact (default: that of the scene)")
     solve.add_argument("--tolerance", type=float, help="relative error of the iterative methods")
-    solve.add_argument(
-        "--plan",
-        metavar="PLAN",
-        type=Path,
-        help="plan.toml or plan.json, instead of the scene's plan",
-    )
+    file(solve, "--plan", "PLAN", "plan.toml or plan.json, instead of the scene's plan")
     solve.set_defaults(run=scene_commands.solve)
 
     info = commands.add_parser("info", parents=[common], help="list the contents of a scene")
@@ -405,16 +358,14 @@ def _add_landmarks(commands: Any, named: argparse.ArgumentParser) -> None:
         parents=[named],
         help="find the landmarks of skull and skin, and draw them for checking",
     )
-    landmarks.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, help="output folder (default: that of the case)"
-    )
-    landmarks.add_argument(
+    file(landmarks, "-o --output", "OUT", "output folder (default: that of the case)")
+    file(
+        landmarks,
         "--template",
-        metavar="FOLDER",
-        type=Path,
-        action="append",
-        help="a head whose landmarks are known (cranium, mandible, skull_landmarks.mrk.json); "
+        "FOLDER",
+        "a head whose landmarks are known (cranium, mandible, skull_landmarks.mrk.json); "
         "may be repeated",
+        action="append",
     )
     landmarks.add_argument(
         "--names",
@@ -422,14 +373,12 @@ def _add_landmarks(commands: Any, named: argparse.ArgumentParser) -> None:
         default="cmfsim",
         help="labels of the files: gonion_L (default), or LGo as in cephalometry and ALI_CBCT",
     )
-    landmarks.add_argument(
+    switch(
+        landmarks,
         "--page",
-        action="store_true",
-        help="also write landmarks.html, a page in which the landmarks are checked and placed",
+        "also write landmarks.html, a page in which the landmarks are checked and placed",
     )
-    landmarks.add_argument(
-        "--no-open", action="store_true", help="do not open the page in the browser"
-    )
+    switch(landmarks, "--no-open", "do not open the page in the browser")
     landmarks.set_defaults(run=landmarks_command.landmarks)
 
 
@@ -465,20 +414,16 @@ def _add_template_import(actions: Any, common: argparse.ArgumentParser) -> None:
         epilog=f"BodyParts3D: download the OBJ files from {WHERE}.",
     )
     imports.add_argument("atlas", choices=["bodyparts3d"], help="which atlas")
-    imports.add_argument("folder", metavar="FOLDER", type=Path, help="folder of the atlas files")
-    imports.add_argument(
+    file(imports, "folder", "FOLDER", "folder of the atlas files")
+    file(
+        imports,
         "--landmarks",
-        metavar="FILE",
-        type=Path,
+        "FILE",
+        "skull landmarks on the bones of the atlas (.mrk.json)",
         required=True,
-        help="skull landmarks on the bones of the atlas (.mrk.json)",
     )
-    imports.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz file"
-    )
-    imports.add_argument(
-        "--any-files", action="store_true", help="accept files with unknown hashes"
-    )
+    file(imports, "-o --output", "OUT", "folder, or .npz file", required=True)
+    switch(imports, "--any-files", "accept files with unknown hashes")
     imports.set_defaults(run=template_commands.import_atlas)
 
 
@@ -488,32 +433,19 @@ def _add_template_morph(actions: Any, named: argparse.ArgumentParser) -> None:
         parents=[named],
         help="transfer the muscles of a template to a patient by landmarks",
     )
-    morph.add_argument(
-        "landmarks",
-        metavar="LANDMARKS",
-        type=Path,
-        help="skull landmarks of the patient, .mrk.json or .fcsv",
-    )
-    morph.add_argument(
-        "-o", "--output", metavar="OUT", type=Path, required=True, help="folder, or .npz file"
-    )
-    morph.add_argument(
-        "--smoothing", metavar="MM", type=float, default=0.0, help="0 (default): exact landmarks"
-    )
+    file(morph, "landmarks", "LANDMARKS", "skull landmarks of the patient, .mrk.json or .fcsv")
+    file(morph, "-o --output", "OUT", "folder, or .npz file", required=True)
+    number(morph, "--smoothing", "MM", "0 (default): exact landmarks", default=0.0)
     morph.set_defaults(run=template_commands.morph)
 
 
 def _add_template_show(actions: Any, named: argparse.ArgumentParser) -> None:
     show = actions.add_parser("show", parents=[named], help="draw a template's muscles")
-    show.add_argument(
-        "-o", "--output", metavar="PNG", type=Path, required=True, help="picture to write"
-    )
+    file(show, "-o --output", "PNG", "picture to write", required=True)
     show.add_argument(
         "--only", metavar="NAME", nargs="+", help="only these muscles; without _L or _R, both sides"
     )
-    show.add_argument(
-        "--fibres", action="store_true", help="draw fibre boxes and directions instead of names"
-    )
+    switch(show, "--fibres", "draw fibre boxes and directions instead of names")
     show.set_defaults(run=template_commands.show)
 
 
@@ -527,32 +459,22 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         help="measure the run time and the accuracy of each setting of a prediction",
         epilog="Finished runs are kept in the output folder, so an interrupted sweep is resumed.",
     )
-    frontier.add_argument(
-        "case", metavar="CASE", type=Path, nargs="?", help="case.toml (default: a synthetic head)"
-    )
-    frontier.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        type=Path,
+    file(frontier, "case", "CASE", "case.toml (default: a synthetic head)", nargs="?")
+    file(
+        frontier,
+        "-o --output",
+        "OUT",
+        f"output folder (default {bench_command.FRONTIER_FOLDER})",
         default=bench_command.FRONTIER_FOLDER,
-        help=f"output folder (default {bench_command.FRONTIER_FOLDER})",
     )
-    frontier.add_argument(
+    number(
+        frontier,
         "--edge-length",
-        metavar="H",
-        type=float,
-        help="edge length of the base run, mm (default: that of the case)",
+        "H",
+        "edge length of the base run, mm (default: that of the case)",
     )
     frontier.add_argument("--model", choices=MODELS, help="model of the base run (default M+S)")
-    frontier.add_argument(
-        "--edges",
-        metavar="H",
-        type=float,
-        nargs="+",
-        default=EDGES,
-        help="edge lengths of the grid, mm",
-    )
+    number(frontier, "--edges", "H", "edge lengths of the grid, mm", nargs="+", default=EDGES)
     for name, known in (("elements", ELEMENTS), ("kinematics", KINEMATICS)):
         frontier.add_argument(
             f"--{name}",
@@ -569,11 +491,11 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         metavar="FACTOR",
         help=f"settings to vary one at a time, none if empty (default {' '.join(FACTORS)})",
     )
-    frontier.add_argument(
+    number(
+        frontier,
         "--reference-edge",
-        metavar="H",
-        type=float,
-        help="edge length of the reference, mm (default: the smallest of the sweep)",
+        "H",
+        "edge length of the reference, mm (default: the smallest of the sweep)",
     )
     frontier.add_argument(
         "--reference-kinematics",
@@ -581,18 +503,8 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         default="hyperelastic",
         help="kinematics of the reference (default hyperelastic)",
     )
-    frontier.add_argument(
-        "--repeats", metavar="N", type=int, default=3, help="timing rounds (default 3)"
-    )
-    frontier.add_argument(
-        "--threads", metavar="N", type=int, help="number of threads (default: all cores)"
-    )
-    frontier.add_argument(
-        "--time-limit",
-        metavar="S",
-        type=float,
-        default=600.0,
-        help="time limit per job, s (default 600)",
-    )
-    frontier.add_argument("--fresh", action="store_true", help="repeat finished runs")
+    whole(frontier, "--repeats", "N", "timing rounds (default 3)", default=3)
+    whole(frontier, "--threads", "N", "number of threads (default: all cores)")
+    number(frontier, "--time-limit", "S", "time limit per job, s (default 600)", default=600.0)
+    switch(frontier, "--fresh", "repeat finished runs")
     frontier.set_defaults(run=bench_command.frontier)

@@ -18,10 +18,14 @@ from cmfsim.doctor.sites.landmarks import check_automatic
 from cmfsim.doctor.sites.placement import check_placement
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
 from cmfsim.doctor.surgery.moved_bones import check_moved
-from cmfsim.doctor.surgery.operation import check_cuts, check_plan, pieces_of, vertices_of
-from cmfsim.doctor.surgery.plan import state_plan
-from cmfsim.doctor.surgery.plan_size import SizedMotion, check_motion_size
-from cmfsim.doctor.surgery.postoperative import check_after
+from cmfsim.doctor.surgery.operation import (
+    check_after,
+    check_cuts,
+    check_plan,
+    pieces_of,
+    vertices_of,
+)
+from cmfsim.doctor.surgery.plan import SizedMotion, check_motion_size, state_plan
 from cmfsim.doctor.tissue_ends import check_ends, check_lips
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.values.clinical_motion import ClinicalMotion

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cmfsim.doctor.evidence import Body, Evidence
-from cmfsim.doctor.sites.places import place_text
+from cmfsim.doctor.evidence import Body, Evidence, place_text
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 

@@ -9,8 +9,7 @@ from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.surfaces.barycentric import barycentric
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats
-from cmfsim.values.renumbering import used_nodes
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 # A partner lies on the border if its distance from the border's edge, as a share of the height of
 # its triangle, is below this: more than the rounding of a closest point at 1000 mm.

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
-from cmfsim.io.results.prediction_schema import is_prediction_file
+from cmfsim.io.results.predictions import is_prediction_file
 from cmfsim.pipeline.building.inputs import check_output
 
 _log = logging.getLogger(__name__)

@@ -15,8 +15,7 @@ from cmfsim.errors import CaseInputError, third_party
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, Indices, as_number, as_positive
 from cmfsim.values.image_data import ImageData
-from cmfsim.values.renumbering import used_nodes
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 _log = logging.getLogger(__name__)
 

@@ -17,8 +17,7 @@ from cmfsim.surfaces.checks import (
 from cmfsim.surfaces.topology import component_labels, connected_labels, edges_of, orientation_flips
 from cmfsim.values.checks import Floats, as_number
 from cmfsim.values.finding import Finding
-from cmfsim.values.renumbering import used_nodes
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 # An ear whose area is below this share of the loop's squared extent is cut off only if no other is
 # left: cutting needles first would leave needles behind.

@@ -16,10 +16,9 @@ from cmfsim.values.checks import Floats, Frozen, Indices, listing
 from cmfsim.values.finding import Finding, counted_findings
 from cmfsim.values.lifted_tissue import LiftedTissue
 from cmfsim.values.node_kinds import NodeKinds
-from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import Scene
 from cmfsim.values.skin_motion import SkinEnd, skin_end
-from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData, used_nodes
 from cmfsim.values.tissue_data import TissueData
 from cmfsim.values.touching import LipRegion
 

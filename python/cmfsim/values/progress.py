@@ -1,17 +1,22 @@
-"""Progress of long work: callbacks with the name of each stage, and the share that is done."""
+"""Progress of long work: callbacks with each stage and the share that is done, and observers."""
 
 import contextlib
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
-from cmfsim.errors import third_party
+from cmfsim.errors import CmfsimError, third_party
+from cmfsim.values.finding import Finding
 
+if TYPE_CHECKING:
+    # A case without muscles loads nothing of them.
+    from cmfsim.values.anatomy import BoneSegment
+    from cmfsim.values.musculature import Musculature
 Progress = Callable[[str], None]
 # What public functions take: True shows a bar.
 ProgressOrBar = Progress | bool | None
-
 # A stage of equal steps names the one that begins: "solving nearby plans (3 of 96)".
 COUNT = re.compile(r" \(?(\d+) of (\d+)\)?$")
 # Typical seconds of the longer stages of a build, in order: the CT phantom and the demo on one
@@ -37,6 +42,34 @@ PRIOR = 5.0
 FEW_STEPS = 3
 # The least that is left of a stage, as a share of the time it has taken: it may take any time.
 LEAST_LEFT = 0.1
+
+
+class Observer:
+    """What learns of the work on a case as it goes on: override the methods that you need.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> class Log(cmfsim.Observer):
+    ...     def stage(self, name):
+    ...         print(name)
+    >>> prediction = cmfsim.predict("case.toml", observer=Log())  # doctest: +SKIP
+    checking the case
+    """
+
+    def stage(self, name: str) -> None:
+        """A stage begins."""
+
+    def found(self, findings: Sequence[Finding]) -> None:
+        """Findings of a stage or a solution; some may have been reported before."""
+
+    def muscles(self, muscles: "Musculature", segments: "Sequence[BoneSegment]") -> None:
+        """Muscles and segments of bone are known: before a model is solved, perhaps repeatedly."""
+
+    def failed(self, model: str, error: CmfsimError) -> None:
+        """A model cannot be solved: the other models continue unless this raises the error."""
+        del model
+        raise error
 
 
 def no_progress(stage: str) -> None:

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.values.checks import Floats, Frozen, as_rows
-from cmfsim.values.renumbering import used_nodes
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 # A point up to so many edges from the mesh's skin follows it fully.
 FOLLOWS = 2.0

@@ -6,8 +6,8 @@ import pytest
 import cmfsim
 import meshes
 from cmfsim.bones.achieved import measure_pair
-from cmfsim.bones.pairs.along_surface import AlongSurface
 from cmfsim.bones.pairs.coherent_motion import coherent_motion
+from cmfsim.bones.pairs.paired_surfaces import AlongSurface
 from paired_motion import (
     ALL,
     EXACT,

@@ -10,7 +10,7 @@ import cmfsim
 import real_heads
 from angles import angle_between
 from cmfsim.bones import PROCEDURES, CutOptions
-from cmfsim.bones.cuts import needed_sites
+from cmfsim.bones.cuts import procedures
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 
 pytest.importorskip("skimage")
@@ -254,9 +254,9 @@ def test_at_most_three_landmarks_are_asked_for_and_suffice(kind):
 def test_a_missing_landmark_is_estimated_from_the_others_and_reported(kind, head):
     """Within 7 mm of where a person placed it, where the other side shows its partner 5 mm."""
     points = real_heads.landmarks(head)
-    for name in needed_sites.NEEDED[kind]:
+    for name in procedures.NEEDED[kind]:
         less = {n: p for n, p in points.items() if n != name}
-        found, (finding,) = needed_sites.with_missing_sites(kind, less)
+        found, (finding,) = procedures.with_missing_sites(kind, less)
         assert finding.code == "cut-site-estimated"
         assert f"with {name} estimated" in finding.what
         partner = name[:-1] + {"L": "R", "R": "L"}.get(name[-1], "")

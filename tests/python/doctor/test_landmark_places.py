@@ -11,8 +11,8 @@ import pytest
 
 import cmfsim
 import real_heads
+from cmfsim.doctor.evidence import direction_text, shift_text
 from cmfsim.doctor.sites import landmarks as checks
-from cmfsim.doctor.sites.places import direction_text, shift_text
 from cmfsim.registration import mirror_agreement, swapped_names
 from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.values.landmark_sites import REFERENCE_PLACES

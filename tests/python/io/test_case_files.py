@@ -8,7 +8,6 @@ import pytest
 
 import cmfsim
 import cmfsim.values.case_parts
-import cmfsim.values.case_region
 from cmfsim.io.files.toml_lines import line_of, toml_lines
 
 HEAD = 'format = "cmfsim-case"\nversion = 1\n'
@@ -323,13 +322,13 @@ def test_a_mark_of_utf_8_and_windows_line_ends_change_nothing(tmp_path):
 
 def test_the_posterior_plane_is_given_or_placed_from_landmarks_or_depth():
     """Coronal, 10 mm behind the roots of the arches; without them at 0.6 of the depth."""
-    region = cmfsim.values.case_region.Region()
+    region = cmfsim.values.case_parts.Region()
     roots = {"supraglenoid_L": np.array([60, -100, 0.0]), "supraglenoid_R": np.array([-60, -96, 0])}
     plane = region.plane(roots, -200.0, 0.0)
     assert plane.point.tolist() == [0.0, -88.0, 0.0]
     assert plane.normal.tolist() == [0.0, 1.0, 0.0]
     assert region.plane({}, -200.0, 0.0).point.tolist() == [0.0, -80.0, 0.0]
-    near = cmfsim.values.case_region.Region(posterior_depth=-5.0)
+    near = cmfsim.values.case_parts.Region(posterior_depth=-5.0)
     assert near.plane(roots, -200.0, 0.0).point.tolist() == [0.0, -103.0, 0.0]
     with pytest.raises(cmfsim.CaseError, match="supraglenoid_L and supraglenoid_R"):
         near.plane({}, -200.0, 0.0)

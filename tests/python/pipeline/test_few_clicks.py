@@ -12,8 +12,12 @@ import real_heads
 from cmfsim.bones import cut_bones, place_procedure
 from cmfsim.cli import main
 from cmfsim.pipeline import proposing
-from cmfsim.pipeline.building.sites.landmarks import found_landmarks, is_to_be_found
-from cmfsim.pipeline.building.sites.site_checks import check_bones_of_sites, check_pieces
+from cmfsim.pipeline.building.landmarks import (
+    check_bones_of_sites,
+    check_pieces,
+    found_landmarks,
+    is_to_be_found,
+)
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
 from cmfsim.pipeline.proposing import ProposedHead
 from cmfsim.values.landmark_sites import is_lower_site

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cmfsim.values.renumbering import used_nodes
+from cmfsim.values.surface_data import used_nodes
 
 
 @pytest.mark.parametrize(("width", "kind"), [(3, np.uint32), (4, np.uint32), (3, np.int64)])

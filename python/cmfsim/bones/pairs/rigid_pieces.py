@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, rigid_fit
-from cmfsim.bones.pairs.along_surface import AlongSurface
+from cmfsim.bones.pairs.paired_surfaces import AlongSurface
 from cmfsim.bones.pairs.shape_fit import LEAST_SIGMA, TO_SIGMA, TUKEY
 from cmfsim.surfaces.topology import connected_labels
 from cmfsim.values.checks import Floats

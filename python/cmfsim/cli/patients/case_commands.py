@@ -6,29 +6,110 @@ import json
 import logging
 import re
 import sys
+import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
-from cmfsim.cli.text.build_report import WIDTH, build_text
 from cmfsim.cli.text.notices import FindingsError, Notices
 from cmfsim.cli.text.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import Examination, examine, findings_text
+from cmfsim.drafting import CASE_FILE, init_case, read_moves
 from cmfsim.io import Case
 from cmfsim.io.results.models import is_model_file
 from cmfsim.pipeline.building.inputs import plan_key
 from cmfsim.pipeline.predicting import case_for_models
 from cmfsim.pipeline.preparation import prepare
+from cmfsim.report import Table
 from cmfsim.values.checks import as_positive
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import SEVERITIES, Finding
+from cmfsim.values.mesh_report import MeshReport
 
+# Columns of the text in a pipe, and at most on a terminal.
+WIDTH = 100
+# Columns before the values, as in the lines of `MeshReport.as_text`.
+INDENT = 14
+# Distances of a contact surface from the bone beneath.
+AWAY = ("mean", "p95", "max")
 _log = logging.getLogger(__name__)
 # What the planning page states of the case that a plan was made for.
 MADE_FOR = re.compile(r"^# made for: ([0-9a-f]{64})\s*$", re.MULTILINE)
+
+
+def build_text(summary: Mapping[str, Any], *, width: int = WIDTH) -> str:
+    """The summary of a `PatientModel` that was written: nodes, mesh, time per stage, files."""
+    parts = [
+        [f"case          {escaped(summary['case'])}", *_nodes(summary)],
+        MeshReport(**summary["mesh"]).as_text().splitlines(),
+        _times(summary["timings"]),
+        _files(summary, width),
+    ]
+    return "\n\n".join("\n".join(part) for part in parts)
+
+
+def _nodes(summary: Mapping[str, Any]) -> list[str]:
+    """Nodes on each segment, and how far contact surfaces are from the bone beneath."""
+    kinds = ", ".join(f"{count} {kind}" for kind, count in summary["nodes"].items())
+    held = tuple((n, str(s["joined"]), str(s["sliding"])) for n, s in summary["segments"].items())
+    tables = [Table(("segment", "joined", "sliding"), held, f"nodes         {kinds}")]
+    if summary.get("contact"):
+        rows = tuple(
+            (name, *(f"{found[f'departure_{key}']:.2f}" for key in AWAY), found["surface"])
+            for name, found in summary["contact"].items()
+        )
+        caption = "contact       departure from bone, mm"
+        tables.append(Table(("segment", *AWAY, "surface"), rows, caption))
+    return [escaped(line) for table in tables for line in table.text.split("\n")]
+
+
+def _times(timings: Mapping[str, float]) -> list[str]:
+    lines = [f"time          {sum(timings.values()):.1f} s"]
+    return lines + [f"  {seconds:8.2f} s  {escaped(name)}" for name, seconds in timings.items()]
+
+
+def _files(summary: Mapping[str, Any], width: int) -> list[str]:
+    names = ", ".join(escaped(name) for name in summary["files"])
+    wrapped = textwrap.wrap(
+        names,
+        max(width, 40),
+        initial_indent=" " * INDENT,
+        subsequent_indent=" " * INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [f"written       {escaped(summary['output'])}", *wrapped]
+
+
+def init(options: argparse.Namespace) -> int:
+    """Writes the case file, and reports the role assumed for each file."""
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        draft = init_case(
+            options.folder,
+            force=options.force,
+            cuts=options.cut,
+            moves=read_moves(options.move),
+            progress=progress.stage,
+        )
+    folder = options.folder if options.folder.is_dir() else options.folder.parent
+    case = folder / CASE_FILE
+    if options.json:
+        print(json.dumps({"case": str(case), **draft.as_dict()}, allow_nan=False))
+        return DONE
+    for entry in draft.taken:
+        is_open = entry.question or not entry.taken_for
+        details = ", ".join(part for part in (entry.unit, entry.frame) if part)
+        head = f"{entry.label}: {entry.taken_for or '?'}{f' ({details})' if details else ''}"
+        print(f"{'? ' if is_open else '  '}{escaped(head)}")
+        print(f"      {escaped(entry.why)}")
+    print(f"case  {escaped(str(case))}")
+    for question in draft.questions:
+        print(f"decide  {escaped(question)}")
+    print(f"next  cmfsim doctor {escaped(str(case))}")
+    return DONE
 
 
 def doctor(options: argparse.Namespace) -> int:

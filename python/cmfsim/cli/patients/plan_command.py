@@ -9,9 +9,9 @@ import webbrowser
 
 import numpy as np
 
-from cmfsim.cli.band_options import band_options
 from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.opening import can_open, open_page
+from cmfsim.cli.options import band_options
 from cmfsim.cli.patients.case_commands import case_of, checked
 from cmfsim.cli.text.notices import Notices
 from cmfsim.cli.text.terminal import StageProgress, escaped

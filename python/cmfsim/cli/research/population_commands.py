@@ -1,12 +1,12 @@
-"""`cmfsim virtual-patients` and `cmfsim benchmark`: synthetic heads with their truth, scored."""
+"""`cmfsim phantom`, `virtual-patients` and `benchmark`: synthetic heads, their truth, scores."""
 
 import argparse
 import json
 import sys
-from pathlib import Path
 from typing import Any
 
 from cmfsim.cli.exit_codes import DONE
+from cmfsim.cli.options import file, number, whole
 from cmfsim.cli.text.terminal import StageProgress
 from cmfsim.errors import CaseInputError
 from cmfsim.io.results.populations import FAILED, MADE, PARTS, PENDING, TEST
@@ -15,8 +15,29 @@ from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.lab.virtual import PatientOutcome, virtual_population
 from cmfsim.lab.virtual import virtual_patients as write_patients
 from cmfsim.lab.virtual.patient_folder import PATIENTS_WITH_JOINED_LIPS
+from cmfsim.lab.virtual.phantom_case import write_phantom_case
 from cmfsim.lab.virtual.population import OWN, TRUTHS
+from cmfsim.phantom import HeadParameters, make_head
+from cmfsim.values.checks import as_positive
 from cmfsim.values.model_names import MODELS
+
+
+def phantom(options: argparse.Namespace) -> int:
+    """Writes the case of a synthetic head: CT, landmarks and case file."""
+    spacing = as_positive("--spacing", options.spacing)
+    parameters = HeadParameters()
+    if options.person is not None:
+        parameters = HeadParameters.random(options.person)
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        progress.stage("making a head")
+        head = make_head(parameters)
+        progress.stage("imaging it")
+        case = write_phantom_case(options.folder, head, spacing=spacing)
+    if options.json:
+        print(json.dumps({"case": str(case)}, allow_nan=False))
+    else:
+        print(f"wrote {case}; build it with: cmfsim build {case}")
+    return DONE
 
 
 def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> None:
@@ -32,44 +53,38 @@ def _add_virtual_patients(commands: Any, common: argparse.ArgumentParser) -> Non
         help="write virtual patients with their post-operative faces (in silico)",
         epilog="Existing patients with the same settings are kept.",
     )
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="output folder")
-    parser.add_argument(
+    file(parser, "folder", "FOLDER", "output folder")
+    whole(
+        parser,
         "--patients",
-        metavar="N",
-        type=int,
+        "N",
+        "patients, 1 to 6 (default 1 to 4; the lips of 5 and 6 touch, which takes longer)",
         nargs="+",
-        help="patients, 1 to 6 (default 1 to 4; the lips of 5 and 6 touch, which takes longer)",
     )
-    parser.add_argument(
+    whole(
+        parser,
         "--count",
-        metavar="N",
-        type=int,
-        help="draw N patients at random (shape, tissue, operation, plan) instead of --patients",
+        "N",
+        "draw N patients at random (shape, tissue, operation, plan) instead of --patients",
     )
-    parser.add_argument(
+    whole(
+        parser,
         "--workers",
-        metavar="N",
-        type=int,
+        "N",
+        "number of drawn patients made at a time, one process each (default 1)",
         default=1,
-        help="number of drawn patients made at a time, one process each (default 1)",
     )
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="random seed (default 0)")
+    whole(parser, "--seed", "N", "random seed (default 0)", default=0)
     parser.add_argument(
         "--truth",
         choices=TRUTHS,
         help="true tissue of drawn patients: their own (default), or the phantom's, whose muscles "
         "and moduli the models assume",
     )
-    parser.add_argument(
-        "--edge-length",
-        metavar="H",
-        type=float,
-        default=6.0,
-        help="edge length of the true mesh, mm (default 6)",
+    number(
+        parser, "--edge-length", "H", "edge length of the true mesh, mm (default 6)", default=6.0
     )
-    parser.add_argument(
-        "--spacing", metavar="MM", type=float, default=2.0, help="CT voxel size (default 2)"
-    )
+    number(parser, "--spacing", "MM", "CT voxel size (default 2)", default=2.0)
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
     )
@@ -85,9 +100,7 @@ def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
         "Results are written to FOLDER/benchmark; except for the run times, they have "
         "the same bytes each time.",
     )
-    parser.add_argument(
-        "folder", metavar="FOLDER", type=Path, help="folder written by virtual-patients --count"
-    )
+    file(parser, "folder", "FOLDER", "folder written by virtual-patients --count")
     parser.add_argument(
         "--entries",
         metavar="ENTRY",
@@ -116,12 +129,12 @@ def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--part", choices=PARTS, default=TEST, help="patients to score (default test)"
     )
-    parser.add_argument(
+    whole(
+        parser,
         "--workers",
-        metavar="N",
-        type=int,
+        "N",
+        "number of patients predicted at a time, one process each (default 1)",
         default=1,
-        help="number of patients predicted at a time, one process each (default 1)",
     )
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
@@ -211,6 +224,6 @@ def benchmark(options: argparse.Namespace) -> int:
         print(found.table.json(), end="")
         return DONE
     print(found.table.markdown())
-    for file in found.files:
-        print(f"wrote {file}")
+    for path in found.files:
+        print(f"wrote {path}")
     return DONE

@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cmfsim.cli.band_options import band_options
 from cmfsim.cli.exit_codes import DONE, FAILED
+from cmfsim.cli.options import band_options
 from cmfsim.cli.patients.case_commands import case_of, checked
 from cmfsim.cli.text.notices import Notices
 from cmfsim.cli.text.terminal import StageProgress, escaped

@@ -9,7 +9,7 @@ from cmfsim.cli.text.terminal import CLEAR_LINE, escaped, in_colour
 from cmfsim.doctor.report import severity_text
 from cmfsim.errors import CmfsimError
 from cmfsim.values.finding import Finding, FindingGroup, counted, grouped
-from cmfsim.values.observer import Observer
+from cmfsim.values.progress import Observer
 
 
 class FindingsError(Exception):

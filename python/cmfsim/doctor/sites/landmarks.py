@@ -10,8 +10,7 @@ from importlib import import_module
 import numpy as np
 
 from cmfsim._core import Surface
-from cmfsim.doctor.evidence import Evidence
-from cmfsim.doctor.sites.places import direction_text, place_text, shift_text
+from cmfsim.doctor.evidence import Evidence, direction_text, place_text, shift_text
 from cmfsim.errors import LandmarkError, RegistrationError
 from cmfsim.registration import common_shift, leave_one_out, mirror_agreement, swapped_names
 from cmfsim.values.checks import Floats

@@ -5,14 +5,13 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.doctor.evidence import Body, Evidence
+from cmfsim.doctor.evidence import Body, Evidence, place_text
 from cmfsim.doctor.sites.landmarks import (
     Nearest,
     check_landmarks,
     nearest_of_level,
     nearest_of_surfaces,
 )
-from cmfsim.doctor.sites.places import place_text
 from cmfsim.errors import ImageError
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.doctor.sites.places import place_text
+from cmfsim.doctor.evidence import place_text
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried

@@ -5,10 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from cmfsim._core import rigid_fit
-from cmfsim.doctor.evidence import Evidence
-from cmfsim.doctor.sites.places import place_text
+from cmfsim.doctor.evidence import Evidence, place_text
 from cmfsim.doctor.surgery.operation import check_against_skin
-from cmfsim.doctor.surgery.plan_size import FAR, TOO_FAR, check_tiny, check_turn
+from cmfsim.doctor.surgery.plan import FAR, TOO_FAR, check_tiny, check_turn
 from cmfsim.errors import CmfsimError, RegistrationError
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats

@@ -1,16 +1,159 @@
-"""The plan of a case in a surgeon's words, from what can be read before any work."""
+"""The plan of a case in a surgeon's words, and whether each motion has the size of a bone's."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
 
 from cmfsim.bones.motion import sound_motion, torn_pieces
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion
+from cmfsim.values.finding import Finding
+from cmfsim.values.motion import decompose_motion
 from cmfsim.values.surface_data import MovedSurface
 
+# Motions of bone above which a plan is unusual, and above which it is implausible; mm and degrees.
+# The largest relocation in Table 2 of the paper is 12.6 mm; distraction reaches 30 mm.
+FAR, TOO_FAR = 20.0, 60.0
+TURNED, TOO_TURNED = 20.0, 60.0
+# A motion that no face shows, mm: a tenth of a voxel of a CT. 20 mm written in metres is 0.02.
+TINY = 0.05
+# Motions of less than this, mm and degrees, are more likely in centimetres, and those further to a
+# side than this, mm, if that is most of the motion, in another order.
+SMALL, SIDEWAYS = 1.0, 5.0
+# Turns that nobody plans, degrees: 0.2 rad are 11°. Below the first, rounding of a typed matrix.
+TINY_TURN = (1e-3, 0.2)
+# Less than this is rounding of no motion, mm and degrees.
+NOTHING = 1e-6
+# Where no surface of the segment is known, how far it reaches from the point that is, mm.
+REACH = 60.0
 # A bone whose vertices deviate by less than this from a rigid motion, mm RMS, was not cut.
 BENT = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class SizedMotion:
+    """A rigid motion of a segment with what its size is judged by.
+
+    name: Of the segment.
+    matrix: (4, 4), mm.
+    where: Its place in the case file.
+    points: (k, 3), mm, or None, on the segment's surface, where one is known.
+    point: (3,), mm, or None. One point of the segment, where no surface is known.
+    typed: Whether it was given by translation, angle, axis and centre.
+    """
+
+    name: str
+    matrix: Floats
+    where: str
+    points: Floats | None = None
+    point: Floats | None = None
+    typed: bool = False
+    has_centre: bool = False
+
+
+def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
+    """Findings about a motion that is too large, too small, or turns too far or too little."""
+    points = motion.points
+    if points is None:
+        points = (np.zeros(3) if motion.point is None else motion.point)[None]
+    rotation, shift = motion.matrix[:3, :3], motion.matrix[:3, 3]
+    far = float(np.linalg.norm(points @ rotation.T + shift - points, axis=1).max())
+    angle = decompose_motion(motion.matrix).angle
+    if far > FAR:
+        about_origin = angle > 0.0 and motion.typed and not motion.has_centre
+        remedy = "check translation (mm), sign and frame (LPS: forwards is −P)"
+        if about_origin:
+            remedy = (
+                "give the centre of the rotation: without one, the segment rotates about the "
+                "origin of the coordinates"
+            )
+        elif not motion.typed:
+            remedy = "check the unit (mm), frame (LPS or RAS) and direction of the transform"
+        yield _too_far(motion, far, remedy)
+    elif angle > TINY_TURN[0] and motion.typed and not motion.has_centre:
+        yield Finding(
+            "plan-no-centre",
+            f"{motion.name} turns by {angle:.1f}° about the origin of the coordinates, for no "
+            f"centre is given: the turn moves it by up to {far:.1f} mm",
+            where=motion.where,
+        )
+    yield from check_turn(motion.name, motion.where, angle)
+    reach = 0.0 if motion.points is not None else REACH * math.radians(angle)
+    yield from check_tiny(motion.name, motion.where, far + reach, angle)
+
+
+def _too_far(motion: SizedMotion, far: float, remedy: str) -> Finding:
+    return Finding(
+        "plan-far",
+        f"{motion.name} moves by up to {far:.1f} mm",
+        severity="error" if far > TOO_FAR else "warning",
+        where=motion.where,
+        fix=remedy,
+        facts={"most": FAR},
+    )
+
+
+def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
+    """Findings about the numbers of a typed motion: in centimetres, or in another order."""
+    size = math.hypot(motion.forwards, motion.up, motion.left)
+    turn = math.hypot(motion.pitch, motion.yaw, motion.roll)
+    if TINY <= size < SMALL and turn < SMALL:
+        yield Finding(
+            "plan-tiny",
+            f"{motion.segment} moves by {size:.2g} mm",
+            where=where,
+            facts={"size": size, "unit": "cm", "larger": 10.0 * size},
+        )
+    if abs(motion.left) > SIDEWAYS and size < math.sqrt(2.0) * abs(motion.left):
+        side = "left" if motion.left > 0.0 else "right"
+        yield Finding(
+            "plan-sideways",
+            f"{motion.segment} moves {abs(motion.left):.1f} mm to the {side}, which is most of its "
+            "motion",
+            where=where,
+        )
+
+
+def nothing_moves(where: str) -> Finding:
+    """The warning about a plan that moves no segment."""
+    return Finding("plan-still", "no segment moves", where=where)
+
+
+def check_turn(name: str, where: str, angle: float) -> Iterator[Finding]:
+    """A finding about a turn, in degrees, of more than bone is turned."""
+    if angle > TURNED:
+        yield Finding(
+            "plan-turned",
+            f"{name} turns by {angle:.1f}°",
+            severity="error" if angle > TOO_TURNED else "warning",
+            where=where,
+            facts={"most": TURNED},
+        )
+
+
+def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Finding]:
+    """Findings about a motion of `far` mm at most and a turn, in degrees, that nobody plans."""
+    if NOTHING < far < TINY:
+        yield Finding(
+            "plan-tiny",
+            f"{name} moves by {far:.2g} mm at most",
+            where=where,
+            why="this is too small to be visible: the prediction equals the face before the "
+            "operation",
+            facts={"size": far, "unit": "m", "larger": 1000.0 * far},
+        )
+    least, most = TINY_TURN
+    if least <= angle < most:
+        yield Finding(
+            "plan-tiny-angle",
+            f"{name} turns by {angle:.2g}°",
+            where=where,
+            facts={"angle": angle, "degrees": math.degrees(angle)},
+        )
 
 
 def state_plan(

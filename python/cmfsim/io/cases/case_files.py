@@ -40,8 +40,8 @@ from cmfsim.values.case_parts import (
     CaseOsteotomy,
     CasePostoperative,
     CaseSurfaces,
+    Region,
 )
-from cmfsim.values.case_region import Region
 from cmfsim.values.checks import as_text, listing
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import TissueData

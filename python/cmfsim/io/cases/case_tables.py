@@ -19,8 +19,9 @@ from cmfsim.values.case_parts import (
     CaseMuscles,
     CasePostoperative,
     CaseSurfaces,
+    Plane,
+    Region,
 )
-from cmfsim.values.case_region import Plane, Region
 from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE, MuscleModuli, TissueModuli
 from cmfsim.values.solver_options import CONTACTS, SolverOptions
 from cmfsim.values.tissue_data import MIXINGS, TissueData

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, Indices, as_index_rows, as_rows
-from cmfsim.values.renumbering import used_nodes
+from cmfsim.values.surface_data import used_nodes
 
 # The limits of `TetMesh`: volume over longest edge cubed, and the longest edge, mm.
 DEGENERATE_VOLUME, SHORTEST_EDGE = 1e-12, 1e-9

@@ -12,8 +12,8 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.io.files.reading_writing import named, replacing
 from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
-from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import SceneResult
+from cmfsim.values.surface_data import used_nodes
 
 RESULT_FORMAT = "cmfsim-result"
 

@@ -29,8 +29,7 @@ from cmfsim.lab.benchmark.entries import (
     times_of,
 )
 from cmfsim.lab.benchmark.patients import BenchmarkPatient, far_from_models, patients_of
-from cmfsim.lab.benchmark.results import MethodResult
-from cmfsim.lab.benchmark.scores import score
+from cmfsim.lab.benchmark.scores import MethodResult, score
 from cmfsim.lab.benchmark.skin_predictions import read_skin_prediction
 from cmfsim.lab.benchmark.tables import BenchmarkTable
 from cmfsim.processes.parallel import answers

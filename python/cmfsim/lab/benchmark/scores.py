@@ -1,17 +1,31 @@
-"""Errors of one prediction at the vertices of each region."""
+"""Errors of predictions: of one at the vertices of each region, of a method on all patients."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from cmfsim.lab.benchmark.patients import BenchmarkPatient
+from cmfsim.lab.benchmark.bands import MethodBand
+from cmfsim.lab.benchmark.patients import LIPS, BenchmarkPatient
 from cmfsim.lab.benchmark.skin_predictions import SkinPrediction
 from cmfsim.values.calibration import BandFactor
 from cmfsim.values.checks import Floats
 
+# Regions in the order of the tables.
+REGIONS = (
+    "face",
+    "lower face",
+    LIPS,
+    "upper lip",
+    "lower lip",
+    "chin",
+    "nose",
+    "left cheek",
+    "right cheek",
+)
+FIGURES = ("mean", "p95", "within", "normal")
 # What is usually called acceptable, mm.
 WITHIN = 2.0
 # Decimals of figures in files, mm and shares: beyond what a prediction in single precision has.
@@ -97,3 +111,48 @@ def _widths(prediction: SkinPrediction, factor: BandFactor | None) -> Floats | N
 
 def _rounded(value: Any) -> float:
     return round(float(value), DECIMALS)
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """The scores of one method.
+
+    scores: By patient, then by region.
+    missing: Patients without a prediction.
+    failed: The reasons that the method gives for some of them, by patient.
+    band: Calibration of its standard deviations on the calibration part, where it states any.
+    """
+
+    method: str
+    scores: Mapping[str, Mapping[str, RegionScore]]
+    missing: tuple[str, ...] = ()
+    failed: Mapping[str, str] = field(default_factory=dict)
+    band: MethodBand | None = None
+
+    def figures(self, region: str, name: str) -> list[float]:
+        """The value of a figure for each patient who has it."""
+        found = [getattr(scores[region], name) for scores in self.scores.values()]
+        return [float(value) for value in found if value is not None]
+
+    def mean(self, region: str, name: str) -> float | None:
+        """The mean of a figure over patients; None where none has it."""
+        found = self.figures(region, name)
+        return float(np.mean(found)) if found else None
+
+    def row(self, region: str, count: int) -> list[str]:
+        """The cells of the CSV file."""
+        means = self.figures(region, "mean")
+        spread = float(np.std(means, ddof=1)) if len(means) > 1 else None
+        values = [self.mean(region, name) for name in FIGURES]
+        banded = self.figures(region, "covered")
+        band = [self.mean(region, name) for name in ("covered", "half_width")]
+        numbers = [_number(value) for value in (values[0], spread, *values[1:])]
+        counts = [str(len(means)), str(count)]
+        factor = self.band.factors.get(region) if self.band is not None else None
+        band_cells = [str(len(banded)), *(_number(value) for value in band)]
+        band_cells += ["", ""] if factor is None else [str(factor.n), _number(factor.factor)]
+        return [self.method, region, *counts, *numbers, *band_cells]
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.6f}"

@@ -47,8 +47,7 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.progress import Progress, no_progress
-from cmfsim.values.renumbering import used_nodes
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 # Where the sum of the distances to both tooth rows is less than the gap of the bite plus this, mm,
 # there is no tissue.

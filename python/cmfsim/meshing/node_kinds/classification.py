@@ -20,9 +20,8 @@ from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, Indices, as_index_rows, as_point, as_rows, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
-from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.scene import SegmentData
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 FREE, FIXED, JOINED, SLIDING = range(4)
 # A body is held if at least this many of its nodes, not on one line, are prescribed.

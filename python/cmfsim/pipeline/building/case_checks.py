@@ -9,7 +9,7 @@ from cmfsim._core import TetMesh
 from cmfsim.doctor import SizedMotion, check_motion_size
 from cmfsim.doctor.sites.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
 from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of
-from cmfsim.doctor.surgery.plan_size import nothing_moves
+from cmfsim.doctor.surgery.plan import nothing_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.surgery.motions import PlannedBones

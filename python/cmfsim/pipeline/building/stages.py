@@ -10,8 +10,7 @@ from cmfsim.errors import CmfsimError
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.finding import Finding, OnFindings
-from cmfsim.values.observer import Observer
-from cmfsim.values.progress import ProgressOrBar, shown_progress
+from cmfsim.values.progress import Observer, ProgressOrBar, shown_progress
 
 if TYPE_CHECKING:
     # A case without muscles loads nothing of them.

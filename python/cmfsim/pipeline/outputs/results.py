@@ -29,9 +29,9 @@ from cmfsim.io.results.metrics import (
     skin_errors_file,
     write_skin_errors,
 )
-from cmfsim.io.results.prediction_schema import is_prediction_file
 from cmfsim.io.results.predictions import (
     fill_prediction,
+    is_prediction_file,
     is_result_file,
     predictions_of,
     read_prediction,

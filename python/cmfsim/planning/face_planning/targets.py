@@ -12,9 +12,8 @@ from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
 from cmfsim.planning.replanning import Motions, PlanningModel
 from cmfsim.values.checks import Floats, as_positive, as_rows
-from cmfsim.values.renumbering import used_nodes
 from cmfsim.values.skin_motion import attachment
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 # A point of the face further from the desired surface than this, mm, has no partner on it.
 MOST_APART = 25.0

@@ -14,7 +14,7 @@ from build_runs import PICTURES, run
 
 import cmfsim
 from cmfsim.io.results import models
-from cmfsim.pipeline.building import assembly, case_model
+from cmfsim.pipeline.building import case_model
 from cmfsim.pipeline.outputs import model as model_output
 from head_case import HeadCase
 
@@ -87,7 +87,7 @@ def test_a_stage_that_fails_leaves_the_old_results(
         monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
     if stage == "write_model":
         monkeypatch.setattr(model_output, "build_model", lambda *_, **__: small_model)
-    owner = {"segment_data": assembly, "write_model": model_output}.get(stage, case_model)
+    owner = {"write_model": model_output}.get(stage, case_model)
     monkeypatch.setattr(owner, stage, fail)
     found, out, err = run("build", ellipsoids, "-q", "--no-doctor")
     assert (found, out) == (code, "")
@@ -366,5 +366,5 @@ def test_files_of_one_name_in_two_folders_have_their_own_hashes(ellipsoids):
     (folder / "cranium.ply").write_bytes(bone)
     text = ellipsoids.read_text(encoding="utf-8")
     ellipsoids.write_text(text.replace('"mandible.ply"', '"other/cranium.ply"'), encoding="utf-8")
-    hashes = assembly.input_hashes(cmfsim.Case.load(ellipsoids))
+    hashes = case_model.input_hashes(cmfsim.Case.load(ellipsoids))
     assert hashes["cranium.ply"] != hashes["other/cranium.ply"]

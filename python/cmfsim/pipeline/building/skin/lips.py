@@ -22,8 +22,7 @@ from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
-from cmfsim.values.renumbering import used_nodes
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, used_nodes
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 
 # Nodes of a lip further than this from the other lip, or from the teeth, do not come to them, mm.

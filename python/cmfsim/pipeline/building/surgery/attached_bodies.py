@@ -7,7 +7,7 @@ from cmfsim.errors import MeshInputError
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
-from cmfsim.values.renumbering import used_nodes
+from cmfsim.values.surface_data import used_nodes
 
 # Held nodes that a body needs: three hold it unless they are in line.
 LEAST_HELD = 3

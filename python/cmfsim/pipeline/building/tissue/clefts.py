@@ -10,8 +10,7 @@ from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NodeKinds
-from cmfsim.values.renumbering import used_nodes
-from cmfsim.values.surface_data import MovedSurface
+from cmfsim.values.surface_data import MovedSurface, used_nodes
 
 # Distances from two segments, taken together and relative to the width of a cleft, up to which
 # tissue cannot move out of their way.
