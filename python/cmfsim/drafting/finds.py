@@ -33,18 +33,8 @@ MARKUPS = (".mrk.json", ".fcsv")
 SCENES = (".mrml", ".mrb")
 # Endings that files beside DICOM slices have, and no slice.
 NO_SLICES = (
-    ".txt",
-    ".jpg",
-    ".jpeg",
-    ".png",
-    ".pdf",
-    ".json",
-    ".xml",
-    ".html",
-    ".csv",
-    ".zip",
-    ".toml",
-)
+    ".txt", ".jpg", ".jpeg", ".png", ".pdf", ".json", ".xml", ".html", ".csv", ".zip", ".toml",
+)  # fmt: skip
 # Names of an entry that stands for several files.
 SHOWN = 3
 # The case file that is written.

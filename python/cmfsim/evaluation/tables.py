@@ -17,18 +17,9 @@ from cmfsim.values.checks import as_text, check_one_of
 
 # Columns of the CSV file after patient, region and model.
 COLUMNS = (
-    "count",
-    "mean_mm",
-    "std_mm",
-    "median_mm",
-    "rms_mm",
-    "p90_mm",
-    "p95_mm",
-    "max_mm",
-    "signed_mean_mm",
-    "signed_std_mm",
-    "outliers",
-)
+    "count", "mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm",
+    "signed_mean_mm", "signed_std_mm", "outliers",
+)  # fmt: skip
 AVERAGE = "average"
 # Stands where a patient has no figure.
 NOTHING = "–"

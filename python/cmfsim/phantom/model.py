@@ -42,19 +42,10 @@ BONES = ("cranium", "mandible", "upper_teeth", "lower_teeth")
 # Parts that `surface` draws besides the muscles.
 PARTS = ("skin", *BONES, "teeth", "air", "brain")
 # Numbers of the label image.
-LABELS: Mapping[str, int] = MappingProxyType(
-    {
-        "outside": 0,
-        "fat": 1,
-        "muscle": 2,
-        "cranium": 3,
-        "mandible": 4,
-        "upper_teeth": 5,
-        "lower_teeth": 6,
-        "air": 7,
-        "brain": 8,
-    }
-)
+LABELS: Mapping[str, int] = MappingProxyType({
+    "outside": 0, "fat": 1, "muscle": 2, "cranium": 3, "mandible": 4, "upper_teeth": 5,
+    "lower_teeth": 6, "air": 7, "brain": 8,
+})  # fmt: skip
 # Soft tissue that covers bone and teeth at least, mm; the thinnest is over the nasal bones.
 LEAST_COVER = 2.2
 # Width over which the cover melts into the skin as drawn, mm.

@@ -9,22 +9,12 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import as_number
 
 # Lowest and highest value of each parameter. Within them every part stays inside the skin.
-PARAMETER_RANGES = MappingProxyType(
-    {
-        "scale": (0.85, 1.15),
-        "face_height": (0.92, 1.10),
-        "nose_length": (-4.0, 5.0),
-        "nose_projection": (-4.0, 5.0),
-        "lip_fullness": (0.7, 1.3),
-        "lip_gap": (0.0, 8.0),
-        "chin_projection": (-5.0, 5.0),
-        "jaw_width": (0.92, 1.08),
-        "mandible_advance": (-6.0, 6.0),
-        "fat_thickness": (-1.0, 5.0),
-        "asymmetry": (-5.0, 5.0),
-        "bite_gap": (1.0, 6.0),
-    }
-)
+PARAMETER_RANGES = MappingProxyType({
+    "scale": (0.85, 1.15), "face_height": (0.92, 1.10), "nose_length": (-4.0, 5.0),
+    "nose_projection": (-4.0, 5.0), "lip_fullness": (0.7, 1.3), "lip_gap": (0.0, 8.0),
+    "chin_projection": (-5.0, 5.0), "jaw_width": (0.92, 1.08), "mandible_advance": (-6.0, 6.0),
+    "fat_thickness": (-1.0, 5.0), "asymmetry": (-5.0, 5.0), "bite_gap": (1.0, 6.0),
+})  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -10,21 +10,11 @@ from cmfsim.values.checks import Floats
 
 # Mean HU of each tissue at about 120 kV; round figures of the textbooks (Hounsfield 1973; Bushberg
 # 2012).
-HOUNSFIELD: Mapping[str, float] = MappingProxyType(
-    {
-        "air": -1000.0,
-        "skin": 40.0,
-        "fat": -90.0,
-        "muscle": 55.0,
-        "brain": 35.0,
-        "cortical": 1150.0,
-        "cancellous": 450.0,
-        "tooth": 2100.0,
-        "metal": 3071.0,
-        "couch_shell": -50.0,
-        "couch_foam": -920.0,
-    }
-)
+HOUNSFIELD: Mapping[str, float] = MappingProxyType({
+    "air": -1000.0, "skin": 40.0, "fat": -90.0, "muscle": 55.0, "brain": 35.0, "cortical": 1150.0,
+    "cancellous": 450.0, "tooth": 2100.0, "metal": 3071.0, "couch_shell": -50.0,
+    "couch_foam": -920.0,
+})  # fmt: skip
 # What an image can hold, HU: 12 bits with an offset of 1024.
 LOWEST, HIGHEST = -1024, 3071
 # Couch: mm between the head and its shell, thickness of the shell and of the foam, half width.

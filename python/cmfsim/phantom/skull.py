@@ -16,21 +16,11 @@ from cmfsim.values.checks import Floats
 CONDYLE = (50.0, -13.0, -5.0)
 # Middle line of the alveolar arch of either jaw as seen from above: x, y in mm.
 UPPER_ARCH = (
-    (0.0, -90.0),
-    (9.0, -88.0),
-    (18.0, -81.0),
-    (24.0, -70.0),
-    (27.5, -57.0),
-    (28.5, -45.0),
-)
+    (0.0, -90.0), (9.0, -88.0), (18.0, -81.0), (24.0, -70.0), (27.5, -57.0), (28.5, -45.0),
+)  # fmt: skip
 LOWER_ARCH = (
-    (0.0, -87.5),
-    (8.0, -85.5),
-    (16.5, -79.0),
-    (23.0, -68.5),
-    (27.0, -56.0),
-    (29.0, -43.0),
-)
+    (0.0, -87.5), (8.0, -85.5), (16.5, -79.0), (23.0, -68.5), (27.0, -56.0), (29.0, -43.0),
+)  # fmt: skip
 # Widths along the arch of incisors, canine, premolars and molars without the third, mm.
 UPPER_WIDTHS = (8.6, 6.6, 7.6, 7.0, 6.8, 10.0, 9.4)
 LOWER_WIDTHS = (5.4, 6.0, 6.9, 7.1, 7.1, 10.9, 10.4)

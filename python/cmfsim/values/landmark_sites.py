@@ -16,30 +16,20 @@ from cmfsim.errors import LandmarkInputError
 from cmfsim.values.checks import Floats
 
 _SKULL_MIDLINE: Mapping[str, tuple[float, float, float]] = {
-    "glabella": (0.0, -93.5, 43.2),
-    "infradentale": (0.0, -89.8, -53.5),
-    "menton": (0.0, -82.7, -83.9),
-    "mid_philtrum": (0.0, -95.2, -29.0),
-    "nasion": (0.0, -90.8, 29.7),
-    "pogonion": (0.0, -90.6, -74.3),
-    "rhinion": (0.0, -98.5, 11.0),
-    "supradentale": (0.0, -93.2, -32.5),
-    "supraglabella": (0.0, -90.6, 58.3),
+    "glabella": (0.0, -93.5, 43.2), "infradentale": (0.0, -89.8, -53.5),
+    "menton": (0.0, -82.7, -83.9), "mid_philtrum": (0.0, -95.2, -29.0),
+    "nasion": (0.0, -90.8, 29.7), "pogonion": (0.0, -90.6, -74.3), "rhinion": (0.0, -98.5, 11.0),
+    "supradentale": (0.0, -93.2, -32.5), "supraglabella": (0.0, -90.6, 58.3),
     "supramentale": (0.0, -89.3, -66.0),
-}
+}  # fmt: skip
 _SKULL_PAIRED: Mapping[str, tuple[float, float, float]] = {
-    "frontal_eminence": (31.5, -82.4, 68.0),
-    "gonion": (48.9, -20.0, -60.0),
-    "inferior_malar": (31.5, -76.2, -16.0),
-    "lateral_orbit": (56.0, -64.0, 4.0),
-    "occlusal_line": (51.7, -38.0, -45.0),
-    "sub_m2": (42.3, -49.0, -62.0),
-    "suborbital": (31.5, -79.8, 1.0),
-    "supra_m2": (34.1, -50.0, -27.0),
-    "supraglenoid": (64.5, -12.0, 5.0),
-    "supraorbital": (31.5, -85.7, 35.0),
+    "frontal_eminence": (31.5, -82.4, 68.0), "gonion": (48.9, -20.0, -60.0),
+    "inferior_malar": (31.5, -76.2, -16.0), "lateral_orbit": (56.0, -64.0, 4.0),
+    "occlusal_line": (51.7, -38.0, -45.0), "sub_m2": (42.3, -49.0, -62.0),
+    "suborbital": (31.5, -79.8, 1.0), "supra_m2": (34.1, -50.0, -27.0),
+    "supraglenoid": (64.5, -12.0, 5.0), "supraorbital": (31.5, -85.7, 35.0),
     "zygomatic_arch": (66.6, -29.5, 1.5),
-}
+}  # fmt: skip
 _SKIN_MIDLINE: Mapping[str, tuple[float, float, float]] = {
     "labiale_inferius": (0.0, -100.2, -53.2),
     "labiale_superius": (0.0, -102.2, -34.9),
@@ -58,21 +48,10 @@ _SKIN_PAIRED: Mapping[str, tuple[float, float, float]] = {
 # The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
 # in its text, so the choice is ours.
 SKIN_LANDMARKS = (
-    "nasion",
-    "pronasale",
-    "subnasale",
-    "labiale_superius",
-    "labiale_inferius",
-    "pogonion",
-    "exocanthion_L",
-    "exocanthion_R",
-    "endocanthion_L",
-    "endocanthion_R",
-    "alare_L",
-    "alare_R",
-    "cheilion_L",
-    "cheilion_R",
-)
+    "nasion", "pronasale", "subnasale", "labiale_superius", "labiale_inferius", "pogonion",
+    "exocanthion_L", "exocanthion_R", "endocanthion_L", "endocanthion_R", "alare_L", "alare_R",
+    "cheilion_L", "cheilion_R",
+)  # fmt: skip
 
 _SKIN_PLACES: Mapping[str, str] = {
     "nasion": "root of the nose, at the height of the nasofrontal suture",
@@ -161,14 +140,8 @@ SKIN_SITES: Mapping[str, str] = MappingProxyType(
 
 # Sites of the lower jaw, without their side.
 JAW_SITES = (
-    "infradentale",
-    "supramentale",
-    "pogonion",
-    "menton",
-    "gonion",
-    "occlusal_line",
-    "sub_m2",
-)
+    "infradentale", "supramentale", "pogonion", "menton", "gonion", "occlusal_line", "sub_m2",
+)  # fmt: skip
 
 
 def is_lower_site(name: str) -> bool:
@@ -214,55 +187,43 @@ CEPHALOMETRY: tuple[CephalometricSite, ...] = (
     CephalometricSite(("G",), "skull", "glabella", "glabella", "foremost point between the brows"),
     CephalometricSite(("Rhi", "Rh"), "skull", "rhinion", "rhinion", "tip of the nasal bones"),
     CephalometricSite(
-        ("A", "SS"),
-        "skull",
-        "A point, subspinale",
-        "mid_philtrum",
+        ("A", "SS"), "skull", "A point, subspinale", "mid_philtrum",
         "deepest point of the maxilla between anterior nasal spine and prosthion",
     ),
     CephalometricSite(
-        ("Pr", "SPr"),
-        "skull",
-        "prosthion",
-        "supradentale",
+        ("Pr", "SPr"), "skull", "prosthion", "supradentale",
         "edge of the bone between the upper central incisors",
     ),
     CephalometricSite(
-        ("Id",),
-        "skull",
-        "infradentale",
-        "infradentale",
+        ("Id",), "skull", "infradentale", "infradentale",
         "edge of the bone between the lower central incisors",
     ),
     CephalometricSite(
-        ("B",),
-        "skull",
-        "B point",
-        "supramentale",
+        ("B",), "skull", "B point", "supramentale",
         "deepest point of the mandible between infradentale and pogonion",
     ),
     CephalometricSite(
-        ("Pog", "Pg"), "skull", "pogonion", "pogonion", "foremost point of the bony chin"
+        ("Pog", "Pg"), "skull", "pogonion", "pogonion", "foremost point of the bony chin",
     ),
     CephalometricSite(("Me",), "skull", "menton", "menton", "lowest point of the chin"),
     CephalometricSite(
-        ("Or",), "skull", "orbitale", "suborbital", "lowest point of the rim of the orbit"
+        ("Or",), "skull", "orbitale", "suborbital", "lowest point of the rim of the orbit",
     ),
     CephalometricSite(
-        ("Zy",), "skull", "zygion", "zygomatic_arch", "outermost point of the zygomatic arch"
+        ("Zy",), "skull", "zygion", "zygomatic_arch", "outermost point of the zygomatic arch",
     ),
     CephalometricSite(("Go",), "skull", "gonion", "gonion", "point of the angle of the mandible"),
     CephalometricSite(("N'", "Na'"), "skin", "soft nasion", "nasion", "root of the nose"),
     CephalometricSite(("Prn", "Pn"), "skin", "pronasale", "pronasale", "tip of the nose"),
     CephalometricSite(("Sn",), "skin", "subnasale", "subnasale", "where septum and upper lip meet"),
     CephalometricSite(
-        ("Ls",), "skin", "labiale superius", "labiale_superius", "border of the upper vermilion"
+        ("Ls",), "skin", "labiale superius", "labiale_superius", "border of the upper vermilion",
     ),
     CephalometricSite(
-        ("Li",), "skin", "labiale inferius", "labiale_inferius", "border of the lower vermilion"
+        ("Li",), "skin", "labiale inferius", "labiale_inferius", "border of the lower vermilion",
     ),
     CephalometricSite(
-        ("Pog'", "Pg'"), "skin", "soft pogonion", "pogonion", "foremost point of the soft chin"
+        ("Pog'", "Pg'"), "skin", "soft pogonion", "pogonion", "foremost point of the soft chin",
     ),
     CephalometricSite(("Ex",), "skin", "exocanthion", "exocanthion", "outer corner of the eye"),
     CephalometricSite(("En",), "skin", "endocanthion", "endocanthion", "inner corner of the eye"),
@@ -273,43 +234,34 @@ CEPHALOMETRY: tuple[CephalometricSite, ...] = (
     CephalometricSite(("ANS",), "skull", "anterior nasal spine", "", "tip of the spine"),
     CephalometricSite(("PNS",), "skull", "posterior nasal spine", "", "tip of the spine"),
     CephalometricSite(
-        ("Po",),
-        "skull",
-        "porion",
-        "",
+        ("Po",), "skull", "porion", "",
         "highest point of the opening of the ear canal, on each side",
     ),
     CephalometricSite(("Co",), "skull", "condylion", "", "highest point of each condyle"),
     CephalometricSite(
-        ("Gn",), "skull", "gnathion", "", "point of the chin between pogonion and menton"
+        ("Gn",), "skull", "gnathion", "", "point of the chin between pogonion and menton",
     ),
     CephalometricSite(
-        ("U1", "UR1O", "UL1O"), "skull", "upper incisor", "", "edge of the upper central incisor"
+        ("U1", "UR1O", "UL1O"), "skull", "upper incisor", "", "edge of the upper central incisor",
     ),
     CephalometricSite(
-        ("L1", "LR1O", "LL1O"), "skull", "lower incisor", "", "edge of the lower central incisor"
+        ("L1", "LR1O", "LL1O"), "skull", "lower incisor", "", "edge of the lower central incisor",
     ),
     CephalometricSite(
-        ("U1R", "UR1R", "UL1R"), "skull", "root of the upper incisor", "", "tip of its root"
+        ("U1R", "UR1R", "UL1R"), "skull", "root of the upper incisor", "", "tip of its root",
     ),
     CephalometricSite(
-        ("L1R", "LR1R", "LL1R"), "skull", "root of the lower incisor", "", "tip of its root"
+        ("L1R", "LR1R", "LL1R"), "skull", "root of the lower incisor", "", "tip of its root",
     ),
     CephalometricSite(
-        ("U6", "UR6O", "UL6O", "UR6MB", "UL6MB"),
-        "skull",
-        "upper first molar",
-        "",
+        ("U6", "UR6O", "UL6O", "UR6MB", "UL6MB"), "skull", "upper first molar", "",
         "crown of the upper first molar: middle (O), mesiobuccal cusp (MB)",
     ),
     CephalometricSite(
-        ("L6", "LR6O", "LL6O", "LR6MB", "LL6MB"),
-        "skull",
-        "lower first molar",
-        "",
+        ("L6", "LR6O", "LL6O", "LR6MB", "LL6MB"), "skull", "lower first molar", "",
         "crown of the lower first molar: middle (O), mesiobuccal cusp (MB)",
     ),
-)
+)  # fmt: skip
 
 
 def named_site(label: str, kind: str) -> str | None:

@@ -11,19 +11,12 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, Frozen, as_floats, as_text, check_one_of, frozen
 
 # Arrays that each kind of tissue needs, with the number of axes after the first.
-TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType(
-    {
-        "isotropic": {"young": (), "poisson": ()},
-        "transversely_isotropic": {
-            "young_along": (),
-            "young_across": (),
-            "poisson": (),
-            "fibre": (3,),
-        },
-        "stiffness": {"stiffness": (6, 6)},
-        "preset": {"fraction": (), "fibre": (3,)},
-    }
-)
+TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType({
+    "isotropic": {"young": (), "poisson": ()},
+    "transversely_isotropic": {"young_along": (), "young_across": (), "poisson": (), "fibre": (3,)},
+    "stiffness": {"stiffness": (6, 6)},
+    "preset": {"fraction": (), "fibre": (3,)},
+})  # fmt: skip
 # Arrays of the above that may be left out.
 TISSUE_OPTIONAL = frozenset({("preset", "fibre")})
 # How the constants of fat and muscle mix: each modulus, or the whole stiffness.

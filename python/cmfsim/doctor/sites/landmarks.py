@@ -41,16 +41,10 @@ CLEARLY = 0.7
 # How far around a landmark the surface of an image is looked for, mm.
 REACH = 18.0
 # Every finding that this module makes, so that a build can replace those of the doctor.
-LANDMARK_CODES = frozenset(
-    {
-        "landmark-far",
-        "landmarks-shifted",
-        "landmarks-off",
-        "landmark-asymmetric",
-        "landmark-disagrees",
-        "landmarks-swapped",
-    }
-)
+LANDMARK_CODES = frozenset({
+    "landmark-far", "landmarks-shifted", "landmarks-off", "landmark-asymmetric",
+    "landmark-disagrees", "landmarks-swapped",
+})  # fmt: skip
 PLACED_FROM = {
     "skull": "cuts, muscles and the region are placed from it",
     "skin": "distances and the regions of the face depend on it",

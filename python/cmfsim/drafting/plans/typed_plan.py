@@ -13,13 +13,9 @@ from cmfsim.values.clinical_motion import clinical_motion, planned_motion
 
 # What each word does: which number of a motion it is, and its sign.
 SHIFTS = {
-    "forwards": (0, 1.0),
-    "backwards": (0, -1.0),
-    "up": (1, 1.0),
-    "down": (1, -1.0),
-    "left": (2, 1.0),
-    "right": (2, -1.0),
-}
+    "forwards": (0, 1.0), "backwards": (0, -1.0), "up": (1, 1.0), "down": (1, -1.0),
+    "left": (2, 1.0), "right": (2, -1.0),
+}  # fmt: skip
 TURNS = {"pitch": 0, "yaw": 1, "roll": 2}
 WORDS = (*SHIFTS, *TURNS)
 

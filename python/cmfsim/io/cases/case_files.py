@@ -50,26 +50,10 @@ CASE_FORMAT = "cmfsim-case"
 # What a case's file is called where its folder alone is given.
 CASE_FILE = "case.toml"
 TABLES = (
-    "format",
-    "version",
-    "name",
-    "note",
-    "image",
-    "surfaces",
-    "landmarks",
-    "region",
-    "mesh",
-    "lips",
-    "osteotomies",
-    "plan",
-    "node_kinds",
-    "tissue",
-    "muscles",
-    "solver",
-    "band",
-    "postoperative",
+    "format", "version", "name", "note", "image", "surfaces", "landmarks", "region", "mesh", "lips",
+    "osteotomies", "plan", "node_kinds", "tissue", "muscles", "solver", "band", "postoperative",
     "output",
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

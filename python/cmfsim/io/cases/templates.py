@@ -32,18 +32,9 @@ from cmfsim.values.surface_data import SurfaceData
 
 TEMPLATE_FILE = "template.toml"
 KEYS = (
-    "format",
-    "version",
-    "name",
-    "licence",
-    "attribution",
-    "source",
-    "skull",
-    "units",
-    "frame",
-    "landmarks",
-    "muscles",
-)
+    "format", "version", "name", "licence", "attribution", "source", "skull", "units", "frame",
+    "landmarks", "muscles",
+)  # fmt: skip
 MUSCLE_KEYS = ("name", "side", "kind", "file", "boxes", "course", "concepts")
 # File and line at the start of an error's text.
 PLACE = re.compile(r"([^\s:]+(?::\d+)?): (.*)", re.DOTALL)

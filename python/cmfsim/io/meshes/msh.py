@@ -21,18 +21,10 @@ MAX_LINE = 2**12
 Integers = NDArray[np.int64]
 # Gmsh's numbers of elements (its manual, MSH file format): name, number of nodes.
 ELEMENTS = {
-    1: ("line", 2),
-    2: ("triangle", 3),
-    3: ("quad", 4),
-    4: ("tetra", 4),
-    5: ("hexahedron", 8),
-    6: ("wedge", 6),
-    7: ("pyramid", 5),
-    8: ("line3", 3),
-    9: ("triangle6", 6),
-    11: ("tetra10", 10),
+    1: ("line", 2), 2: ("triangle", 3), 3: ("quad", 4), 4: ("tetra", 4), 5: ("hexahedron", 8),
+    6: ("wedge", 6), 7: ("pyramid", 5), 8: ("line3", 3), 9: ("triangle6", 6), 11: ("tetra10", 10),
     15: ("vertex", 1),
-}
+}  # fmt: skip
 
 WHOLE = re.compile(r"-?[0-9]{1,18}")
 

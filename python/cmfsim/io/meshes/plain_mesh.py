@@ -17,15 +17,9 @@ MAX_COORDINATE = 1e9
 
 # Corners of a cell of each type that has straight edges.
 CELL_CORNERS = {
-    "vertex": 1,
-    "line": 2,
-    "triangle": 3,
-    "quad": 4,
-    "tetra": 4,
-    "pyramid": 5,
-    "wedge": 6,
+    "vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6,
     "hexahedron": 8,
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

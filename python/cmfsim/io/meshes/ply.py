@@ -20,15 +20,11 @@ Column = NDArray[np.float64] | NDArray[np.int64]
 MAX_HEADER = 2**16
 ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": ""}
 TYPES = {
-    **dict.fromkeys((b"char", b"int8"), "i1"),
-    **dict.fromkeys((b"uchar", b"uint8"), "u1"),
-    **dict.fromkeys((b"short", b"int16"), "i2"),
-    **dict.fromkeys((b"ushort", b"uint16"), "u2"),
-    **dict.fromkeys((b"int", b"int32"), "i4"),
-    **dict.fromkeys((b"uint", b"uint32"), "u4"),
-    **dict.fromkeys((b"float", b"float32"), "f4"),
-    **dict.fromkeys((b"double", b"float64"), "f8"),
-}
+    **dict.fromkeys((b"char", b"int8"), "i1"), **dict.fromkeys((b"uchar", b"uint8"), "u1"),
+    **dict.fromkeys((b"short", b"int16"), "i2"), **dict.fromkeys((b"ushort", b"uint16"), "u2"),
+    **dict.fromkeys((b"int", b"int32"), "i4"), **dict.fromkeys((b"uint", b"uint32"), "u4"),
+    **dict.fromkeys((b"float", b"float32"), "f4"), **dict.fromkeys((b"double", b"float64"), "f8"),
+}  # fmt: skip
 END = re.compile(rb"(?:^|(?<=[\r\n]))end_header[ \t]*(?:\r\n|\n|\r)")
 AXES = (b"x", b"y", b"z")
 CORNERS = (b"vertex_indices", b"vertex_index")

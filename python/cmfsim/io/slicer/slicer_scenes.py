@@ -40,19 +40,11 @@ MAX_ELEMENTS, MAX_DEPTH = 100_000, 64
 # Bytes of a name that every system takes, and characters of one that are kept and shown.
 MAX_NAME = 200
 # What elements of a scene are, by their name in MRML.
-KINDS: Mapping[str, str] = MappingProxyType(
-    {
-        "Model": "model",
-        "Segmentation": "segmentation",
-        "Volume": "volume",
-        "LabelMapVolume": "segmentation",
-        "LinearTransform": "transform",
-        "Transform": "transform",
-        "BSplineTransform": "transform",
-        "GridTransform": "transform",
-        "MarkupsFiducial": "markups",
-    }
-)
+KINDS: Mapping[str, str] = MappingProxyType({
+    "Model": "model", "Segmentation": "segmentation", "Volume": "volume",
+    "LabelMapVolume": "segmentation", "LinearTransform": "transform", "Transform": "transform",
+    "BSplineTransform": "transform", "GridTransform": "transform", "MarkupsFiducial": "markups",
+})  # fmt: skip
 REFERENCE = re.compile(r"([A-Za-z0-9_./-]+):([^;]*)")
 MATRIX = "matrixTransformToParent"
 

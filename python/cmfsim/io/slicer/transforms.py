@@ -463,16 +463,10 @@ def _no_turn(parameters: Floats, fixed: Floats) -> Floats:
 
 
 # Number of parameters of each kind, and the rotation that they describe.
-ITK_KINDS: Mapping[str, tuple[int, Callable[[Floats, Floats], Floats]]] = MappingProxyType(
-    {
-        "Euler3DTransform": (6, _euler),
-        "VersorRigid3DTransform": (6, _versor),
-        "VersorTransform": (3, _versor),
-        "TranslationTransform": (3, _no_turn),
-        "IdentityTransform": (0, _no_turn),
-        "AffineTransform": (12, _matrix),
-        "MatrixOffsetTransformBase": (12, _matrix),
-        "Rigid3DTransform": (12, _matrix),
-    }
-)
+ITK_KINDS: Mapping[str, tuple[int, Callable[[Floats, Floats], Floats]]] = MappingProxyType({
+    "Euler3DTransform": (6, _euler), "VersorRigid3DTransform": (6, _versor),
+    "VersorTransform": (3, _versor), "TranslationTransform": (3, _no_turn),
+    "IdentityTransform": (0, _no_turn), "AffineTransform": (12, _matrix),
+    "MatrixOffsetTransformBase": (12, _matrix), "Rigid3DTransform": (12, _matrix),
+})  # fmt: skip
 WITHOUT_SHIFT = ("VersorTransform", "IdentityTransform")

@@ -27,15 +27,10 @@ NEAREST, FOLLOWS, FADED = 4, 6.0, 20.0
 # The plan in numbers: the motions of these landmarks of the skull, by what may carry them.
 BODY = ("mandible_body", "mandible")
 FEATURES = {
-    "supradentale": ("maxilla",),
-    "supra_m2_L": ("maxilla",),
-    "supra_m2_R": ("maxilla",),
-    "infradentale": BODY,
-    "sub_m2_L": BODY,
-    "sub_m2_R": BODY,
-    "pogonion": ("chin", *BODY),
+    "supradentale": ("maxilla",), "supra_m2_L": ("maxilla",), "supra_m2_R": ("maxilla",),
+    "infradentale": BODY, "sub_m2_L": BODY, "sub_m2_R": BODY, "pogonion": ("chin", *BODY),
     "menton": ("chin", *BODY),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,16 +15,9 @@ from cmfsim.values.checks import Floats
 
 # Regions in the order of the tables.
 REGIONS = (
-    "face",
-    "lower face",
-    LIPS,
-    "upper lip",
-    "lower lip",
-    "chin",
-    "nose",
-    "left cheek",
+    "face", "lower face", LIPS, "upper lip", "lower lip", "chin", "nose", "left cheek",
     "right cheek",
-)
+)  # fmt: skip
 FIGURES = ("mean", "p95", "within", "normal")
 # What is usually called acceptable, mm.
 WITHIN = 2.0

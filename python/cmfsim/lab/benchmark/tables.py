@@ -25,21 +25,10 @@ ABOUT = (
 
 FORMAT = "cmfsim-benchmark"
 COLUMNS = (
-    "method",
-    "region",
-    "patients",
-    "of",
-    "mean_mm",
-    "sd_between_patients_mm",
-    "p95_mm",
-    "share_within_2mm",
-    "normal_mm",
-    "patients_with_band",
-    "share_covered",
-    "half_width_mm",
-    "calibration_patients",
-    "standard_deviations",
-)
+    "method", "region", "patients", "of", "mean_mm", "sd_between_patients_mm", "p95_mm",
+    "share_within_2mm", "normal_mm", "patients_with_band", "share_covered", "half_width_mm",
+    "calibration_patients", "standard_deviations",
+)  # fmt: skip
 NOTE = (
     "In silico: synthetic heads and computed operations, no patients. Each figure is the mean "
     "over patients. The error at a vertex is the length of the difference from its true "

@@ -11,17 +11,9 @@ from cmfsim.lab.frontier.skin_points import SKIN, WHOLE
 TARGET = 0.1
 GRID = ("edge_length", "element", "kinematics")
 TITLES = (
-    "mean",
-    "P95",
-    "max",
-    "skin",
-    "build s",
-    "solve s (min–max)",
-    "times base (min–max)",
-    "CPU s",
-    "peak MB",
-    "front",
-)
+    "mean", "P95", "max", "skin", "build s", "solve s (min–max)", "times base (min–max)", "CPU s",
+    "peak MB", "front",
+)  # fmt: skip
 DASH = "–"
 
 

@@ -60,16 +60,9 @@ THICKNESS_CHANGE = next(source.sd for source in ADDED if source.name == "thickne
 # several ranges at once.
 MIDDLE = 0.7
 SHAPES = (
-    "scale",
-    "face_height",
-    "nose_length",
-    "nose_projection",
-    "lip_fullness",
-    "chin_projection",
-    "jaw_width",
-    "fat_thickness",
-    "asymmetry",
-)
+    "scale", "face_height", "nose_length", "nose_projection", "lip_fullness", "chin_projection",
+    "jaw_width", "fat_thickness", "asymmetry",
+)  # fmt: skip
 
 
 # How the true tissue is made: with muscles, moduli and sliding of its own, or with those that the
@@ -92,13 +85,9 @@ MUSCLE_OFFSET: Distribution = (0.0, 2.9, 5.8)
 # Share of persons who lack a muscle of expression on both sides, and the muscles nobody lacks.
 LACKING = 0.1
 NEVER_LACKING = (
-    "masseter",
-    "temporalis",
-    "medial_pterygoid",
-    "buccinator",
-    "orbicularis_oris",
+    "masseter", "temporalis", "medial_pterygoid", "buccinator", "orbicularis_oris",
     "orbicularis_oculi",
-)
+)  # fmt: skip
 # Depth of the vestibule beyond that which the models assume, mm.
 VESTIBULE: Distribution = (0.0, 2.0, 4.0)
 

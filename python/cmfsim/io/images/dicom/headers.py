@@ -23,48 +23,23 @@ INVERTED = re.compile(
 )
 # Elements that are kept, by their tag.
 NAMES: Mapping[int, str] = {
-    0x00020010: "transfer_syntax",
-    0x00041220: "directory_records",
-    0x00080008: "image_type",
-    0x00080016: "sop_class",
-    0x00080022: "acquisition_date",
-    0x00080032: "acquisition_time",
-    0x00080060: "modality",
-    0x0008103E: "series_description",
-    0x00100020: "patient_id",
-    0x00180050: "thickness",
-    0x00180088: "slice_spacing",
-    0x00181120: "gantry_tilt",
-    0x0020000D: "study_uid",
-    0x0020000E: "series_uid",
-    0x00200011: "series_number",
-    0x00200012: "acquisition_number",
-    0x00200013: "instance_number",
-    0x00200032: "position",
-    0x00200037: "orientation",
-    0x00200052: "frame_of_reference",
-    0x00280002: "samples",
-    0x00280004: "photometric",
-    0x00280008: "n_frames",
-    0x00280010: "rows",
-    0x00280011: "columns",
-    0x00280030: "pixel_spacing",
-    0x00280100: "bits",
-    0x00281052: "intercept",
-    0x00281053: "slope",
-    0x00281054: "rescale_type",
-    0x3004000C: "frame_offsets",
-}
+    0x00020010: "transfer_syntax", 0x00041220: "directory_records", 0x00080008: "image_type",
+    0x00080016: "sop_class", 0x00080022: "acquisition_date", 0x00080032: "acquisition_time",
+    0x00080060: "modality", 0x0008103E: "series_description", 0x00100020: "patient_id",
+    0x00180050: "thickness", 0x00180088: "slice_spacing", 0x00181120: "gantry_tilt",
+    0x0020000D: "study_uid", 0x0020000E: "series_uid", 0x00200011: "series_number",
+    0x00200012: "acquisition_number", 0x00200013: "instance_number", 0x00200032: "position",
+    0x00200037: "orientation", 0x00200052: "frame_of_reference", 0x00280002: "samples",
+    0x00280004: "photometric", 0x00280008: "n_frames", 0x00280010: "rows", 0x00280011: "columns",
+    0x00280030: "pixel_spacing", 0x00280100: "bits", 0x00281052: "intercept", 0x00281053: "slope",
+    0x00281054: "rescale_type", 0x3004000C: "frame_offsets",
+}  # fmt: skip
 # Sequences that are read, and what is in them.
 SEQUENCES: Mapping[int, str] = {
-    0x52009229: "shared",
-    0x52009230: "per_frame",
-    0x00209111: "content",
-    0x00209113: "plane_position",
-    0x00209116: "plane_orientation",
-    0x00289110: "pixel_measures",
+    0x52009229: "shared", 0x52009230: "per_frame", 0x00209111: "content",
+    0x00209113: "plane_position", 0x00209116: "plane_orientation", 0x00289110: "pixel_measures",
     0x00289145: "value_transformation",
-}
+}  # fmt: skip
 # Whole numbers of 16 bits in binary; all others are text.
 BINARY = frozenset({"samples", "rows", "columns", "bits"})
 PIXELS = 0x7FE00010

@@ -9,18 +9,9 @@ from cmfsim.io.meshes.plain_mesh import CELL_CORNERS, Cells
 Integers = NDArray[np.int64]
 # VTK's numbers (vtkCellType.h); other cells keep their number as their name.
 NAMES = {
-    1: "vertex",
-    3: "line",
-    5: "triangle",
-    9: "quad",
-    10: "tetra",
-    12: "hexahedron",
-    13: "wedge",
-    14: "pyramid",
-    21: "line3",
-    22: "triangle6",
-    24: "tetra10",
-}
+    1: "vertex", 3: "line", 5: "triangle", 9: "quad", 10: "tetra", 12: "hexahedron", 13: "wedge",
+    14: "pyramid", 21: "line3", 22: "triangle6", 24: "tetra10",
+}  # fmt: skip
 
 
 def cells_by_type(

@@ -9,13 +9,9 @@ from numpy.typing import NDArray
 
 VTK_TETRA = 10
 VTK_TYPES = {
-    "float64": "Float64",
-    "float32": "Float32",
-    "uint32": "UInt32",
-    "int32": "Int32",
-    "int64": "Int64",
-    "uint8": "UInt8",
-}
+    "float64": "Float64", "float32": "Float32", "uint32": "UInt32", "int32": "Int32",
+    "int64": "Int64", "uint8": "UInt8",
+}  # fmt: skip
 
 
 def data_array(name: str, array: NDArray[Any]) -> str:

@@ -13,13 +13,9 @@ from cmfsim.values.checks import Floats
 
 # (i, j, k, ε_ijk) that are not zero.
 PERMUTATIONS = (
-    (0, 1, 2, 1.0),
-    (1, 2, 0, 1.0),
-    (2, 0, 1, 1.0),
-    (0, 2, 1, -1.0),
-    (2, 1, 0, -1.0),
+    (0, 1, 2, 1.0), (1, 2, 0, 1.0), (2, 0, 1, 1.0), (0, 2, 1, -1.0), (2, 1, 0, -1.0),
     (1, 0, 2, -1.0),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
