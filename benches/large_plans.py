@@ -18,7 +18,7 @@ import numpy as np
 
 import cmfsim
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.solving.simulation import least_volume_ratios
+from cmfsim.solving.inversion import least_volume_ratios
 from cmfsim.values.case_parts import CaseMotion
 
 # Motion of maxilla and mandible, mm, LPS: y backwards, z up.

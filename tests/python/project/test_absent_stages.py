@@ -31,7 +31,7 @@ STAGES = {
     "cmfsim.doctor",
     "cmfsim.evaluation",
     "cmfsim.lab.virtual",
-    "cmfsim.solving.simulation",
+    "cmfsim.solving.inversion",
     "cmfsim.io",
     "cmfsim.meshing",
     "cmfsim.meshing.node_kinds",

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-import cmfsim.solving.simulation
-from cmfsim.solving.simulation import inversion_finding, least_volume_ratios
+import cmfsim.solving.inversion
+from cmfsim.solving.inversion import inversion_finding, least_volume_ratios
 from meshes import box
 
 LENGTH = 60.0  # mm
@@ -91,7 +91,7 @@ def test_hyperelastic_tissue_under_a_punch_inverts_nowhere(depth, sideways):
 
 def test_linear_kinematics_counts_nothing_and_pays_nothing(monkeypatch, caplog):
     """Though this bar's end passes through the held one."""
-    monkeypatch.delattr(cmfsim.solving.simulation, "inversion_finding")
+    monkeypatch.delattr(cmfsim.solving.inversion, "inversion_finding")
     result = cmfsim.solve_scene(bar("linear", shift=-1.5 * LENGTH))
     moved = signed_volumes(result.nodes + result.displacements, result.tets)
     assert moved.min() < 0.0
