@@ -127,7 +127,10 @@ def contact_sheet(
     Examples
     --------
     >>> import cmfsim
-    >>> sheet = cmfsim.contact_sheet("maxilla", anatomy.bones["cranium"], arch)  # doctest: +SKIP
+    >>> arches = cmfsim.dental_arches(anatomy, segments, landmarks)
+    >>> sheet = cmfsim.contact_sheet(
+    ...     "maxilla", anatomy.bones["cranium"], arches.by_jaw["upper"]
+    ... )
     """
     options = options or SheetOptions()
     grid = _Grid(name, bone, arch, options)

@@ -85,8 +85,9 @@ def skin_regions(
     Examples
     --------
     >>> import cmfsim
-    >>> regions = cmfsim.skin_regions(skin.vertices, landmarks)  # doctest: +SKIP
-    >>> regions["chin"].sum()  # doctest: +SKIP
+    >>> regions = cmfsim.skin_regions(skin.vertices, skin_landmarks)
+    >>> bool(regions["chin"].any())
+    True
     """
     return _regions(points, landmarks, _outlines)
 
@@ -115,7 +116,7 @@ def unmoved_regions(
     Examples
     --------
     >>> import cmfsim
-    >>> regions = cmfsim.unmoved_regions(points, landmarks)  # doctest: +SKIP
+    >>> regions = cmfsim.unmoved_regions(skin.vertices, skin_landmarks)
     """
     return _regions(points, landmarks, _unmoved_outlines)
 

@@ -100,8 +100,8 @@ def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) ->
     Examples
     --------
     >>> import cmfsim
-    >>> landmarks = cmfsim.read_landmarks("skull.mrk.json")  # doctest: +SKIP
-    >>> landmarks["nasion"].shape  # doctest: +SKIP
+    >>> landmarks = cmfsim.read_landmarks("skull.mrk.json")
+    >>> landmarks["nasion"].shape
     (3,)
     """
     found = _read(path, frame)

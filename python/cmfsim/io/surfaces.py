@@ -72,7 +72,7 @@ def read_surface(
     Examples
     --------
     >>> import cmfsim
-    >>> skin = cmfsim.read_surface("skin.stl", units="mm", frame="RAS")  # doctest: +SKIP
+    >>> skin = cmfsim.read_surface("skin.stl", units="mm", frame="RAS")
     """
     read = read_surface_file(path, crease_angle, units=units, frame=frame)
     for finding in read.findings:
@@ -139,7 +139,7 @@ def read_moved_surface(
     Examples
     --------
     >>> import cmfsim
-    >>> motion = cmfsim.read_moved_surface("mandible.ply", "mandible_post.ply")  # doctest: +SKIP
+    >>> motion = cmfsim.read_moved_surface("mandible.ply", "mandible_post.ply")
     """
     (here, triangles, its), (there, moved_triangles, other) = (
         _numbered(Path(path)) for path in (before, after)

@@ -91,7 +91,11 @@ def anatomy_from_surfaces(
     Examples
     --------
     >>> import cmfsim
-    >>> anatomy = cmfsim.anatomy_from_surfaces(skin, {"skull": skull})  # doctest: +SKIP
+    >>> skin = cmfsim.read_surface("skin.ply")
+    >>> bones = {name: cmfsim.read_surface(f"{name}.ply") for name in ("cranium", "mandible")}
+    >>> anatomy = cmfsim.anatomy_from_surfaces(skin, bones, spacing=3.0)
+    >>> sorted(anatomy.bones)
+    ['cranium', 'mandible']
     """
     as_positive("spacing", spacing)
     if not bones:

@@ -94,8 +94,8 @@ def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tup
     Examples
     --------
     >>> import cmfsim
-    >>> region = cmfsim.TissueRegion(point=(0, -120, 0))
-    >>> level, findings = cmfsim.tissue_level(anatomy, region)  # doctest: +SKIP
+    >>> region = cmfsim.TissueRegion(point=(0, -10, 0))
+    >>> level, findings = cmfsim.tissue_level(anatomy, region)
     """
     grid = anatomy.skin
     level: Levels = np.array(grid.values, dtype=np.float32)

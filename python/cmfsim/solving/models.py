@@ -49,7 +49,7 @@ def model_scene(patient: PatientModel, model: str = "M+S") -> Scene:
     Examples
     --------
     >>> import cmfsim
-    >>> scene = cmfsim.model_scene(patient, "H+S")  # doctest: +SKIP
+    >>> scene = cmfsim.model_scene(patient, "H+S")
     """
     check_one_of("model", model, MODELS)
     left_out = any(finding.code == "muscles-left-out" for finding in patient.findings)
@@ -93,8 +93,9 @@ def predict_patient(
     Examples
     --------
     >>> import cmfsim
-    >>> prediction = cmfsim.predict_patient(patient, "H")  # doctest: +SKIP
-    >>> prediction.skin.vertices  # doctest: +SKIP
+    >>> prediction = cmfsim.predict_patient(patient, "H+S")
+    >>> len(prediction.skin.vertices) == len(prediction.skin_displacements)
+    True
     """
     return solved_patient(patient, model, solver=solver).prediction
 

@@ -51,8 +51,9 @@ def scene_solver(scene: Scene) -> StaticSolver:
     Examples
     --------
     >>> import cmfsim
-    >>> solver = cmfsim.scene_solver(scene)  # doctest: +SKIP
-    >>> solver.solve({"maxilla": cmfsim.rigid_motion((0, -5, 0))})  # doctest: +SKIP
+    >>> solver = cmfsim.scene_solver(scene)
+    >>> plan = cmfsim.scene_plan(scene) | {"maxilla": cmfsim.rigid_motion((0, -5, 0))}
+    >>> solution = solver.solve(plan)
     """
     mesh = TetMesh(scene.nodes, scene.tets)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
@@ -105,7 +106,7 @@ def scene_plan(scene: Scene) -> dict[str, NDArray[np.float64] | SurfaceMotion]:
     Examples
     --------
     >>> import cmfsim
-    >>> plan = cmfsim.scene_plan(scene)  # doctest: +SKIP
+    >>> plan = cmfsim.scene_plan(scene)
     """
     plan: dict[str, NDArray[np.float64] | SurfaceMotion] = {}
     for name, motion in scene.plan.items():
@@ -309,8 +310,8 @@ def slip_finding(scene: Scene, displacements: ArrayLike) -> Finding | None:
     --------
     >>> import cmfsim
     >>> from cmfsim.solving.simulation import slip_finding
-    >>> result = cmfsim.solve_scene(scene)  # doctest: +SKIP
-    >>> slip_finding(scene, result.displacements)  # doctest: +SKIP
+    >>> result = cmfsim.solve_scene(scene)
+    >>> slip_finding(scene, result.displacements)
     """
     if scene.options.contact != "bilateral":
         return None

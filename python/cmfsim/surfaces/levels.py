@@ -159,7 +159,8 @@ def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> 
     Examples
     --------
     >>> import cmfsim
-    >>> cmfsim.contact_surface(segments["maxilla"], relief=2.0)  # doctest: +SKIP
+    >>> maxilla = next(segment for segment in segments if segment.name == "maxilla")
+    >>> surface = cmfsim.contact_surface(maxilla, relief=2.0)
     """
     sigma = as_positive("relief", relief) / segment.level.spacing
     ndimage = third_party("scipy.ndimage", "contact surfaces are smoothed", "imaging")

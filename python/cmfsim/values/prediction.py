@@ -148,7 +148,7 @@ class Prediction(Frozen):
         --------
         >>> import cmfsim
         >>> motion = cmfsim.rigid_motion(translation=(0, -4, 0))
-        >>> other = prediction.replan({"maxilla": motion})  # doctest: +SKIP
+        >>> other = prediction.replan({"maxilla": motion})
         """
         if self.predicted_by is None:
             raise CaseInputError(

@@ -50,11 +50,13 @@ class Observer:
     Examples
     --------
     >>> import cmfsim
+    >>> stages = []
     >>> class Log(cmfsim.Observer):
     ...     def stage(self, name):
-    ...         print(name)
-    >>> prediction = cmfsim.predict("case.toml", observer=Log())  # doctest: +SKIP
-    checking the case
+    ...         stages.append(name)
+    >>> prediction = cmfsim.predict("case.toml", model="H", observer=Log())
+    >>> stages[0]
+    'checking the case'
     """
 
     def stage(self, name: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from example_world import example_values, write_example_files
 
 ROOT = Path(__file__).parents[3]
 MODULES = sorted(
@@ -81,11 +82,23 @@ def test_replanning_is_exact():
     assert importlib.import_module("replan").main() < 1e-9
 
 
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """The values that examples speak of, in the folder that holds their files."""
+    values = example_values(tmp_path_factory)
+    folder = tmp_path_factory.mktemp("examples") / "case"
+    write_example_files(folder, values)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        yield values
+
+
 @pytest.mark.parametrize("name", MODULES)
-def test_docstring_examples_hold(name, tmp_path, monkeypatch):
-    """Every example in a docstring that is not marked as a sketch."""
-    monkeypatch.chdir(tmp_path)
-    assert doctest.testmod(importlib.import_module(name)).failed == 0
+def test_docstring_examples_hold(name, world):
+    """Every example in a docstring, but for those that are marked: they take minutes."""
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    module = importlib.import_module(name)
+    assert doctest.testmod(module, extraglobs=world, optionflags=flags).failed == 0
 
 
 def test_every_public_function_of_the_package_has_an_example():

@@ -182,7 +182,9 @@ def segments_from_surfaces(
     Examples
     --------
     >>> import cmfsim
-    >>> cmfsim.segments_from_surfaces(anatomy.bones, anatomy.surfaces)  # doctest: +SKIP
+    >>> found = cmfsim.segments_from_surfaces(anatomy.bones, anatomy.surfaces)
+    >>> [segment.name for segment in found]
+    ['cranium', 'mandible']
     """
     for name in surfaces:
         if name != "skin" and name not in levels:

@@ -254,7 +254,9 @@ def place_procedure(
     Examples
     --------
     >>> import cmfsim
-    >>> cmfsim.place_procedure("le_fort_1", landmarks, {"height": 4.0})  # doctest: +SKIP
+    >>> placed = cmfsim.place_procedure("le_fort_1", landmarks, {"height": 4.0})
+    >>> [cut.segment for cut in placed.cuts]
+    ['maxilla']
     """
     chosen = _chosen_options(kind, options or {})
     given = {n: _point(kind, n, place) for n, place in landmarks.items() if n in SKULL_LANDMARKS}

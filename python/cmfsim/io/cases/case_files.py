@@ -98,7 +98,7 @@ class Case:
     Examples
     --------
     >>> import cmfsim
-    >>> case = cmfsim.Case.load("case.toml")  # doctest: +SKIP
+    >>> case = cmfsim.Case.load("case.toml")
     """
 
     name: str

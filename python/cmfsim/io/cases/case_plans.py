@@ -177,7 +177,7 @@ def write_plan(
     --------
     >>> import cmfsim
     >>> motion = cmfsim.rigid_motion(translation=(0, -4, 0))
-    >>> cmfsim.write_plan("plan.toml", {"maxilla": motion})  # doctest: +SKIP
+    >>> cmfsim.write_plan("plan.toml", {"maxilla": motion})
     """
     lines = [
         "# Plan. Not a medical device.",

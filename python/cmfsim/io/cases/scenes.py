@@ -78,7 +78,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     Examples
     --------
     >>> import cmfsim
-    >>> scene = cmfsim.read_scene("scene.npz")  # doctest: +SKIP
+    >>> scene = cmfsim.read_scene("scene.npz")
     """
     path = Path(path)
     if path.suffix == ".toml":
@@ -108,7 +108,7 @@ def write_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     Examples
     --------
     >>> import cmfsim
-    >>> cmfsim.write_scene("scene.npz", scene)  # doctest: +SKIP
+    >>> cmfsim.write_scene("scene.npz", scene)
     """
     path = Path(path)
     if path.suffix != ".npz":
@@ -142,7 +142,8 @@ def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[A
     Examples
     --------
     >>> import cmfsim
-    >>> plan = cmfsim.read_plan("plan.toml", scene)  # doctest: +SKIP
+    >>> cmfsim.write_plan("whole_plan.toml", cmfsim.scene_plan(scene))
+    >>> plan = cmfsim.read_plan("whole_plan.toml", scene)
     """
     path = Path(path)
     with named(path):

@@ -61,7 +61,7 @@ class CaseChanges:
     --------
     >>> import cmfsim
     >>> changes = cmfsim.CaseChanges({"muscles": {"fit": False}})
-    >>> case = cmfsim.Case.load("case.toml", changes=changes)  # doctest: +SKIP
+    >>> case = cmfsim.Case.load("case.toml", changes=changes)
     """
 
     values: Mapping[str, Any]

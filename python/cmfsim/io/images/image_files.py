@@ -78,7 +78,7 @@ def read_image(path: str | os.PathLike[str], *, series: str | None = None) -> Im
     Examples
     --------
     >>> import cmfsim
-    >>> image = cmfsim.read_image("head.nii.gz")  # doctest: +SKIP
+    >>> image = cmfsim.read_image("head.nii.gz")
     """
     return read_image_file(path, series=series).image
 
@@ -132,7 +132,7 @@ def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
     --------
     >>> import cmfsim, numpy as np
     >>> image = cmfsim.ImageData(np.zeros((4, 4, 4), dtype=np.int16), spacing=(1, 1, 1))
-    >>> cmfsim.write_image(image, "image.nrrd")  # doctest: +SKIP
+    >>> cmfsim.write_image(image, "image.nrrd")
     """
     path = Path(path)
     suffix = next((s for s in SUFFIXES if path.name.lower().endswith(s)), None)

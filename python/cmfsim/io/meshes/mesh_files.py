@@ -192,7 +192,7 @@ def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], ND
     Examples
     --------
     >>> import cmfsim
-    >>> nodes, tets = cmfsim.read_tet_mesh("mesh.vtu")  # doctest: +SKIP
+    >>> nodes, tets = cmfsim.read_tet_mesh("mesh.vtu")
     """
     path = Path(path)
     mesh = read_mesh(path)

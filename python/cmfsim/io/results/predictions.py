@@ -306,7 +306,7 @@ def write_prediction(
     Examples
     --------
     >>> import cmfsim
-    >>> names = cmfsim.write_prediction("out", prediction)  # doctest: +SKIP
+    >>> names = cmfsim.write_prediction("out", prediction)
     """
     folder = Path(folder)
     key = str(prediction.summary.get("case_key", ""))

@@ -31,7 +31,7 @@ def read_result(path: str | os.PathLike[str]) -> SceneResult:
     Examples
     --------
     >>> import cmfsim
-    >>> result = cmfsim.read_result("out.npz")  # doctest: +SKIP
+    >>> result = cmfsim.read_result("out.npz")
     """
     path = Path(path)
     with named(path):
@@ -95,7 +95,7 @@ def write_result(path: str | os.PathLike[str], result: SceneResult) -> None:
     Examples
     --------
     >>> import cmfsim
-    >>> cmfsim.write_result("out.vtu", result)  # doctest: +SKIP
+    >>> cmfsim.write_result("out.vtu", result)
     """
     path = Path(path)
     if path.suffix not in result_suffixes():

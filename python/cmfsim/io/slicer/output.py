@@ -156,7 +156,7 @@ def write_slicer_bundle(path: str | os.PathLike[str], prediction: Prediction) ->
     Examples
     --------
     >>> import cmfsim
-    >>> cmfsim.write_slicer_bundle("face.mrb", prediction)  # doctest: +SKIP
+    >>> cmfsim.write_slicer_bundle("face.mrb", prediction)
     """
     path = Path(path)
     scene = _Scene()

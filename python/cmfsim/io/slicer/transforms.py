@@ -119,7 +119,7 @@ def read_transform(
     >>> import cmfsim
     >>> motion = cmfsim.read_transform(
     ...     "maxilla.tfm", direction="from-parent"
-    ... )  # doctest: +SKIP
+    ... )
     """
     return read_transform_file(path, direction=direction, frame=frame).matrix
 
@@ -220,7 +220,7 @@ def write_transform(
     --------
     >>> import cmfsim
     >>> motion = cmfsim.rigid_motion((0, -5, 0))
-    >>> cmfsim.write_transform("a.tfm", motion, direction="from-parent")  # doctest: +SKIP
+    >>> cmfsim.write_transform("a.tfm", motion, direction="from-parent")
     """
     path = Path(path)
     check_one_of("frame", frame, FRAMES)

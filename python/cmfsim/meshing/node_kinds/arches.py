@@ -66,7 +66,7 @@ def dental_arches(
     Examples
     --------
     >>> import cmfsim
-    >>> arches = cmfsim.dental_arches(anatomy, segments, landmarks)  # doctest: +SKIP
+    >>> arches = cmfsim.dental_arches(anatomy, segments, landmarks)
     """
     landmarks = landmarks or {}
     missing = [n for n in (*UPPER_ARCH, *LOWER_ARCH) if n not in landmarks]

@@ -155,7 +155,7 @@ def fit_muscles(morphed: MorphedMusculature, anatomy: Anatomy) -> MuscleFit:
     >>> head = cmfsim.make_head()
     >>> template = cmfsim.MuscleTemplate.load("default")
     >>> muscles = template.morph(head.skull_landmarks)
-    >>> fit = cmfsim.fit_muscles(muscles, head.anatomy(3.0))  # doctest: +SKIP
+    >>> fit = cmfsim.fit_muscles(muscles, head.anatomy(3.0))
     """
     begun = time.perf_counter()
     vertices = np.concatenate([m.surface.vertices for m in morphed.muscles])

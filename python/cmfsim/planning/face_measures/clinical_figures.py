@@ -37,8 +37,9 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
     Examples
     --------
     >>> import cmfsim
-    >>> cmfsim.clinical_figures(prediction)["cephalometry"][2]["planned"]  # doctest: +SKIP
-    2.4
+    >>> figures = cmfsim.clinical_figures(prediction)["cephalometry"]
+    >>> [measure["label"] for measure in figures][:3]
+    ['SNA', 'SNB', 'ANB']
     """
     patient = prediction.patient
     bone, sites = _bone_sites(patient), face.face_sites(patient)

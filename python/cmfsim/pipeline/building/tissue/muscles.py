@@ -106,7 +106,7 @@ def with_muscles(
     Examples
     --------
     >>> import cmfsim
-    >>> patient = cmfsim.with_muscles(patient, cmfsim.CaseMuscles())  # doctest: +SKIP
+    >>> patient = cmfsim.with_muscles(patient, cmfsim.CaseMuscles())
     """
     begun = time.perf_counter()
     if placed is None:
