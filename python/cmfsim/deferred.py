@@ -18,10 +18,7 @@ def deferred(
     The stub next to its `__init__.py` has the one list of its public names, a line each:
     `from module import name as name`. Modules and folders of the package too are attributes.
 
-    Parameters
-    ----------
-    package, file : str
-        Its `__name__` and `__file__`.
+    package, file: Its `__name__` and `__file__`.
     """
     stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
     home_of = {name: home for home, name in PUBLIC.findall(stub)}

@@ -99,21 +99,11 @@ def third_party(
 ) -> Any:
     """A module of an optional dependency; an error names the pip line for a missing one.
 
-    Parameters
-    ----------
-    module : str
-        As `import` takes it: "scipy.ndimage".
-    purpose : str
-        Its use, as the beginning of a sentence: "bones are cut".
-    extra : str
-        The extra of cmfsim that installs it.
-    error : type of CmfsimError
-        What to raise.
-
-    Raises
-    ------
-    CmfsimError
-        (of type `error`) The module cannot be imported.
+    module: As `import` takes it: "scipy.ndimage".
+    purpose: Its use, as the beginning of a sentence: "bones are cut".
+    extra: The extra of cmfsim that installs it.
+    error: What to raise.
+    Raises `CmfsimError`: (of type `error`) The module cannot be imported.
     """
     try:
         with _IMPORTING:

@@ -45,17 +45,9 @@ def picture_segments(
 ) -> None:
     """Writes a picture of bone segments in colours: from the front, the left front and the left.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    segments : sequence of BoneSegment
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, no segment, another ending.
+    path: Ends in `.png`.
+    size: pixels.
+    Raises `CaseError`: PyVista or OpenGL is missing, no segment, another ending.
 
     Examples
     --------
@@ -85,18 +77,9 @@ def picture_anatomy(
 ) -> None:
     """Writes a picture of translucent skin over bones: from the front and both sides.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    skin : SurfaceData
-    segments : sequence of BoneSegment
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, another ending.
+    path: Ends in `.png`.
+    size: pixels.
+    Raises `CaseError`: PyVista or OpenGL is missing, another ending.
 
     Examples
     --------
@@ -132,22 +115,13 @@ def picture_node_kinds(
     then without its free part, so that the interface with the bones shows, from the left, from the
     front and from behind.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    nodes : (n, 3) float64, mm
-    boundary_triangles : (t, 3) uint32
-    kinds : NodeKinds
-    lips : mapping of str to LipRegion, optional
-        "upper" and "lower": their nodes have colours of their own, and show where the free part is
-        left away.
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, misshapen arrays, another ending.
+    path: Ends in `.png`.
+    nodes: (n, 3), mm.
+    boundary_triangles: (t, 3) uint32.
+    lips: "upper" and "lower": their nodes have colours of their own, and show where the free part
+        is left away.
+    size: pixels.
+    Raises `CaseError`: PyVista or OpenGL is missing, misshapen arrays, another ending.
 
     Examples
     --------

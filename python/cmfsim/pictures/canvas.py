@@ -196,13 +196,8 @@ class Shown:
 def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: str) -> None:
     """Adds an upright scale in mm to a view.
 
-    Parameters
-    ----------
-    place : (float, float)
-        Its lower left corner, as shares of the view.
-    labels : int
-    form : str
-        Of their numbers, as printf has it.
+    place: Its lower left corner, as shares of the view.
+    form: Of their numbers, as printf has it.
     """
     bar = plotter.add_scalar_bar(
         title="mm",
@@ -308,10 +303,7 @@ def polydata(vertices: ArrayLike, triangles: ArrayLike) -> Any:
 def check_can_draw(name: str) -> None:
     """Refuses to draw where OpenGL does not work: VTK would end the process.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) It does not.
+    Raises `CaseError`: It does not.
     """
     if not (_may_crash.get() or _candraw()):
         raise CaseInputError(

@@ -42,18 +42,11 @@ def chart_errors(
     mean; whiskers reach to the last value within 1.5 boxes, and what lies beyond is drawn as dots
     and, above the box, counted.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`, `.svg` or `.pdf`.
-    errors : mapping of str to mapping of str to (k,) float64, mm
-        By patient (or region), then by model: signed distances or their sizes.
-    width, height : float, inches
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) matplotlib is missing, nothing to draw, NaN, another ending.
+    path: Ends in `.png`, `.svg` or `.pdf`.
+    errors: mapping of str to mapping of str to (k,), mm, by patient (or region), then by model:
+        signed distances or their sizes.
+    width, height: inches.
+    Raises `CaseError`: matplotlib is missing, nothing to draw, NaN, another ending.
 
     Examples
     --------
@@ -83,20 +76,11 @@ def write_figure(
 ) -> None:
     """Writes what `draw` puts into an empty figure; an old file goes in one step.
 
-    Parameters
-    ----------
-    path : Path
-        Ends in `.png`, `.svg` or `.pdf`.
-    size : (float, float), inches
-    draw : callable
-        Takes matplotlib's figure.
-    dpi : int
-        Of a `.png`.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) matplotlib is missing, another ending.
+    path: Ends in `.png`, `.svg` or `.pdf`.
+    size: inches.
+    draw: Takes matplotlib's figure.
+    dpi: Of a `.png`.
+    Raises `CaseError`: matplotlib is missing, another ending.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise CaseInputError(

@@ -43,25 +43,14 @@ def picture_distances(
 ) -> None:
     """Writes a picture of signed distances on a skin: from the right, the front and the left.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    skin : SurfaceData
-        The predicted skin.
-    distances : (v,) float64, mm
-        At its vertices, negative (blue) where the prediction lies behind the post-operative skin. A
-        masked array leaves the masked vertices grey: `SkinComparison.field`.
-    limit : float, mm
-        Ends of the colour bar; larger distances have the colours of its ends.
-    regions : mapping of str to float, mm, optional
-        Signed means to print, each with its colour.
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, another number of distances, none to show,
+    path: Ends in `.png`.
+    skin: The predicted skin.
+    distances: (v,), mm, at its vertices, negative (blue) where the prediction lies behind the
+        post-operative skin. A masked array leaves the masked vertices grey: `SkinComparison.field`.
+    limit: mm. Ends of the colour bar; larger distances have the colours of its ends.
+    regions: mm. Signed means to print, each with its colour.
+    size: pixels.
+    Raises `CaseError`: PyVista or OpenGL is missing, another number of distances, none to show,
         another ending.
 
     Examples
@@ -112,22 +101,13 @@ def picture_distance_grid(
     All faces are drawn from the front and at one scale; the mean size of the distances is printed
     below each.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    faces : mapping of str to mapping of str to (SurfaceData, (v,) float64)
-        By patient, then by model: the predicted skin with the signed distances of its vertices, mm,
-        masked where nothing was evaluated. A model that a patient lacks leaves its place empty.
-    limit : float, mm
-        Ends of the colour bar.
-    cell : (int, int), pixels
-        Size of each face.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, no face, another number of distances than
+    path: Ends in `.png`.
+    faces: mapping of str to mapping of str to (SurfaceData, (v,)), by patient, then by model: the
+        predicted skin with the signed distances of its vertices, mm, masked where nothing was
+        evaluated. A model that a patient lacks leaves its place empty.
+    limit: mm. Ends of the colour bar.
+    cell: pixels. Size of each face.
+    Raises `CaseError`: PyVista or OpenGL is missing, no face, another number of distances than
         vertices, none to show, another ending.
 
     Examples
@@ -243,19 +223,10 @@ def picture_band(
     Where no calibration case has data, the skin is grey. Without a calibration, each view states
     that.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    prediction : Prediction
-        With `band`.
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The prediction has no band; PyVista or OpenGL is missing, another
-        ending.
+    path: Ends in `.png`.
+    prediction: With `band`.
+    size: pixels.
+    Raises `CaseError`: The prediction has no band; PyVista or OpenGL is missing, another ending.
 
     Examples
     --------

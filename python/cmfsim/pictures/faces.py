@@ -38,17 +38,9 @@ def picture_prediction(
 ) -> None:
     """Writes a picture of a face before and after, and how far each point of it moves.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    prediction : Prediction
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, another ending.
+    path: Ends in `.png`.
+    size: pixels.
+    Raises `CaseError`: PyVista or OpenGL is missing, another ending.
 
     Examples
     --------
@@ -133,17 +125,9 @@ def picture_plan(
 
     The motion of each segment stands below, in words.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    prediction : Prediction
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, another ending.
+    path: Ends in `.png`.
+    size: pixels.
+    Raises `CaseError`: PyVista or OpenGL is missing, another ending.
 
     Examples
     --------

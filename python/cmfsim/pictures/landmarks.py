@@ -63,14 +63,9 @@ class Label:
 class LabelPlaces:
     """Where names stand in a view, in pixels from its lower left corner.
 
-    Attributes
-    ----------
-    left : (n,) bool
-        Whether a name stands in the left column.
-    lines : (n, 2) float64
-        Where its line begins: the inner end of the text, at half its height.
-    boxes : (n, 4) float64
-        What its text may take: left, bottom, right, top.
+    left: (n,) bool. Whether a name stands in the left column.
+    lines: (n, 2), where its line begins: the inner end of the text, at half its height.
+    boxes: (n, 4). What its text may take: left, bottom, right, top.
     """
 
     left: Any
@@ -92,14 +87,8 @@ def spread(heights: ArrayLike, gap: float, low: float, high: float) -> Floats:
     Bartholomew, Bremner & Brunk 1972), cut at the bounds. Where there is no room for all, they
     stand closer than `gap`.
 
-    Parameters
-    ----------
-    heights : (n,) float64
-    gap, low, high : float
-
-    Returns
-    -------
-    (n,) float64
+    heights: (n,).
+    Returns: (n,).
     """
     given = np.asarray(heights, dtype=np.float64)
     count = len(given)
@@ -124,13 +113,8 @@ def spread(heights: ArrayLike, gap: float, low: float, high: float) -> Floats:
 def label_places(points: ArrayLike, names: Sequence[str], size: tuple[float, float]) -> LabelPlaces:
     """Where the names of points stand: in the column that is closer, from the middle in turns.
 
-    Parameters
-    ----------
-    points : (n, 2) float64
-        In pixels from the lower left corner of the view.
-    names : sequence of str
-    size : (float, float)
-        Of the view, pixels.
+    points: (n, 2), in pixels from the lower left corner of the view.
+    size: Of the view, pixels.
     """
     at = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     width, height = size
@@ -156,12 +140,7 @@ def label_places(points: ArrayLike, names: Sequence[str], size: tuple[float, flo
 def add_labels(plotter: Any, toward: Floats, labels: Sequence[Label]) -> None:
     """Adds names and lines to a view whose camera stands, in parallel projection.
 
-    Parameters
-    ----------
-    plotter : pyvista.Plotter
-    toward : (3,) float64
-        The unit vector from the head to the camera.
-    labels : sequence of Label
+    toward: (3,). The unit vector from the head to the camera.
     """
     if not labels:
         return
@@ -218,25 +197,12 @@ def picture_landmarks(
     its side and of the midline. Names stand in columns at the sides of a view, joined to their
     points by lines, so that none covers another.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    bones : mapping of str to SurfaceData
-    skin : SurfaceData or None
-    landmarks : mapping of str to mapping of str to (3,) float64, mm
-        Under "skull" and "skin".
-    doubtful : mapping of str to sequence of str, optional
-        The names of doubtful ones, under "skull" and "skin".
-    views : sequence of str
-        Of "front", "left", "right": those to draw.
-    size : (int, int), pixels, optional
-        Of the picture; default: 700 by 700 for each view.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, no landmark, no view or an unknown one,
+    path: Ends in `.png`.
+    landmarks: mapping of str to mapping of str to (3,), mm. Under "skull" and "skin".
+    doubtful: The names of doubtful ones, under "skull" and "skin".
+    views: Of "front", "left", "right": those to draw.
+    size: pixels, of the picture; default: 700 by 700 for each view.
+    Raises `CaseError`: PyVista or OpenGL is missing, no landmark, no view or an unknown one,
         another ending.
 
     Examples

@@ -40,23 +40,12 @@ def picture_muscles(
     colour. With fibres, boxes of muscles whose outline hardly determines the direction are orange,
     others blue; where fibre lines are known the directions follow them.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.png`.
-    musculature : Musculature
-    skull : SurfaceData, optional
-        Drawn with them, such as the patient's bones.
-    fibres : bool
-        Whether to draw boxes and directions (Kim et al. 2010, Figure 2) instead of names.
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) PyVista or OpenGL is missing, no muscle, another ending.
-    MeshError
-        (also `ValueError`) A muscle's surface that cannot be used for fibres.
+    path: Ends in `.png`.
+    skull: Drawn with them, such as the patient's bones.
+    fibres: Whether to draw boxes and directions (Kim et al. 2010, Figure 2) instead of names.
+    size: pixels.
+    Raises `CaseError`: PyVista or OpenGL is missing, no muscle, another ending.
+    Raises `MeshError`: A muscle's surface that cannot be used for fibres.
 
     Examples
     --------

@@ -38,18 +38,10 @@ OVER_BONES = 0.45
 class ViewPart:
     """A surface of a view.
 
-    Attributes
-    ----------
-    name : str
-    surface : SurfaceData
-    colour : str
-        "#rrggbb"; unused where there are values.
-    opacity : float
-        0 to 1.
-    values : (v,) float64 or None
-        At the vertices, shown in colours from 0 to the largest.
-    shown : bool
-        Initial state; the box next to its name shows and hides it.
+    colour: "#rrggbb"; unused where there are values.
+    opacity: 0 to 1.
+    values: (v,) or None, at the vertices, shown in colours from 0 to the largest.
+    shown: Initial state; the box next to its name shows and hides it.
     """
 
     name: str
@@ -111,20 +103,10 @@ def view_parts(
 ) -> None:
     """Opens a window with surfaces that can be turned, shown and hidden, or writes a picture of it.
 
-    Parameters
-    ----------
-    parts : sequence of ViewPart
-    title : str
-    unit : str
-        Of the values, next to their colours.
-    screenshot : path, optional
-        Ends in `.png`: nothing is opened.
-    size : (int, int), pixels
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Nothing to show; PyVista, OpenGL or a screen is missing.
+    unit: Of the values, next to their colours.
+    screenshot: Ends in `.png`: nothing is opened.
+    size: pixels.
+    Raises `CaseError`: Nothing to show; PyVista, OpenGL or a screen is missing.
 
     Examples
     --------

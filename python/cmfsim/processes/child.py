@@ -42,25 +42,12 @@ class ReaderError(RuntimeError):
 def read_in_child(task: str, limits: ReadLimits | None = None, /, **arguments: Any) -> Answer:
     """The answer of a function of the package that is called in the child process.
 
-    Parameters
-    ----------
-    task : str
-        "module:function" within cmfsim; the `LIBRARIES` of the module are imported before its
+    task: "module:function" within cmfsim; the `LIBRARIES` of the module are imported before its
         time begins.
-    limits : ReadLimits, optional
-    **arguments
-        Plain values that JSON holds; paths as text, absolute.
-
-    Returns
-    -------
-    Answer
-
-    Raises
-    ------
-    ReaderError
-        The child crashed, or passed a limit. The text is a clause without the file's name.
-    CmfsimError, ValueError, OSError
-        What the function raises, with its class.
+    **arguments: Plain values that JSON holds; paths as text, absolute.
+    Raises `ReaderError`: The child crashed, or passed a limit. The text is a clause without the
+        file's name.
+    Raises `CmfsimError`, `ValueError`, `OSError`: What the function raises, with its class.
     """
     with _LOCK:
         child = _the_child()

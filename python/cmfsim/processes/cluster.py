@@ -18,24 +18,11 @@ def on_cluster(
     A job whose machine is lost is given to another one, as Dask does it; only one that loses
     several machines in a row is given up.
 
-    Parameters
-    ----------
-    scheduler : str
-        Address of the cluster.
-    function : callable
-        The machines import it by its name.
-    jobs : sequence of sequence
-        Arguments.
-
-    Yields
-    ------
-    (int, object, Exception or None)
-        Index, and either the answer or what the function raised, or the cluster for it.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) No Dask installed, or no cluster at the address.
+    scheduler: Address of the cluster.
+    function: The machines import it by its name.
+    jobs: Arguments.
+    Yields: Index, and either the answer or what the function raised, or the cluster for it.
+    Raises `CaseError`: No Dask installed, or no cluster at the address.
     """
     distributed = third_party("distributed", "work is distributed over a cluster", "study")
     try:

@@ -20,23 +20,15 @@ def answers(
 ) -> Iterator[tuple[int, Any]]:
     """What a function answers to each job, with the job's index, as they end.
 
-    Parameters
-    ----------
-    function : str
-        "module:name" of this package; it takes a job's values by name and returns plain values.
-    jobs : sequence of mapping
-        Plain values, as JSON has them.
-    workers : int
-        Processes.
-    scheduler : str, optional
-        Address of a Dask cluster that sees the same files; it then decides how many run at a time.
-
-    Raises
-    ------
-    CmfsimError
-        What the function raises, with its class.
-    CaseError
-        A process died, or met an error of another kind, which its text has; no cluster answers.
+    function: "module:name" of this package; it takes a job's values by name and returns plain
+        values.
+    jobs: Plain values, as JSON has them.
+    workers: Processes.
+    scheduler: Address of a Dask cluster that sees the same files; it then decides how many run at a
+        time.
+    Raises `CmfsimError`: What the function raises, with its class.
+    Raises `CaseError`: A process died, or met an error of another kind, which its text has; no
+        cluster answers.
     """
     if scheduler is not None:
         yield from _on_cluster(function, jobs, scheduler)
@@ -61,13 +53,8 @@ def as_they_end(
 ) -> Iterator[tuple[int, Made]]:
     """What a function here makes of each job, in threads, with the job's index, as they end.
 
-    Parameters
-    ----------
-    run : callable
-        Takes a job, and what starts a `Worker`. All workers end when the caller stops listening.
-    jobs : sequence
-    workers : int
-        Threads.
+    run: Takes a job, and what starts a `Worker`. All workers end when the caller stops listening.
+    workers: Threads.
     """
     lock, ended = threading.Lock(), threading.Event()
     started: list[Worker] = []

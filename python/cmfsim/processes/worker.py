@@ -54,12 +54,8 @@ LENGTH = struct.Struct("<Q")
 class WorkerEndedError(CaseError):
     """A worker process ended before it answered.
 
-    Attributes
-    ----------
-    code : int
-        Its exit code; minus the signal that ended it.
-    late : bool
-        Whether it passed its time.
+    code: Its exit code; minus the signal that ended it.
+    late: Whether it passed its time.
     """
 
     def __init__(self, code: int, late: bool = False) -> None:  # noqa: FBT001, FBT002 (pickled so)
@@ -77,11 +73,7 @@ class WorkerEndedError(CaseError):
 class WorkerFailedError(CaseError):
     """A function raised an error that is not of the package.
 
-    Attributes
-    ----------
-    kinds : list of str
-        Names of its class and of those that it is made from.
-    text, trace : str
+    kinds: Names of its class and of those that it is made from.
     """
 
     def __init__(self, kinds: list[str], text: str, trace: str) -> None:
@@ -98,12 +90,9 @@ class WorkerFailedError(CaseError):
 class ReadLimits:
     """What one request may use.
 
-    Attributes
-    ----------
-    seconds : float
-        Processor time; six times as much on the clock, more where others keep the processor busy.
-    memory : int
-        Bytes beyond what the worker holds when the request begins; on Linux only.
+    seconds: Processor time; six times as much on the clock, more where others keep the processor
+        busy.
+    memory: Bytes beyond what the worker holds when the request begins; on Linux only.
     """
 
     seconds: float = 8.0
@@ -121,12 +110,8 @@ class Answer:
 class Worker:
     """A process that calls functions one after the other; it ends with a `with` statement.
 
-    Parameters
-    ----------
-    threads : int, optional
-        Of the core and of numpy; those of this process by default.
-    log : file or int, optional
-        What the process and its libraries print is written there; default: standard error.
+    threads: Of the core and of numpy; those of this process by default.
+    log: What the process and its libraries print is written there; default: standard error.
     """
 
     def __init__(self, *, threads: int | None = None, log: IO[bytes] | int | None = None) -> None:
@@ -171,24 +156,13 @@ class Worker:
     ) -> Answer:
         """The answer of a function of the package that is called in the process.
 
-        Parameters
-        ----------
-        function : str
-            "module:name"; it takes the arguments by name and returns an `Answer` or plain values.
-        arguments : mapping
-            Plain values that JSON holds.
-        limits : ReadLimits, optional
-        seconds : float, optional
-            Time on the clock.
-
-        Raises
-        ------
-        CmfsimError
-            What the function raises, with its class.
-        WorkerFailedError
-            It raises an error of another kind.
-        WorkerEndedError
-            The process crashed, or passed a limit.
+        function: "module:name"; it takes the arguments by name and returns an `Answer` or plain
+            values.
+        arguments: Plain values that JSON holds.
+        seconds: Time on the clock.
+        Raises `CmfsimError`: What the function raises, with its class.
+        Raises `WorkerFailedError`: It raises an error of another kind.
+        Raises `WorkerEndedError`: The process crashed, or passed a limit.
         """
         most = None if limits is None else [limits.seconds, limits.memory]
         request = {"function": function, "arguments": dict(arguments), "limits": most}
