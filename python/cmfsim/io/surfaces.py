@@ -285,11 +285,6 @@ def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
         WRITERS[path.suffix](file, vertices, surface.triangles)
 
 
-def surface_suffixes() -> tuple[str, ...]:
-    """The file endings that `write_surface` knows."""
-    return tuple(WRITERS)
-
-
 def _write_vtp(
     file: BinaryIO, vertices: NDArray[np.float64], triangles: NDArray[np.integer]
 ) -> None:

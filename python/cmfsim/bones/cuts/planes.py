@@ -3,9 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import cast
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
@@ -100,15 +98,6 @@ class Cut:
         if source != "skull" or self.joined is None:
             return self
         return replace(self, groups=tuple((*group, self.joined) for group in self.groups))
-
-    def region_on(self, image: ImageData) -> Floats:
-        """How deep each voxel of a grid lies in the region: positive inside, in mm near planes."""
-        return cast(
-            "Floats",
-            np.maximum.reduce(
-                [np.minimum.reduce([p.distance_on(image) for p in g]) for g in self.groups]
-            ),
-        )
 
 
 @dataclass(frozen=True, eq=False)
