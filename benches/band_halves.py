@@ -15,8 +15,8 @@ import numpy as np
 
 import cmfsim
 from cmfsim.io.results.populations import PARTS
-from cmfsim.lab.benchmark.bands import COVERAGE, calibrated_band
 from cmfsim.lab.benchmark.patients import far_from_models, patients_of
+from cmfsim.lab.benchmark.scores import COVERAGE, calibrated_band
 from cmfsim.lab.benchmark.tables import table
 
 # Quantiles of the coverage over splits that are printed.

@@ -13,7 +13,7 @@ import platform
 from pathlib import Path
 
 import cmfsim
-from cmfsim.study.outputs import FIGURE_9_FILE, FIGURE_10_FILE, TABLE_3_FILE
+from cmfsim.study.cohort import FIGURE_9_FILE, FIGURE_10_FILE, TABLE_3_FILE
 from marked import publish
 
 NAME = "benches/kim2010.py"

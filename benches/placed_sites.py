@@ -16,8 +16,7 @@ import numpy as np
 
 import cmfsim
 from cmfsim.io import read_landmark_file, read_surface
-from cmfsim.pipeline.filling import filled_landmarks
-from cmfsim.pipeline.proposing import ProposedHead
+from cmfsim.pipeline.proposing import ProposedHead, filled_landmarks
 from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, SiteState
 from marked import publish

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from cmfsim import Case, SurfaceData, __version__, make_head, write_landmarks
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.lab.virtual.patient_folder import case_text
-from cmfsim.lab.virtual.people import PATIENTS
+from cmfsim.lab.virtual.population import PATIENTS
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth
 from cmfsim.phantom import PhantomHead
 

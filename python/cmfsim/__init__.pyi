@@ -105,8 +105,8 @@ from cmfsim.io import write_scene as write_scene
 from cmfsim.io import write_slicer_bundle as write_slicer_bundle
 from cmfsim.io import write_surface as write_surface
 from cmfsim.io import write_transform as write_transform
-from cmfsim.io.meshes.tets import RepairedTets as RepairedTets
-from cmfsim.io.meshes.tets import repair_tets as repair_tets
+from cmfsim.io.meshes.plain_mesh import RepairedTets as RepairedTets
+from cmfsim.io.meshes.plain_mesh import repair_tets as repair_tets
 from cmfsim.io.objects import from_meshio as from_meshio
 from cmfsim.io.objects import from_nibabel as from_nibabel
 from cmfsim.io.objects import from_pyvista as from_pyvista
@@ -227,8 +227,8 @@ from cmfsim.solving.simulation import solve_scene as solve_scene
 from cmfsim.study.cohort import StudyOptions as StudyOptions
 from cmfsim.study.cohort import StudyReport as StudyReport
 from cmfsim.study.cohort import run_study as run_study
-from cmfsim.study.outputs import study_table as study_table
-from cmfsim.study.outputs import write_study_report as write_study_report
+from cmfsim.study.cohort import study_table as study_table
+from cmfsim.study.cohort import write_study_report as write_study_report
 from cmfsim.study.trials import SensitivityReport as SensitivityReport
 from cmfsim.study.trials import landmark_trials as landmark_trials
 from cmfsim.study.trials import sensitivity as sensitivity
@@ -242,7 +242,6 @@ from cmfsim.surfaces.repair import RepairOptions as RepairOptions
 from cmfsim.surfaces.repair import repair_surface as repair_surface
 from cmfsim.values.anatomy import Anatomy as Anatomy
 from cmfsim.values.anatomy import BoneSegment as BoneSegment
-from cmfsim.values.band_options import BandOptions as BandOptions
 from cmfsim.values.calibration import BandFactor as BandFactor
 from cmfsim.values.calibration import Calibration as Calibration
 from cmfsim.values.calibration import CalibrationCase as CalibrationCase
@@ -273,6 +272,7 @@ from cmfsim.values.progress import Observer as Observer
 from cmfsim.values.scene import Scene as Scene
 from cmfsim.values.scene import SceneResult as SceneResult
 from cmfsim.values.scene import SegmentData as SegmentData
+from cmfsim.values.skin_band import BandOptions as BandOptions
 from cmfsim.values.skin_band import SkinBand as SkinBand
 from cmfsim.values.solver_options import SolverOptions as SolverOptions
 from cmfsim.values.surface_data import MovedSurface as MovedSurface

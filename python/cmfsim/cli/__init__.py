@@ -19,8 +19,7 @@ from cmfsim.cli.exit_codes import BAD_INPUT, CLOSED, DONE, FAILED
 from cmfsim.cli.memory import keep_freed_memory
 from cmfsim.cli.parsing import make_parser
 from cmfsim.cli.patients.case_commands import print_findings
-from cmfsim.cli.text.notices import FindingsError
-from cmfsim.cli.text.terminal import ProgressHandler, print_error, spell_out
+from cmfsim.cli.terminal import FindingsError, ProgressHandler, print_error, spell_out
 from cmfsim.errors import CmfsimError, error_text
 
 __all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED", "main"]

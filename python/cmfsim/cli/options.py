@@ -6,7 +6,7 @@ from typing import Any
 
 from cmfsim.io import Case
 from cmfsim.io.results.calibrations import read_calibration
-from cmfsim.values.band_options import BandOptions
+from cmfsim.values.skin_band import BandOptions
 
 
 def switch(command: argparse.ArgumentParser, names: str, words: str) -> None:

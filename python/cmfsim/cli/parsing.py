@@ -14,7 +14,7 @@ from cmfsim.cli.patients import (
     template_commands,
     view_command,
 )
-from cmfsim.cli.research import bench_command, population_commands, study_commands
+from cmfsim.cli.research import population_commands, study_commands
 from cmfsim.cli.research.population_commands import add_population_commands
 from cmfsim.io import result_suffixes
 from cmfsim.lab.frontier import EDGES, FACTORS
@@ -464,8 +464,8 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         frontier,
         "-o --output",
         "OUT",
-        f"output folder (default {bench_command.FRONTIER_FOLDER})",
-        default=bench_command.FRONTIER_FOLDER,
+        f"output folder (default {population_commands.FRONTIER_FOLDER})",
+        default=population_commands.FRONTIER_FOLDER,
     )
     number(
         frontier,
@@ -507,4 +507,4 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     whole(frontier, "--threads", "N", "number of threads (default: all cores)")
     number(frontier, "--time-limit", "S", "time limit per job, s (default 600)", default=600.0)
     switch(frontier, "--fresh", "repeat finished runs")
-    frontier.set_defaults(run=bench_command.frontier)
+    frontier.set_defaults(run=population_commands.frontier)

@@ -15,7 +15,7 @@ from cmfsim.drafting.case_lines import Taken
 from cmfsim.drafting.draft import CaseDraft, draft_case
 from cmfsim.drafting.finds import CASE_FILE, EXTRACTED
 from cmfsim.drafting.gathering import gather
-from cmfsim.drafting.plans.typed_plan import TypedPlan, read_moves
+from cmfsim.drafting.motions import TypedPlan, read_moves
 from cmfsim.drafting.written import check_written
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing

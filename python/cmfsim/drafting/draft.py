@@ -11,8 +11,14 @@ from cmfsim.drafting.case_lines import Taken, Text, legible, quoted
 from cmfsim.drafting.choices import choose_images, choose_landmarks
 from cmfsim.drafting.finds import ImageFind, LandmarkFind
 from cmfsim.drafting.gathering import Gathered
-from cmfsim.drafting.plans.motions import DraftMotion, Plan, file_motions, scene_motions
-from cmfsim.drafting.plans.typed_plan import TypedPlan, add_typed
+from cmfsim.drafting.motions import (
+    DraftMotion,
+    Plan,
+    TypedPlan,
+    add_typed,
+    file_motions,
+    scene_motions,
+)
 from cmfsim.drafting.roles import MOVING
 from cmfsim.drafting.surfaces import Anatomy, choose_surfaces
 from cmfsim.drafting.written import (

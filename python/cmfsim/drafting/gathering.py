@@ -18,8 +18,7 @@ from cmfsim.drafting.finds import (
     surface_find,
 )
 from cmfsim.drafting.roles import name_role
-from cmfsim.drafting.scene_finds import LooseMotion, scene_finds
-from cmfsim.drafting.segment_finds import segment_finds
+from cmfsim.drafting.scene_finds import LooseMotion, scene_finds, segment_finds
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.images.segmentations import NAMES_FILE
 from cmfsim.io.slicer.slicer_scenes import read_slicer_scene, unpack_bundle

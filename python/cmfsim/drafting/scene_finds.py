@@ -1,9 +1,14 @@
-"""The contents of a 3D Slicer scene, each with the effect of its transforms."""
+"""What `cmfsim init` finds in scenes of 3D Slicer and in segmentations."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cmfsim.drafting.finds import (
+    LABELS,
     ImageFind,
     LandmarkFind,
     OtherFind,
@@ -12,14 +17,178 @@ from cmfsim.drafting.finds import (
     landmark_find,
     surface_find,
 )
-from cmfsim.drafting.roles import NameRole, name_role
-from cmfsim.drafting.segment_finds import segment_finds
-from cmfsim.errors import CmfsimError
+from cmfsim.drafting.roles import JAWS_OF_TEETH, NameRole, name_role
+from cmfsim.errors import CmfsimError, third_party
+from cmfsim.io.images.segmentations import Segment, Segmentation, read_labels, read_segmentation
 from cmfsim.io.slicer.slicer_scenes import SceneNode, SlicerScene
+from cmfsim.surfaces.levels import block_of, surface_of_level
 from cmfsim.values.checks import Floats
+from cmfsim.values.image_data import ImageData
+from cmfsim.values.surface_data import SurfaceData
 
+# Segments without a known name that are asked about, where some have one; the rest are organs.
+MOST_UNNAMED = 6
+# Grids that agree up to this, mm, are one.
+SAME_GRID = 1e-3
+# Bone counts as cut out of the skin where less than this share of it is in the skin's label.
+CUT_OUT = 0.5
 # Slicer's own planes in the 3-D view are models, too.
 SLICE_MODELS = "Volume Slice"
+
+
+@dataclass(frozen=True, eq=False)
+class _Mask:
+    """A segment that may be part of a case."""
+
+    label: str
+    role: NameRole
+    path: Path
+    segment: Segment
+    read: Segmentation
+    is_alone: bool
+
+    def voxels(self) -> NDArray[np.bool_]:
+        """Where it is."""
+        return self.read.mask(self.segment)
+
+    def is_on(self, other: "_Mask") -> bool:
+        """Whether both have one grid."""
+        return self.read.labels.shape[1:] == other.read.labels.shape[1:] and np.allclose(
+            self.read.affine, other.read.affine, rtol=0.0, atol=SAME_GRID
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentFinds:
+    """Segments as surfaces, and those that are not used, with the reasons."""
+
+    surfaces: list[SurfaceFind]
+    others: list[OtherFind]
+
+
+def segment_finds(files: Sequence[tuple[Path, str]]) -> SegmentFinds:
+    """The segments of files that may be skin, bone or teeth, each as a surface.
+
+    Teeth are added to the jaw that their name says, where both have the same grid; so are the bones
+    that a label image cuts out of its skin.
+
+    files: Files of segments or labels, each with what reports call it. One mask per file is a
+        segment that is named after its file.
+    """
+    masks: list[_Mask] = []
+    others: list[OtherFind] = []
+    for path, label in files:
+        try:
+            own, dropped = _masks(path, label)
+        except (CmfsimError, OSError) as error:
+            others.append(OtherFind(label, f"cannot be read: {error}"))
+            continue
+        masks += own
+        others += dropped
+    masks, dropped = _named(masks)
+    others += dropped
+    jaws = {id(teeth): jaw for teeth in masks if (jaw := _jaw_of(teeth, masks)) is not None}
+    surfaces = []
+    for mask in masks:
+        if id(mask) in jaws:
+            continue
+        teeth = [other for other in masks if jaws.get(id(other)) is mask]
+        surfaces.append(_surface_find(mask, teeth, masks))
+    return SegmentFinds(surfaces, others)
+
+
+def _masks(path: Path, label: str) -> tuple[list[_Mask], list[OtherFind]]:
+    """The segments of a file that may be part of a case, and the others."""
+    is_slicers = path.name.lower().endswith(LABELS)
+    read = read_segmentation(path) if is_slicers else read_labels(path)
+    alone = not is_slicers and len(read.segments) == 1
+    masks, others = [], []
+    for segment in read.segments:
+        role = name_role(segment.name)
+        shown = label if alone else f"{label} / {segment.name}"
+        if role.part == "other":
+            why = f"its name contains {role.word!r}, which is not a bone of a case"
+            others.append(OtherFind(shown, why))
+        elif not (read.labels[segment.layer] == segment.label).any():
+            others.append(OtherFind(shown, "is empty: it has no voxel"))
+        else:
+            masks.append(_Mask(shown, role, path, segment, read, alone))
+    return masks, others
+
+
+def _named(masks: Sequence[_Mask]) -> tuple[list[_Mask], list[OtherFind]]:
+    """The masks without those of organs, of which there are many, and with names of their own."""
+    unnamed = [mask for mask in masks if not mask.role.part]
+    if len(unnamed) == len(masks):
+        return list(masks), []
+    organs = unnamed if len(unnamed) > MOST_UNNAMED else [m for m in unnamed if m.is_alone]
+    why = "its name is none of skin, bone or teeth, and others have such names"
+    left = [mask for mask in masks if mask not in organs]
+    return left, [OtherFind(mask.label, why) for mask in organs]
+
+
+def _jaw_of(teeth: _Mask, masks: Sequence[_Mask]) -> _Mask | None:
+    """The jaw of a row of teeth, where there is one on its grid, of its time."""
+    for part in JAWS_OF_TEETH.get(teeth.role.part, ()):
+        found = [
+            mask
+            for mask in masks
+            if mask.role.part == part
+            and mask.role.is_after == teeth.role.is_after
+            and mask.is_on(teeth)
+        ]
+        if found:
+            return found[0] if len(found) == 1 else None
+    return None
+
+
+def _surface_find(mask: _Mask, teeth: Sequence[_Mask], masks: Sequence[_Mask]) -> SurfaceFind:
+    voxels = mask.voxels()
+    for other in teeth:
+        voxels = voxels | other.voxels()
+    inside = [o for o in masks if o is not mask and o.role.part != "skin" and o.is_on(mask)]
+    if mask.role.part == "skin" or (not mask.role.part and inside and _encloses(mask, inside)):
+        voxels = _filled(voxels, [bone.voxels() for bone in inside])
+    found = SurfaceFind(
+        mask.label,
+        mask.role,
+        mask.path,
+        _surface(mask.segment.name, voxels, mask.read),
+        "LPS",
+        is_closed=True,
+        is_made=True,
+    )
+    return replace(found, joined=tuple(other.label for other in teeth))
+
+
+def _encloses(outer: _Mask, others: Sequence[_Mask]) -> bool:
+    """Whether the block of a mask holds the blocks of all others: it is the skin, then."""
+    low, high = block_of(outer.voxels())
+    blocks = [block_of(other.voxels()) for other in others]
+    return all((low <= b).all() and (high >= e).all() for b, e in blocks)
+
+
+def _filled(skin: NDArray[np.bool_], bones: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """A skin without hollows: where each voxel has one label, bones are cut out of it."""
+    for bone in bones:
+        if (skin & bone).sum() < CUT_OUT * bone.sum():
+            skin = skin | bone
+    ndimage = third_party("scipy.ndimage", "hollows of labels are filled", "imaging")
+    filled: NDArray[np.bool_] = ndimage.binary_fill_holes(skin)
+    return filled
+
+
+def _surface(name: str, mask: NDArray[np.bool_], read: Segmentation) -> SurfaceData:
+    """The border of a mask, half a voxel outside its voxels' centres, in LPS mm."""
+    lengths = np.linalg.norm(read.affine[:, :3], axis=0)
+    level = ImageData(mask.astype(np.float32) - 0.5, lengths)
+    surface = surface_of_level(name, level)
+    turn = read.affine[:, :3] / lengths
+    vertices = surface.vertices @ turn.T + read.affine[:, 3]
+    triangles = surface.triangles
+    # A grid of left-handed axes turns surfaces inside out.
+    mirrored = bool(np.linalg.det(turn) < 0.0)
+    return SurfaceData(vertices, triangles[:, ::-1] if mirrored else triangles)
 
 
 @dataclass(frozen=True, eq=False)

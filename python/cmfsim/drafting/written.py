@@ -11,7 +11,7 @@ from cmfsim.drafting.case_lines import Taken, Text, quoted
 from cmfsim.drafting.choices import Images, Marks
 from cmfsim.drafting.finds import EXTRACTED, ImageFind, LandmarkFind, SurfaceFind
 from cmfsim.drafting.gathering import Gathered
-from cmfsim.drafting.plans.motions import Plan
+from cmfsim.drafting.motions import Plan
 from cmfsim.drafting.roles import safe_key
 from cmfsim.drafting.surfaces import Anatomy, Question
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError

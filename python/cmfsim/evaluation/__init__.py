@@ -4,14 +4,15 @@ from cmfsim.evaluation.comparison import SkinComparison, compare_skins
 from cmfsim.evaluation.conformal import calibrate, cases_needed, covered_interval, region_scores
 from cmfsim.evaluation.models import NO_CHANGE, WHOLE, Improvement, ModelComparison, compare_models
 from cmfsim.evaluation.regions import REGIONS, skin_regions, unmoved_regions
-from cmfsim.evaluation.significance import (
+from cmfsim.evaluation.statistics import (
     LEAST_PAIRS,
+    DistanceStatistics,
     PairedChange,
     PairedTest,
+    distance_statistics,
     paired_change,
     wilcoxon_test,
 )
-from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.evaluation.tables import ErrorTable, error_table
 from cmfsim.evaluation.unmoved import ThicknessChange, compare_unmoved, fitted_thickness
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS

@@ -12,8 +12,12 @@ from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.comparison import Choice, Landmarks, SkinComparison, compare_skins
 from cmfsim.evaluation.regions import skin_regions
-from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
-from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
+from cmfsim.evaluation.statistics import (
+    DistanceStatistics,
+    PairedTest,
+    distance_statistics,
+    wilcoxon_test,
+)
 from cmfsim.surfaces.depth import moved_outward
 from cmfsim.values.checks import Floats, as_rows, as_text, check_one_of, frozen
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS

@@ -1,4 +1,4 @@
-"""Figures that sum up signed distances (paper 3.2, Table 3)."""
+"""Statistics of distances, and tests of whether models differ (paper 3.2)."""
 
 import math
 from collections.abc import Mapping
@@ -9,13 +9,216 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, as_floats
+from cmfsim.errors import CaseInputError, third_party
+from cmfsim.values.checks import Floats, as_floats, check_one_of
 
+PAIRED_BY = ("vertex", "patient")
+CAVEATS = {
+    "vertex": (
+        "neighbouring vertices move together and are not independent samples: p describes this "
+        "one face, says nothing about the next patient, and falls with every refinement of the "
+        "mesh"
+    ),
+    "patient": "",
+}
+# Two-sided 5 %, the level that the caveat of few patients speaks of.
+LEVEL = 0.05
+# Fewest patients that differ for which the test can reach that level: p is at least 2^(1-n).
+LEAST_PAIRS = 6
 # Errors up to which a prediction is usually called strict, good, acceptable and lenient, mm.
 LIMITS = (1.0, 1.5, 2.0, 3.0)
 # A distance is an outlier of a box plot beyond the upper quartile by this many boxes (Tukey 1977).
 WHISKER = 1.5
+
+
+@dataclass(frozen=True)
+class PairedTest:
+    """The outcome of a Wilcoxon signed-rank test (Wilcoxon 1945).
+
+    Attributes
+    ----------
+    by : str
+        What was paired: "vertex" or "patient".
+    n : int
+        Pairs.
+    n_equal : int
+        Pairs without a difference, which the test excludes.
+    statistic : float
+        The smaller sum of ranks.
+    p : float
+        Two-sided.
+    median_difference : float, mm
+        Of first minus second: negative, the first has the smaller errors.
+    effect : float
+        Rank-biserial correlation, −1 (the first is larger in each pair) to 1 (smaller in each).
+    caveat : str
+        The limits of p; to be printed with it.
+    """
+
+    by: str
+    n: int
+    n_equal: int
+    statistic: float
+    p: float
+    median_difference: float
+    effect: float
+    caveat: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with their unit in the name, as JSON holds them."""
+        return {
+            "test": "Wilcoxon signed-rank, two-sided",
+            "by": self.by,
+            "n": self.n,
+            "n_equal": self.n_equal,
+            "statistic": self.statistic,
+            "p": self.p,
+            "median_difference_mm": self.median_difference,
+            "effect": self.effect,
+            "caveat": self.caveat,
+        }
+
+
+def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") -> PairedTest:
+    """The signed-rank test of two sets of errors in pairs.
+
+    Parameters
+    ----------
+    first, second : (n,) float64, mm
+        Errors of two models at the same vertices, or mean errors of the same patients.
+    by : str
+        "vertex" or "patient": decides the caveat of the outcome.
+
+    Returns
+    -------
+    PairedTest
+        With p = 1 where no pair differs.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) Sets of different length, fewer than one pair, NaN; scipy is missing.
+
+    Notes
+    -----
+    Wilcoxon (1945), by scipy: exact below 51 pairs without ties, else normal with correction for
+    ties. Pairs without a difference are dropped, as Wilcoxon did.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.wilcoxon_test([1.0, 2.0, 1.5, 2.5], [1.2, 2.3, 1.9, 3.0], by="patient")
+    >>> found.p, found.effect
+    (0.125, 1.0)
+    >>> found.caveat
+    '4 pairs cannot give p below 0.125, regardless of the models'
+    """
+    check_one_of("by", by, PAIRED_BY)
+    a, b = as_floats("first errors", first), as_floats("second errors", second)
+    if a.ndim != 1 or a.shape != b.shape or not len(a):
+        raise CaseInputError(
+            f"errors have shapes {a.shape} and {b.shape}: both must be (n,), in pairs, with n "
+            "above 0"
+        )
+    difference = a - b
+    n_used = int(np.count_nonzero(difference))
+    caveat = CAVEATS[by]
+    least = 2.0 ** (1 - n_used)
+    if by == "patient" and least > LEVEL:
+        caveat = f"{n_used} pairs cannot give p below {min(least, 1.0):g}, regardless of the models"
+    statistic, p, effect = 0.0, 1.0, 0.0
+    if n_used:
+        stats = third_party("scipy.stats", "the signed-rank test is made", "report")
+        used = difference[difference != 0.0]
+        found = stats.wilcoxon(used, alternative="two-sided", method="auto")
+        statistic, p = float(found.statistic), float(found.pvalue)
+        ranks = stats.rankdata(np.abs(used))
+        effect = float((ranks[used < 0.0].sum() - ranks[used > 0.0].sum()) / ranks.sum())
+    if not math.isfinite(p):
+        raise CaseInputError(f"the test gave p = {p} for {n_used} pairs: too few to rank")
+    return PairedTest(
+        by, len(a), len(a) - n_used, statistic, p, float(np.median(difference)), effect, caveat
+    )
+
+
+@dataclass(frozen=True)
+class PairedChange:
+    """The change of patients' mean errors from one setting to another.
+
+    Attributes
+    ----------
+    n : int
+        Patients who have both.
+    first, second : float, mm
+        Means of their mean errors, each patient with the same weight.
+    interval : (float, float) or None, mm
+        95 % confidence interval of the mean change by Student's t; None for one patient.
+    n_better : int
+        Patients whose error became smaller.
+    test : PairedTest or None
+        None for fewer than `LEAST_PAIRS` patients whose error changed.
+    """
+
+    n: int
+    first: float
+    second: float
+    interval: tuple[float, float] | None
+    n_better: int
+    test: PairedTest | None
+
+    @property
+    def change(self) -> float:
+        """Second minus first, mm: negative, the second setting has the smaller errors."""
+        return self.second - self.first
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with their unit in the name, as JSON holds them."""
+        return {
+            "n": self.n,
+            "first_mm": self.first,
+            "second_mm": self.second,
+            "change_mm": self.change,
+            "interval_mm": None if self.interval is None else list(self.interval),
+            "n_better": self.n_better,
+            "test": None if self.test is None else self.test.as_dict(),
+        }
+
+
+def paired_change(first: ArrayLike, second: ArrayLike) -> PairedChange:
+    """The change of mean errors of the same patients from one setting to another.
+
+    Parameters
+    ----------
+    first, second : (n,) float64, mm
+        Mean error of each patient.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) As `wilcoxon_test`.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> found = cmfsim.paired_change([1.0, 2.0, 1.5], [0.8, 1.7, 1.1])
+    >>> round(found.change, 3), [round(end, 3) for end in found.interval], found.n_better
+    (-0.3, [-0.548, -0.052], 3)
+    >>> found.test is None
+    True
+    """
+    test = wilcoxon_test(second, first, by="patient")
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    n, interval = test.n, None
+    if n > 1:
+        stats = third_party("scipy.stats", "a confidence interval is found", "report")
+        half = float(stats.t.ppf(1.0 - 0.5 * LEVEL, n - 1) * np.std(b - a, ddof=1) / math.sqrt(n))
+        middle = float((b - a).mean())
+        interval = (middle - half, middle + half)
+    enough = n - test.n_equal >= LEAST_PAIRS
+    better = int(np.count_nonzero(b < a))
+    return PairedChange(
+        n, float(a.mean()), float(b.mean()), interval, better, test if enough else None
+    )
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.models import WHOLE, ModelComparison
-from cmfsim.evaluation.significance import PairedTest, wilcoxon_test
-from cmfsim.evaluation.statistics import DistanceStatistics
+from cmfsim.evaluation.statistics import DistanceStatistics, PairedTest, wilcoxon_test
 from cmfsim.values.checks import as_text, check_one_of
 
 # Columns of the CSV file after patient, region and model.

@@ -6,8 +6,19 @@ the other side is its mirror image), y backwards, z up; the Frankfort plane is z
 
 import numpy as np
 
-from cmfsim.phantom.geometry.curves import Table, smooth_curve, turn_about
-from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, Engraving, Loft, Plane, Step, Tube
+from cmfsim.phantom.geometry.shapes import (
+    Blend,
+    Box,
+    Egg,
+    Engraving,
+    Loft,
+    Plane,
+    Step,
+    Table,
+    Tube,
+    smooth_curve,
+    turn_about,
+)
 from cmfsim.phantom.parameters import HeadParameters
 
 # The box of the head, mm, with the neck cut off below.

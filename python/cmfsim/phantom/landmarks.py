@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from cmfsim.phantom.geometry.curves import Level
+from cmfsim.phantom.geometry.shapes import Level
 from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp
 from cmfsim.phantom.grid import Field, to_surface
 from cmfsim.phantom.parameters import HeadParameters

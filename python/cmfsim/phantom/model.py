@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import scan
-from cmfsim.phantom.geometry.curves import Level, smooth_max
-from cmfsim.phantom.geometry.shapes import Shape, Within
+from cmfsim.phantom.geometry.shapes import Level, Shape, Within, smooth_max
 from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp, JawWarped
 from cmfsim.phantom.grid import Field, level_grid, level_surface
 from cmfsim.phantom.head import HEAD_BOX, skin_shape

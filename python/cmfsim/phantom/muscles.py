@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.phantom.geometry.courses import COURSES, Course, Row
-from cmfsim.phantom.geometry.curves import Level, smooth_curve, smooth_max
-from cmfsim.phantom.geometry.shapes import REACH, Box, Tube
+from cmfsim.phantom.geometry.shapes import REACH, Box, Level, Tube, smooth_curve, smooth_max
 from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
 from cmfsim.values.checks import Floats, as_rows, frozen

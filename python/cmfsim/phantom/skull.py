@@ -7,8 +7,7 @@ encloses count as bone, as `Anatomy.bones` wants it; `brain_shape` and the like 
 
 import numpy as np
 
-from cmfsim.phantom.geometry.curves import smooth_curve, turn_about
-from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, Step, Tube
+from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, Step, Tube, smooth_curve, turn_about
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.values.checks import Floats
 

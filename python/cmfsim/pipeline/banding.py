@@ -16,12 +16,11 @@ from cmfsim.pipeline.face_regions import FaceLandmarks, face_landmarks
 from cmfsim.solving.models import solved_patient
 from cmfsim.solving.rates import SkinRates, skin_rates
 from cmfsim.surfaces.depth import tissue_depth
-from cmfsim.values.band_options import BandOptions
 from cmfsim.values.calibration import BandFactor, Calibration, settings_digest
 from cmfsim.values.checks import Floats
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
-from cmfsim.values.skin_band import WHOLE_FACE, SkinBand
+from cmfsim.values.skin_band import WHOLE_FACE, BandOptions, SkinBand
 from cmfsim.values.uncertainty import ADDED, NOT_COVERED, band_sources
 
 # Regions of `skin_regions` that a band holds simultaneously, each by itself.

@@ -12,8 +12,7 @@ from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import CaseOrPath, as_case, read_landmarks, read_surface, write_plan
 from cmfsim.pipeline.building.stages import BuildKeywords, build_options
 from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, PLAN_FILE, write_planning_page
-from cmfsim.pipeline.predicting import build_patient, named_models
-from cmfsim.pipeline.preparation import prepare
+from cmfsim.pipeline.predicting import build_patient, named_models, prepare
 from cmfsim.planning.face_planning import (
     FacePlan,
     FaceSearch,
@@ -33,9 +32,9 @@ from cmfsim.planning.replanning import (
     plan_band,
     planning_model,
 )
-from cmfsim.values.band_options import BandOptions
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.progress import BUILDING, PLANNING
+from cmfsim.values.skin_band import BandOptions
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

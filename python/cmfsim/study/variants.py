@@ -17,8 +17,7 @@ from cmfsim.pipeline.building.case_model import kind_options_of
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
 from cmfsim.pipeline.outputs.results import write_report_page
 from cmfsim.report.variants import variants_document, variants_markdown, variants_text
-from cmfsim.study.cohort import CaseOutcome, StudyOptions, StudyReport, run_studies
-from cmfsim.study.outputs import study_table
+from cmfsim.study.cohort import CaseOutcome, StudyOptions, StudyReport, run_studies, study_table
 
 _log = logging.getLogger(__name__)
 

@@ -11,8 +11,7 @@ from cmfsim.errors import CmfsimError, error_text
 from cmfsim.io import Case, CaseChanges
 from cmfsim.pipeline.evaluating import evaluate
 from cmfsim.pipeline.outputs.results import write_results
-from cmfsim.pipeline.predicting import case_for_models
-from cmfsim.pipeline.preparation import prepare
+from cmfsim.pipeline.predicting import case_for_models, prepare
 
 _log = logging.getLogger(__name__)
 

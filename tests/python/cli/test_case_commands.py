@@ -15,7 +15,7 @@ import pytest
 import cmfsim
 from cmfsim.cli import main
 from cmfsim.cli.parsing import make_parser
-from cmfsim.cli.text.terminal import StageProgress, in_colour
+from cmfsim.cli.terminal import StageProgress, in_colour
 from head_case import HeadCase
 
 

@@ -17,7 +17,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.cli.text.terminal import spell_out
+from cmfsim.cli.terminal import spell_out
 from head_case import HeadCase
 
 pytest.importorskip("meshio")
@@ -174,8 +174,7 @@ def test_missing_packages_are_one_line_before_any_work(command, case, monkeypatc
     missing = {"jinja2", "scipy", "meshio", "pyvista"}
     find = importlib.util.find_spec
     monkeypatch.setattr(
-        "cmfsim.pipeline.preparation.find_spec",
-        lambda name: None if name in missing else find(name),
+        "cmfsim.pipeline.predicting.find_spec", lambda name: None if name in missing else find(name)
     )
     assert main([command, str(case)]) == 2
     err = capsys.readouterr().err

@@ -8,7 +8,7 @@ import pytest
 import cmfsim
 import cmfsim.pipeline.predicting
 from cmfsim.cli import main
-from cmfsim.cli.text.notices import Notices
+from cmfsim.cli.terminal import Notices
 from cmfsim.report import case_document, render_page
 from cmfsim.values.finding import Finding, counted, grouped
 from head_case import HeadCase

@@ -9,9 +9,8 @@ import pytest
 import cmfsim
 import cmfsim.planning.landmark_page.page
 from cmfsim.io import read_landmark_file
-from cmfsim.pipeline.filling import filled_landmarks, head_distribution
 from cmfsim.pipeline.outputs.landmark_page import head_content, write_landmark_page
-from cmfsim.pipeline.proposing import ProposedHead
+from cmfsim.pipeline.proposing import ProposedHead, filled_landmarks, head_distribution
 from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.site_covariance import PLACED_STD
 from cmfsim.values.landmark_sites import site_part

@@ -14,15 +14,13 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from cmfsim.cli.exit_codes import BAD_INPUT, DONE
-from cmfsim.cli.text.notices import FindingsError, Notices
-from cmfsim.cli.text.terminal import StageProgress, columns, escaped, in_colour
+from cmfsim.cli.terminal import FindingsError, Notices, StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.drafting import CASE_FILE, init_case, read_moves
 from cmfsim.io import Case
 from cmfsim.io.results.models import is_model_file
 from cmfsim.pipeline.building.inputs import plan_key
-from cmfsim.pipeline.predicting import case_for_models
-from cmfsim.pipeline.preparation import prepare
+from cmfsim.pipeline.predicting import case_for_models, prepare
 from cmfsim.report import Table
 from cmfsim.values.checks import as_positive
 from cmfsim.values.clinical_motion import plan_lines

@@ -8,15 +8,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from cmfsim.cli.exit_codes import DONE, FAILED
-from cmfsim.cli.opening import open_page
-from cmfsim.cli.text.notices import Notices
-from cmfsim.cli.text.terminal import StageProgress, escaped
+from cmfsim.cli.terminal import Notices, StageProgress, escaped, open_page
 from cmfsim.lab.virtual.demo import DemoCase, write_demo_case
 from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import evaluate
 from cmfsim.pipeline.outputs.results import REPORT_STAGE, WrittenResults, write_results
-from cmfsim.pipeline.predicting import predict_models
-from cmfsim.pipeline.preparation import prepare
+from cmfsim.pipeline.predicting import predict_models, prepare
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.progress import expected_stages
 

@@ -12,18 +12,22 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli.exit_codes import DONE
-from cmfsim.cli.opening import open_page
 from cmfsim.cli.patients.case_commands import print_findings
-from cmfsim.cli.text.terminal import StageProgress, escaped
+from cmfsim.cli.terminal import StageProgress, escaped, open_page
 from cmfsim.errors import CmfsimError, LandmarkError
 from cmfsim.io import Case
 from cmfsim.io.landmark_files import write_landmarks
 from cmfsim.pictures import picture_landmarks
 from cmfsim.pipeline.building.inputs import read_anatomy, read_case_landmarks, read_placed_sites
-from cmfsim.pipeline.filling import filled_landmarks
 from cmfsim.pipeline.outputs.landmark_page import PAGE_FILE, head_content, write_landmark_page
-from cmfsim.pipeline.preparation import prepare
-from cmfsim.pipeline.proposing import BY_SHAPE, ProposedHead, proposed_head, unproposed_head
+from cmfsim.pipeline.predicting import prepare
+from cmfsim.pipeline.proposing import (
+    BY_SHAPE,
+    ProposedHead,
+    filled_landmarks,
+    proposed_head,
+    unproposed_head,
+)
 from cmfsim.planning.landmark_page import LandmarkContent
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding

@@ -10,11 +10,9 @@ import webbrowser
 import numpy as np
 
 from cmfsim.cli.exit_codes import DONE
-from cmfsim.cli.opening import can_open, open_page
 from cmfsim.cli.options import band_options
 from cmfsim.cli.patients.case_commands import case_of, checked
-from cmfsim.cli.text.notices import Notices
-from cmfsim.cli.text.terminal import StageProgress, escaped
+from cmfsim.cli.terminal import Notices, StageProgress, can_open, escaped, open_page
 from cmfsim.pipeline.outputs.planning_page import PLAN_FILE
 from cmfsim.pipeline.planning import TARGET_STD, PlanningPage, make_planning_page
 from cmfsim.planning.face_planning import FacePlan

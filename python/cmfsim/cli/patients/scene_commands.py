@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli.exit_codes import DONE
-from cmfsim.cli.text.notices import Notices
-from cmfsim.cli.text.terminal import escaped
+from cmfsim.cli.terminal import Notices, escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
 from cmfsim.solving.simulation import solve_scene

@@ -14,8 +14,7 @@ from typing import Any
 from cmfsim.cli.exit_codes import DONE, FAILED
 from cmfsim.cli.options import band_options
 from cmfsim.cli.patients.case_commands import case_of, checked
-from cmfsim.cli.text.notices import Notices
-from cmfsim.cli.text.terminal import StageProgress, escaped
+from cmfsim.cli.terminal import Notices, StageProgress, escaped
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
@@ -27,15 +26,13 @@ from cmfsim.pipeline.outputs.results import (
     write_chart_page,
     write_results,
 )
-from cmfsim.pipeline.predicting import predict_models
-from cmfsim.pipeline.preparation import prepare
+from cmfsim.pipeline.predicting import predict_models, prepare
 from cmfsim.report import Note, Table
 from cmfsim.report.band import band_blocks
 from cmfsim.report.case import motion_blocks
 from cmfsim.report.causes import summary_blocks
 from cmfsim.report.study import study_text
-from cmfsim.study.cohort import CaseOutcome, StudyOptions, run_study
-from cmfsim.study.outputs import write_study_report
+from cmfsim.study.cohort import CaseOutcome, StudyOptions, run_study, write_study_report
 from cmfsim.study.trials import sensitivity as landmark_sensitivity
 from cmfsim.study.variants import run_variants, write_variants_report
 from cmfsim.values.clinical_motion import plan_lines

@@ -17,7 +17,6 @@ from cmfsim.io.results.populations import (
     TRAIN,
     Population,
 )
-from cmfsim.lab.benchmark.bands import calibrated_band
 from cmfsim.lab.benchmark.entries import (
     ENTRIES,
     LEARNED,
@@ -29,7 +28,7 @@ from cmfsim.lab.benchmark.entries import (
     times_of,
 )
 from cmfsim.lab.benchmark.patients import BenchmarkPatient, far_from_models, patients_of
-from cmfsim.lab.benchmark.scores import MethodResult, score
+from cmfsim.lab.benchmark.scores import MethodResult, calibrated_band, score
 from cmfsim.lab.benchmark.skin_predictions import read_skin_prediction
 from cmfsim.lab.benchmark.tables import BenchmarkTable
 from cmfsim.processes.parallel import answers

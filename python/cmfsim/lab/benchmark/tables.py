@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from cmfsim.evaluation import cases_needed, covered_interval
-from cmfsim.lab.benchmark.bands import COVERAGE
 from cmfsim.lab.benchmark.entries import NO_CHANGE
 from cmfsim.lab.benchmark.patients import LIPS
-from cmfsim.lab.benchmark.scores import REGIONS, MethodResult
+from cmfsim.lab.benchmark.scores import COVERAGE, REGIONS, MethodResult
 
 DASH = "–"
 

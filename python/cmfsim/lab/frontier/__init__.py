@@ -1,11 +1,17 @@
 """Error against run time: what each choice of a prediction costs, and what it buys."""
 
-from cmfsim.lab.frontier.choice import Choice, case_choice
+from cmfsim.lab.frontier.choice import (
+    EDGES,
+    FACTORS,
+    Choice,
+    case_choice,
+    reference_choice,
+    sweep_choices,
+)
+from cmfsim.lab.frontier.files import frontier_page
 from cmfsim.lab.frontier.frontier_run import frontier
 from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread, pareto_front
 from cmfsim.lab.frontier.skin_points import SKIN, WHOLE, skin_errors
-from cmfsim.lab.frontier.sweep import EDGES, FACTORS, reference_choice, sweep_choices
-from cmfsim.lab.frontier.table import frontier_page
 
 __all__ = [
     "EDGES",

@@ -15,10 +15,9 @@ from cmfsim import _core
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.io import Case
 from cmfsim.io.files.archives import member_of, read_archive
-from cmfsim.lab.frontier.choice import Choice, case_choice
+from cmfsim.lab.frontier.choice import Choice, case_choice, reference_choice, sweep_choices
 from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread, with_front
 from cmfsim.lab.frontier.skin_points import WHOLE, read_points, skin_errors
-from cmfsim.lab.frontier.sweep import reference_choice, sweep_choices
 from cmfsim.lab.frontier.timing import MOVED_FORMAT, STOPPED, Answer, kept, machine, run_job
 from cmfsim.pipeline.building.inputs import input_hashes
 from cmfsim.values.checks import Floats, as_positive

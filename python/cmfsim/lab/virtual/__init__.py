@@ -7,8 +7,7 @@ finer mesh, individual muscles and contact that only pushes, solved with scikit-
 
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
 from cmfsim.lab.virtual.patient_folder import virtual_patients, write_virtual_patient
-from cmfsim.lab.virtual.people import PATIENTS, Relocation, VirtualPatient
-from cmfsim.lab.virtual.population import drawn_patient
+from cmfsim.lab.virtual.population import PATIENTS, Relocation, VirtualPatient, drawn_patient
 from cmfsim.lab.virtual.population_folder import PatientOutcome, virtual_population
 
 __all__ = [

@@ -20,7 +20,7 @@ from cmfsim.io.cases.cohorts import COHORT_FORMAT
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.lab.virtual.carried_skin import scanned
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
-from cmfsim.lab.virtual.people import (
+from cmfsim.lab.virtual.population import (
     DRAWN,
     PATIENTS,
     Relocation,

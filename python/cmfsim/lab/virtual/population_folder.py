@@ -29,8 +29,7 @@ from cmfsim.lab.virtual.patient_folder import (
     patient_settings,
     write_virtual_patient,
 )
-from cmfsim.lab.virtual.people import VirtualPatient
-from cmfsim.lab.virtual.population import OWN, drawn_patient
+from cmfsim.lab.virtual.population import OWN, VirtualPatient, drawn_patient
 from cmfsim.processes.parallel import answers
 from cmfsim.values.checks import as_number, as_positive
 

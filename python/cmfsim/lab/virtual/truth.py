@@ -36,7 +36,7 @@ from cmfsim.lab.virtual.operation import (
     without_bite,
     without_gaps,
 )
-from cmfsim.lab.virtual.people import TrueTissue, VirtualPatient
+from cmfsim.lab.virtual.population import TrueTissue, VirtualPatient
 from cmfsim.phantom import PhantomHead
 from cmfsim.pipeline.building.case_model import build_model, kind_options_of
 from cmfsim.surfaces.depth import moved_outward, tissue_depth

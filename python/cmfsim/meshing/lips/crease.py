@@ -5,14 +5,15 @@ them. Profiles are taken in planes along the mouth's frame; a path through all o
 dynamic programming, follows the crease past places where another fold is deeper for a moment.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.meshing.lips.frame import MouthFrame
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
+from cmfsim.values.dental_arch import DentalArch
 
 # Grid of the profiles, mm: planes across, places along a profile, and steps of a ray into the head.
 COLUMN, STEP, RAY = 1.0, 0.5, 0.5
@@ -38,6 +39,62 @@ NARROWEST = 12.0
 MOST_SLOPE, COSTLY_SLOPE = 1.5, 1.6
 # Length over which the line is smoothed, mm: fine enough for the bow of the upper lip.
 SMOOTH = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class MouthFrame:
+    """Axes of a mouth, with its origin half-way between the fronts of the two arches.
+
+    origin: (3,), mm.
+    axes: (3, 3). Rows: unit vectors to the left, ahead and up, at right angles. The frame is
+        left-handed in LPS, where ahead is −y.
+    reach_up, reach_down: mm. Heights of the fronts of the upper and lower arch: between them the
+        lips meet.
+    half_width: mm. Half the distance between the second molars.
+    molars: mm. Forward position of the second molars relative to the origin; negative.
+    """
+
+    origin: Floats
+    axes: Floats
+    reach_up: float
+    reach_down: float
+    half_width: float
+    molars: float
+
+    def into(self, points: Floats) -> Floats:
+        """Coordinates to the left, ahead and up of points in space, (n, 3) mm."""
+        return (points - self.origin) @ self.axes.T
+
+    def out_of(self, places: Floats) -> Floats:
+        """The points in space of coordinates to the left, ahead and up, (n, 3) mm."""
+        return self.origin + places @ self.axes
+
+
+def mouth_frame(arches: Mapping[str, DentalArch]) -> MouthFrame:
+    """The frame of a mouth from its two dental arches.
+
+    arches: "upper" and "lower".
+    """
+    upper, lower = arches["upper"], arches["lower"]
+    up = upper.out - lower.out
+    up = up / np.linalg.norm(up)
+    left = upper.left - upper.right
+    left = left + lower.left - lower.right
+    left = left - (left @ up) * up
+    left = left / np.linalg.norm(left)
+    tips = [upper.tip, lower.tip]
+    molars = 0.5 * (upper.middle + lower.middle)
+    origin = 0.5 * (tips[0] + tips[1])
+    ahead = np.cross(left, up)
+    ahead = ahead * np.sign(ahead @ (origin - molars))
+    return MouthFrame(
+        origin,
+        np.stack([left, ahead, up]),
+        float((tips[0] - origin) @ up),
+        float((tips[1] - origin) @ up),
+        0.5 * (upper.half_width + lower.half_width),
+        float((molars - origin) @ ahead),
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.meshing.lips.crease import MIDDLE, MouthLine, SkinProfiles, smoothed, solid
-from cmfsim.meshing.lips.frame import MouthFrame
+from cmfsim.meshing.lips.crease import MIDDLE, MouthFrame, MouthLine, SkinProfiles, smoothed, solid
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.meshing.node_kinds.arches import DentalArches, dental_arches
+from cmfsim.meshing.node_kinds.arches import DentalArches, dental_arches, sliding_nodes
 from cmfsim.meshing.node_kinds.options import BORDERS, KindOptions
-from cmfsim.meshing.node_kinds.sliding import sliding_nodes
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, Indices, as_index_rows, as_point, as_rows, check_instance
 from cmfsim.values.finding import Finding

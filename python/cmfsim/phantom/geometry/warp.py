@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.phantom.geometry.curves import Level, smooth_step
-from cmfsim.phantom.geometry.shapes import REACH, Box, Shape
+from cmfsim.phantom.geometry.shapes import REACH, Box, Level, Shape, smooth_step
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.values.checks import Floats
 

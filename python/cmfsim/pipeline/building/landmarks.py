@@ -206,8 +206,7 @@ def found_landmarks(
         needs it.
     """
     # A case with landmarks loads nothing of the synthetic heads that others are compared with.
-    from cmfsim.pipeline.filling import filled_landmarks  # noqa: PLC0415
-    from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head, unproposed_head  # noqa: PLC0415
+    from cmfsim.pipeline.proposing import BY_SHAPE, filled_landmarks, proposed_head, unproposed_head  # noqa: PLC0415
 
     stages.begin("finding the landmarks")
     skull = placed.get("skull", {})

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from cmfsim.io import replacing
-from cmfsim.pipeline.filling import GivenSites, head_distribution
-from cmfsim.pipeline.proposing import ProposedHead
+from cmfsim.pipeline.proposing import GivenSites, ProposedHead, head_distribution
 from cmfsim.planning.landmark_page import (
     LandmarkContent,
     PageSite,

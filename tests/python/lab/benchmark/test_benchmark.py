@@ -18,10 +18,10 @@ from cmfsim.io.results.populations import part_of
 from cmfsim.lab.benchmark.entries import (
     SKIN_RATIOS,
     EntryFolder,
+    PartialLeastSquares,
     learned_entries,
     predict_by_ratios,
 )
-from cmfsim.lab.benchmark.least_squares import PartialLeastSquares
 from cmfsim.lab.benchmark.patients import BenchmarkPatient, patients_of
 from cmfsim.lab.virtual import Relocation, VirtualPatient
 from cmfsim.lab.virtual.patient_folder import case_text

@@ -28,8 +28,8 @@ from cmfsim.lab.frontier import (
 )
 from cmfsim.lab.frontier import frontier as bench_frontier
 from cmfsim.lab.frontier import frontier_run as bench
+from cmfsim.lab.frontier.choice import EARLY
 from cmfsim.lab.frontier.rows import FrontierRow, with_front
-from cmfsim.lab.frontier.sweep import EARLY
 from cmfsim.lab.frontier.timing import machine, run_job
 from cmfsim.values.skin_motion import carried_points
 from head_case import HeadCase

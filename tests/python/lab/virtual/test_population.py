@@ -15,7 +15,6 @@ import cmfsim
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.lab.virtual import population_folder
-from cmfsim.lab.virtual.people import TrueTissue
 from cmfsim.lab.virtual.population import (
     ALONG_OVER_ACROSS,
     CHIN_FORWARDS,
@@ -27,6 +26,7 @@ from cmfsim.lab.virtual.population import (
     OPERATIONS,
     SKIN_THICKNESS,
     SKIN_YOUNG,
+    TrueTissue,
 )
 from cmfsim.values.uncertainty import PLAN
 

@@ -19,7 +19,7 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_surface
 from cmfsim.io.files.reading_writing import replacing
-from cmfsim.lab.virtual.people import PATIENTS
+from cmfsim.lab.virtual.population import PATIENTS
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy

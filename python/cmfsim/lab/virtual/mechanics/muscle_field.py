@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.phantom import Muscle, PhantomHead
-from cmfsim.phantom.geometry.curves import smooth_max
-from cmfsim.phantom.geometry.shapes import Tube
+from cmfsim.phantom.geometry.shapes import Tube, smooth_max
 from cmfsim.phantom.muscles import MELT
 from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows, check_one_of
 

@@ -1,4 +1,4 @@
-"""Output of the command line for people: errors, log lines, the stage of the work."""
+"""What commands print: progress, tables, and findings as they arise and at the end."""
 
 import codecs
 import logging
@@ -7,12 +7,18 @@ import shutil
 import sys
 import threading
 import time
-from collections.abc import Mapping
+import webbrowser
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import Any, TextIO
 
-from cmfsim.errors import error_text
-from cmfsim.values.progress import COUNT, TimeLeft
+from cmfsim.doctor.report import severity_text
+from cmfsim.errors import CmfsimError, error_text
+from cmfsim.pictures import has_screen
+from cmfsim.values.finding import Finding, FindingGroup, counted, grouped
+from cmfsim.values.progress import COUNT, Observer, TimeLeft
 
 # Back to the start of the line and erase it.
 CLEAR_LINE = "\r\x1b[K"
@@ -27,6 +33,17 @@ SPELLED = {
     "\N{GREATER-THAN OR EQUAL TO}": ">=", "\N{GREEK SMALL LETTER NU}": "nu",
     "\N{GREEK SMALL LETTER MU}": "u", "\N{ALMOST EQUAL TO}": "~",
 }  # fmt: skip
+
+
+def can_open() -> bool:
+    """Whether a person works at a screen."""
+    return sys.stdout.isatty() and not os.environ.get("CI") and has_screen()
+
+
+def open_page(path: Path, *, wanted: bool = True) -> None:
+    """Opens a file in the browser if it is wanted and somebody is there."""
+    if wanted and can_open():
+        webbrowser.open(path.resolve().as_uri())
 
 
 class ProgressHandler(logging.Handler):
@@ -153,3 +170,77 @@ def in_colour(stream: TextIO) -> bool:
 def columns() -> int:
     """The width of the terminal, in characters."""
     return shutil.get_terminal_size().columns
+
+
+class FindingsError(Exception):
+    """The doctor found errors, so the command did nothing else."""
+
+    def __init__(self, findings: Sequence[Finding]) -> None:
+        errors = [finding for finding in findings if finding.severity == "error"]
+        first = errors[0]
+        more = f" (and {len(errors) - 1} more errors)" if len(errors) > 1 else ""
+        super().__init__(f"{first.where}: {first.what}{more}")
+        self.findings = tuple(findings)
+
+
+class Notices(Observer):
+    """The findings of a command, without duplicates.
+
+    Warnings and errors are printed on standard error as they come, grouped by kind, and again by
+    `summarise`; notes are counted there. Use it
+    as the observer of the work: models that cannot be solved are recorded in `failures`.
+    """
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._found: dict[Finding, None] = {}
+        self.failures: dict[str, CmfsimError] = {}
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """All so far, in the order in which they came."""
+        return tuple(self._found)
+
+    def found(self, findings: Iterable[Finding]) -> None:
+        """Adds findings, and prints the new ones except notes."""
+        new = [finding for finding in dict.fromkeys(findings) if finding not in self._found]
+        self._found.update(dict.fromkeys(new))
+        for group in grouped(new):
+            if group.severity != "note":
+                _print(f"cmfsim: {_head(group)}: {escaped(group.line)}")
+
+    def failed(self, model: str, error: CmfsimError) -> None:
+        """Records the error: the other models continue."""
+        self.failures[model] = error
+
+    def summarise(self, where: str | None) -> None:
+        """Prints the list at the end: nothing if there are no findings.
+
+        where: The file that lists all findings in full, for the first line; None lists notes as
+            well.
+        """
+        groups = grouped(self._found)
+        if where is not None or self._quiet:
+            groups = [group for group in groups if group.severity != "note"]
+        if not groups and (self._quiet or not self._found):
+            return
+        full = "" if where is None else f"; in full: {escaped(where)}"
+        _print(f"cmfsim: {counted(self._found)}{full}")
+        for group in groups:
+            _print(f"  {_head(group)}: {escaped(group.line)}")
+            if group.worst.fix:
+                _print(f"    fix: {escaped(group.worst.fix)}")
+
+    def as_dicts(self) -> list[dict[str, Any]]:
+        """Plain values, ready for JSON."""
+        return [asdict(finding) for finding in self._found]
+
+
+def _head(group: FindingGroup) -> str:
+    return severity_text(group.severity, colour=in_colour(sys.stderr))
+
+
+def _print(line: str) -> None:
+    # Over the line of the stage, where there is one.
+    clear = CLEAR_LINE if sys.stderr.isatty() else ""
+    print(f"{clear}{line}", file=sys.stderr, flush=True)

@@ -1,1 +1,0 @@
-"""What the terminal shows: findings, reports, causes of errors."""
