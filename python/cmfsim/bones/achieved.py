@@ -19,9 +19,8 @@ from cmfsim._core import Surface, rigid_fit
 from cmfsim.bones.motion import RemovedBone, missing_patches
 from cmfsim.bones.pairs.coherent_motion import RigidPiece, coherent_motion
 from cmfsim.bones.pairs.matching import MatchOptions, lay_on
-from cmfsim.bones.pairs.paired_surfaces import paired_shape
+from cmfsim.bones.pairs.paired_surfaces import StrayPatch, paired_shape, stray_patches
 from cmfsim.bones.pairs.shape_fit import ShapeFit
-from cmfsim.bones.pairs.stray_patches import StrayPatch, stray_patches
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import (

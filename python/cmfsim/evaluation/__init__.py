@@ -2,7 +2,15 @@
 
 from cmfsim.evaluation.comparison import SkinComparison, compare_skins
 from cmfsim.evaluation.conformal import calibrate, cases_needed, covered_interval, region_scores
-from cmfsim.evaluation.models import NO_CHANGE, WHOLE, Improvement, ModelComparison, compare_models
+from cmfsim.evaluation.models import (
+    NO_CHANGE,
+    WHOLE,
+    ErrorTable,
+    Improvement,
+    ModelComparison,
+    compare_models,
+    error_table,
+)
 from cmfsim.evaluation.regions import REGIONS, skin_regions, unmoved_regions
 from cmfsim.evaluation.statistics import (
     LEAST_PAIRS,
@@ -13,7 +21,6 @@ from cmfsim.evaluation.statistics import (
     paired_change,
     wilcoxon_test,
 )
-from cmfsim.evaluation.tables import ErrorTable, error_table
 from cmfsim.evaluation.unmoved import ThicknessChange, compare_unmoved, fitted_thickness
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 

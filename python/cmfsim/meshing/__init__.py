@@ -4,14 +4,17 @@
 """
 
 from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
-from cmfsim.meshing.quality import (
+from cmfsim.meshing.stuffing import (
+    MeshOptions,
+    TissueMesh,
     mesh_findings,
+    mesh_from_labels,
+    mesh_from_level,
     mesh_report,
     part_mesh,
     report_of_part,
     separated_mesh,
 )
-from cmfsim.meshing.stuffing import MeshOptions, TissueMesh, mesh_from_labels, mesh_from_level
 from cmfsim.meshing.tissue import TissueRegion, near_skin, tissue_level
 
 __all__ = [

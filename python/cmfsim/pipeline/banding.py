@@ -16,12 +16,18 @@ from cmfsim.pipeline.face_regions import FaceLandmarks, face_landmarks
 from cmfsim.solving.models import solved_patient
 from cmfsim.solving.rates import SkinRates, skin_rates
 from cmfsim.surfaces.depth import tissue_depth
-from cmfsim.values.calibration import BandFactor, Calibration, settings_digest
+from cmfsim.values.calibration import (
+    ADDED,
+    NOT_COVERED,
+    BandFactor,
+    Calibration,
+    band_sources,
+    settings_digest,
+)
 from cmfsim.values.checks import Floats
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import WHOLE_FACE, BandOptions, SkinBand
-from cmfsim.values.uncertainty import ADDED, NOT_COVERED, band_sources
 
 # Regions of `skin_regions` that a band holds simultaneously, each by itself.
 BAND_REGIONS = (WHOLE_FACE, "nose", "upper lip", "lower lip", "chin", "left cheek", "right cheek")

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from cmfsim._core import MassTensors, Solution, StaticSolver, Tissue
 from cmfsim.errors import CaseInputError, MaterialError
 from cmfsim.solving.simulation import scene_plan
+from cmfsim.values.calibration import PLAN, TISSUE, Source
 from cmfsim.values.checks import Floats
 from cmfsim.values.moduli import PRESET_MODULI, FatModuli
 from cmfsim.values.motion import rigid_motion
@@ -24,7 +25,6 @@ from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import Scene
 from cmfsim.values.surface_data import MovedSurface
 from cmfsim.values.tissue_data import TissueData
-from cmfsim.values.uncertainty import PLAN, TISSUE, Source
 
 # Difference of forces, in standard deviations: small enough for its error of first order to be
 # 1e-4 of it, far above rounding. Downwards, away from ν = 0.5 and from a fraction of 1.

@@ -7,7 +7,7 @@ import pytest
 
 import cmfsim
 from cmfsim.pipeline.building.surgery.attached_bodies import held_part
-from cmfsim.pipeline.building.tissue.clefts import (
+from cmfsim.pipeline.building.tissue.contacts import (
     cleft_tets,
     crushed_tets,
     without_clefts,

@@ -10,7 +10,7 @@ import cmfsim
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.rates import skin_rates, tissue_parts
 from cmfsim.solving.simulation import scene_plan, scene_solver, solved_scene
-from cmfsim.values.uncertainty import PLAN
+from cmfsim.values.calibration import PLAN
 from shared_values import coarse_demo_patient
 
 # Half the distance between the two solutions of a difference, in standard deviations.

@@ -4,6 +4,9 @@ The rules follow the usual surgical descriptions (Bell 1975 for Le Fort I, Tessi
 III, Trauner and Obwegeser 1957 with Dal Pont 1961 for the sagittal split, Trauner and Obwegeser
 1957 for the chin); the distances below stand in for what a surgeon sees in the image, and each can
 be changed. Left and right follow the names of the landmarks, never the sign of a coordinate.
+
+A missing site is estimated where the other sites of its jaw put it in an average head; where its
+partner on the other side is known, it departs from there as the partner does.
 """
 
 import math

@@ -1,11 +1,11 @@
 """The open benchmark: displacements of the skin, by any method, scored on virtual patients."""
 
-from cmfsim.lab.benchmark.running import run_benchmark
-from cmfsim.lab.benchmark.skin_predictions import (
+from cmfsim.lab.benchmark.patients import (
     SkinPrediction,
     read_skin_prediction,
     write_skin_prediction,
 )
+from cmfsim.lab.benchmark.running import run_benchmark
 from cmfsim.lab.benchmark.tables import BenchmarkTable
 
 __all__ = [

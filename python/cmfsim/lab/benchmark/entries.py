@@ -3,6 +3,9 @@
 The entry of published ratios moves skin landmarks with the bone by fixed shares, as planning in two
 dimensions does. They are known for few landmarks; between these the face follows a thin-plate
 spline.
+
+The entry that learns does so by partial least squares from the planned motion to that of the skin:
+it knows the patients of the training part with their true faces, and no mechanics.
 """
 
 import hashlib
@@ -19,8 +22,8 @@ from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.errors import CaseInputError, CmfsimError, third_party
 from cmfsim.evaluation import SKIN_LANDMARKS
 from cmfsim.io import replacing
-from cmfsim.lab.benchmark.patients import BenchmarkPatient
-from cmfsim.lab.benchmark.skin_predictions import (
+from cmfsim.lab.benchmark.patients import (
+    BenchmarkPatient,
     SkinPrediction,
     read_skin_prediction,
     write_skin_prediction,

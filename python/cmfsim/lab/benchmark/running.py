@@ -27,9 +27,13 @@ from cmfsim.lab.benchmark.entries import (
     patient_entries,
     times_of,
 )
-from cmfsim.lab.benchmark.patients import BenchmarkPatient, far_from_models, patients_of
+from cmfsim.lab.benchmark.patients import (
+    BenchmarkPatient,
+    far_from_models,
+    patients_of,
+    read_skin_prediction,
+)
 from cmfsim.lab.benchmark.scores import MethodResult, calibrated_band, score
-from cmfsim.lab.benchmark.skin_predictions import read_skin_prediction
 from cmfsim.lab.benchmark.tables import BenchmarkTable
 from cmfsim.processes.parallel import answers
 from cmfsim.values.checks import as_number, check_one_of

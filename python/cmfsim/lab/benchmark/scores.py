@@ -13,8 +13,12 @@ from cmfsim.errors import CaseInputError
 from cmfsim.evaluation import calibrate, cases_needed, region_scores
 from cmfsim.io.results.calibrations import write_calibration
 from cmfsim.lab.benchmark.entries import EntryFolder, check_own
-from cmfsim.lab.benchmark.patients import LIPS, BenchmarkPatient
-from cmfsim.lab.benchmark.skin_predictions import SkinPrediction, read_skin_prediction
+from cmfsim.lab.benchmark.patients import (
+    LIPS,
+    BenchmarkPatient,
+    SkinPrediction,
+    read_skin_prediction,
+)
 from cmfsim.values.calibration import BandFactor, Calibration, CalibrationCase
 from cmfsim.values.checks import Floats
 

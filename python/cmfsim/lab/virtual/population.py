@@ -9,8 +9,8 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
 from cmfsim.phantom.geometry.courses import COURSES
+from cmfsim.values.calibration import ADDED, PLAN
 from cmfsim.values.checks import as_number, check_one_of
-from cmfsim.values.uncertainty import ADDED, PLAN
 
 Triple = tuple[float, float, float]
 # Numbers above this belong to patients drawn at random.

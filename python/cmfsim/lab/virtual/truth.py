@@ -11,19 +11,19 @@ from cmfsim._core import Surface, TetMesh
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io import Case
 from cmfsim.lab.virtual.carried_skin import carried
-from cmfsim.lab.virtual.mechanics.body import HyperelasticBody
+from cmfsim.lab.virtual.mechanics.body import (
+    FAT,
+    MUSCLE,
+    HyperelasticBody,
+    HyperelasticTissue,
+    Moduli,
+    SkinLayer,
+)
 from cmfsim.lab.virtual.mechanics.equilibrium import (
     Contact,
     Equilibrium,
     EquilibriumOptions,
     find_equilibrium,
-)
-from cmfsim.lab.virtual.mechanics.hyperelastic import (
-    FAT,
-    MUSCLE,
-    HyperelasticTissue,
-    Moduli,
-    SkinLayer,
 )
 from cmfsim.lab.virtual.mechanics.lip_contact import ContactSum, LipContact, lips_of
 from cmfsim.lab.virtual.mechanics.muscle_field import muscle_field, skin_share, thickened

@@ -1,4 +1,9 @@
-"""Landmarks of a case that gives none or few: found on its head; where they come from in words."""
+"""Landmarks of a case that gives none or few: found on its head; where they come from in words.
+
+Each site lies on the bone that its name puts it on, and each piece holds its sites: a jaw that
+segmentation exchanged with the other, or a site placed on the wrong one, would move the wrong bone,
+and the face would still look like a face.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

@@ -21,12 +21,11 @@ from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.rates import ACCURACY, scene_parts, tissue_load
 from cmfsim.solving.simulation import scene_plan
-from cmfsim.values.calibration import BandFactor
+from cmfsim.values.calibration import TISSUE, BandFactor, Source
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import decompose_motion
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import SkinBand
-from cmfsim.values.uncertainty import TISSUE, Source
 
 # The sources whose effect grows with the plan by tenths of a millimetre; that of the others, below
 # 0.1 mm, is taken as at the reference.

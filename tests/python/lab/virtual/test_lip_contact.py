@@ -7,9 +7,8 @@ import cmfsim
 import meshes
 from cmfsim import HeadParameters, make_head
 from cmfsim.errors import CaseInputError
-from cmfsim.lab.virtual.mechanics.body import HyperelasticBody
+from cmfsim.lab.virtual.mechanics.body import FAT, HyperelasticBody, HyperelasticTissue
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions, find_equilibrium
-from cmfsim.lab.virtual.mechanics.hyperelastic import FAT, HyperelasticTissue
 from cmfsim.lab.virtual.mechanics.lip_contact import ContactSum, Lip, LipContact
 from cmfsim.lab.virtual.open_mouth import MouthSlit
 

@@ -28,7 +28,7 @@ from cmfsim.lab.virtual.population import (
     SKIN_YOUNG,
     TrueTissue,
 )
-from cmfsim.values.uncertainty import PLAN
+from cmfsim.values.calibration import PLAN
 
 SIZE = 400
 # What a test can afford: coarse tets, and a CT that no prediction will read.

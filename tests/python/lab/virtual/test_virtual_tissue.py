@@ -8,18 +8,18 @@ import pytest
 import cmfsim
 import meshes
 from cmfsim.errors import CaseInputError, SolverError
-from cmfsim.lab.virtual.mechanics.body import HyperelasticBody
-from cmfsim.lab.virtual.mechanics.bone_contact import ONSET, BoneContact, SmoothDistance
-from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions, find_equilibrium
-from cmfsim.lab.virtual.mechanics.hyperelastic import (
+from cmfsim.lab.virtual.mechanics.body import (
     CRUSHED,
     CRUSHED_PRESSURE,
     FAT,
     MUSCLE,
+    HyperelasticBody,
     HyperelasticTissue,
     Moduli,
     SkinLayer,
 )
+from cmfsim.lab.virtual.mechanics.bone_contact import ONSET, BoneContact, SmoothDistance
+from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions, find_equilibrium
 from cmfsim.lab.virtual.operation import screw
 
 TIGHT = EquilibriumOptions(steps=1, tolerance=1e-10, loose=1e-4)

@@ -10,8 +10,8 @@ import numpy as np
 
 from cmfsim.bones import part_segment
 from cmfsim.bones.motion import RemovedBone, sound_motion, torn_pieces
+from cmfsim.bones.pairs.paired_surfaces import REACH, StrayPatch
 from cmfsim.bones.pairs.shape_fit import OPEN, OpenDirection, ShapeFit
-from cmfsim.bones.pairs.stray_patches import REACH, StrayPatch
 from cmfsim.doctor.surgery.moved_bones import check_pairs
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface

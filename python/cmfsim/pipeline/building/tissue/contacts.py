@@ -1,13 +1,13 @@
-"""The surfaces on which tissue slides in a case: the sheet of each arch, or the blurred bone."""
+"""The surfaces on which tissue slides in a case, and tissue left out in clefts between bones."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import TetMesh
+from cmfsim._core import Surface, SurfaceMotion, TetMesh
 from cmfsim.bones import ContactSheet, SheetOptions, contact_sheet, sheet_departure
 from cmfsim.meshing.node_kinds import DentalArches, KindOptions
 from cmfsim.surfaces.levels import contact_surface
@@ -16,10 +16,227 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.node_kinds import NodeKinds
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData, used_nodes
 
+# Distances from two segments, taken together and relative to the width of a cleft, up to which
+# tissue cannot move out of their way.
+CONFINED = 3.0
+# Share of its volume below which a tet between two segments counts as crushed.
+CRUSHED = 0.1
+# Distance from a segment, mm, below which a node moves with it alone.
+ON_BONE = 1e-3
 # Least radius of curvature of a sheet, as a part of the tissue's edge length: what tets can follow.
 RADIUS_IN_EDGES = 0.5
+
+
+def without_clefts(
+    mesh: TetMesh,
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    moved: Collection[str],
+    width: float,
+) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
+    """The mesh without the tets in the clefts next to moving segments, and a finding about them.
+
+    segments: Those that the kinds were found with.
+    moved: Names of the segments that may move.
+    width: mm. As for `cleft_tets`.
+    """
+    nodes, tets = mesh.nodes, mesh.tets
+    inside = cleft_tets(nodes, tets, kinds, segments, moved=moved, width=width)
+    if not inside.any():
+        return mesh, kinds, ()
+    volume = float(mesh.volumes[inside].sum())
+    finding = Finding(
+        "clefts-left-out",
+        f"{int(inside.sum())} tets of {volume:.0f} mm³ in total are in the clefts between "
+        "segments and were removed: their distances from two segments add up to less than "
+        f"{width:g} mm",
+        where=f"segments {', '.join(sorted(moved))}",
+    )
+    return *_without(mesh, kinds, inside), (finding,)
+
+
+def without_crushed(
+    mesh: TetMesh,
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    motions: Mapping[str, Floats | MovedSurface],
+    width: float,
+) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
+    """The mesh without the tets that the plan crushes between segments, and a finding about them.
+
+    Linear tissue turns inside out there at no harm to the rest; in large deformation no position of
+    the nodes between two bones that meet leaves these tets a volume.
+
+    segments: Those that the kinds were found with.
+    motions: mapping of str to (4, 4), mm, or MovedSurface, of the segments that move.
+    width: mm. As for `crushed_tets`.
+    """
+    crushed = crushed_tets(mesh.nodes, mesh.tets, kinds, segments, motions=motions, width=width)
+    if not crushed.any():
+        return mesh, kinds, ()
+    corners = mesh.nodes[mesh.tets[crushed]].reshape(-1, 3)
+    low, high = (", ".join(f"{x:.0f}" for x in end) for end in (corners.min(0), corners.max(0)))
+    finding = Finding(
+        "crushed-left-out",
+        f"{int(crushed.sum())} tets of {float(mesh.volumes[crushed].sum()):.0f} mm³ in total would "
+        f"keep less than {CRUSHED:.0%} of their volume between segments that move towards each "
+        "other, and were removed",
+        where=f"between ({low}) and ({high}) mm",
+    )
+    return *_without(mesh, kinds, crushed), (finding,)
+
+
+def _without(
+    mesh: TetMesh, kinds: NodeKinds, removed: NDArray[np.bool_]
+) -> tuple[TetMesh, NodeKinds]:
+    used, tets = used_nodes(mesh.tets[~removed])
+    return TetMesh(mesh.nodes[used], tets), kinds.of_nodes(used)
+
+
+def crushed_tets(
+    nodes: Floats,
+    tets: NDArray[np.uint32],
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    *,
+    motions: Mapping[str, Floats | MovedSurface],
+    width: float,
+) -> NDArray[np.bool_]:
+    """Which tets a plan crushes between two segments, (m,).
+
+    Nodes on a segment move with it. Those between segments follow all of them with weights 1/d² of
+    the distance d (Shepard 1968). A tet is crushed if this leaves it less than a tenth of its
+    volume. Only tets are judged of which every node has two segments within three times `width`,
+    taken together: other tissue moves out of the way.
+
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32.
+    motions: mapping of str to (4, 4), mm, or MovedSurface, of the segments that move.
+    width: mm. The width of a cleft; 0: no tet.
+    """
+    crushed = np.zeros(len(tets), dtype=bool)
+    if width <= 0.0 or not motions:
+        return crushed
+    reach = CONFINED * width
+    distance = np.full((len(segments), len(nodes)), np.inf)
+    for own, segment in zip(distance, segments, strict=True):
+        surface = segment.surface.searched
+        near = _in_box(nodes, surface, reach)
+        own[near] = _distances(nodes[near], surface)
+        if segment.name in kinds.segments:
+            own[kinds.segment == kinds.segments.index(segment.name)] = 0.0
+    if len(segments) < 2:
+        return crushed
+    confined = np.partition(distance, 1, axis=0)[:2].sum(axis=0) < reach
+    ids = np.flatnonzero(confined[tets].all(axis=1))
+    used, cells = used_nodes(tets[ids])
+    moved = nodes[used] + _blended(nodes[used], distance[:, used], segments, motions)
+
+    def volumes(places: Floats) -> Floats:
+        corners = places[cells]
+        found: Floats = np.linalg.det(corners[:, 1:] - corners[:, :1])
+        return found
+
+    crushed[ids] = volumes(moved) < CRUSHED * volumes(nodes[used])
+    return crushed
+
+
+def _blended(
+    nodes: Floats,
+    distance: Floats,
+    segments: Sequence[BoneSegment],
+    motions: Mapping[str, Floats | MovedSurface],
+) -> Floats:
+    """The displacement of nodes by the segments around them, (n, 3)."""
+    # On a segment its weight outdoes all others.
+    weights = 1.0 / np.maximum(distance, ON_BONE) ** 2
+    total = np.zeros_like(nodes)
+    for own, segment in zip(weights, segments, strict=True):
+        motion = motions.get(segment.name)
+        if motion is None:
+            continue
+        if isinstance(motion, MovedSurface):
+            field = SurfaceMotion(motion.surface.searched, motion.moved_vertices)
+            total += own[:, None] * field.displacement(nodes)
+        else:
+            total += own[:, None] * (nodes @ motion[:3, :3].T + motion[:3, 3] - nodes)
+    blended: Floats = total / weights.sum(axis=0)[:, None]
+    return blended
+
+
+def cleft_tets(
+    nodes: Floats,
+    tets: NDArray[np.uint32],
+    kinds: NodeKinds,
+    segments: Sequence[BoneSegment],
+    *,
+    moved: Collection[str],
+    width: float,
+) -> NDArray[np.bool_]:
+    """Which tets lie between two segments of which one or both move, (m,).
+
+    Those are tets that hold nodes of both, and those whose centroid has both within `width`, taken
+    together: a cut in the bone and the slit between the tooth rows look the same.
+
+    nodes: (n, 3), mm.
+    tets: (m, 4) uint32.
+    width: mm. 0: no tet.
+    """
+    inside = np.zeros(len(tets), dtype=bool)
+    if width <= 0.0 or not moved:
+        return inside
+    moves = np.array([name in moved for name in kinds.segments])
+    owner = kinds.segment[tets]
+    most = owner.max(axis=1)
+    least = np.where(owner < 0, most[:, None], owner).min(axis=1)
+    inside |= (most != least) & (moves[most] | moves[least])
+
+    corners = nodes[tets]
+    centroids = corners.mean(axis=1)
+    # A point is at most so much nearer to anything than the nearest corner of its tet.
+    radius = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
+    reach = width + float(radius.max())
+    surfaces = [s.surface.searched for s in segments]
+    about = [_least_at_corners(nodes, tets, surface, reach) - radius for surface in surfaces]
+    names = [segment.name for segment in segments]
+    for one in (i for i, name in enumerate(names) if name in moved):
+        for other in range(len(surfaces)):
+            if other == one or (other < one and names[other] in moved):
+                continue
+            ids = np.flatnonzero(
+                np.maximum(about[one], 0.0) + np.maximum(about[other], 0.0) < width
+            )
+            both = [_distances(centroids[ids], surfaces[each]) for each in (one, other)]
+            inside[ids[both[0] + both[1] < width]] = True
+    return inside
+
+
+def _least_at_corners(
+    nodes: Floats, tets: NDArray[np.uint32], surface: Surface, reach: float
+) -> Floats:
+    """The distance of each tet's nearest corner from a surface; infinity beyond its box."""
+    near = _in_box(nodes, surface, reach)
+    distance = np.full(len(nodes), np.inf)
+    distance[near] = _distances(nodes[near], surface)
+    nearest: Floats = distance[tets].min(axis=1)
+    return nearest
+
+
+def _in_box(nodes: Floats, surface: Surface, reach: float) -> NDArray[np.int64]:
+    """The nodes within a surface's box, enlarged by `reach`."""
+    vertices = surface.vertices
+    low, high = vertices.min(axis=0) - reach, vertices.max(axis=0) + reach
+    return np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
+
+
+def _distances(points: Floats, surface: Surface) -> Floats:
+    if not len(points):
+        return np.zeros(0)
+    closest, _, _ = surface.closest(points)
+    distances: Floats = np.linalg.norm(closest - points, axis=1)
+    return distances
 
 
 @dataclass(frozen=True, eq=False)

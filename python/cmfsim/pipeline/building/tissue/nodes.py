@@ -23,8 +23,13 @@ from cmfsim.pipeline.building.skin.lips import CaseLipContact, lip_contact, sepa
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.pipeline.building.surgery.attached_bodies import held_part
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
-from cmfsim.pipeline.building.tissue.clefts import without_clefts, without_crushed
-from cmfsim.pipeline.building.tissue.contacts import CaseContacts, arch_sheets, mean_edge
+from cmfsim.pipeline.building.tissue.contacts import (
+    CaseContacts,
+    arch_sheets,
+    mean_edge,
+    without_clefts,
+    without_crushed,
+)
 from cmfsim.pipeline.building.tissue.tissue_mesh import end_planes
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
