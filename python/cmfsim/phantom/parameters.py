@@ -38,7 +38,7 @@ class HeadParameters:
     jaw_width : float
         Width of mandible and lower face, 0.92 to 1.08.
     mandible_advance : float, mm
-        Longer mandible: negative is a class II, positive a class III; −6 to 6.
+        Longer mandible: negative is towards class II, positive towards class III; −6 to 6.
     fat_thickness : float, mm
         Fat beyond the ordinary, −1 to 5.
     asymmetry : float, mm

@@ -44,6 +44,8 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
 MARGIN = 1.04
 TEXT_SIZE = 9
 LEGEND_ROW = 26  # pixels
+# Opacity of the ground of a caption, and pixels between a scale and its title.
+CAPTION_GROUND, TITLE_GAP = 0.8, 14
 # Of zlib: level 6 takes three times as long for files that are 4 to 11 % smaller.
 PNG_LEVEL = 4
 # Mean width of a letter of this size, pixels, as VTK draws them: the widest of many lines.
@@ -111,9 +113,12 @@ def draw(
                     _place_camera(plotter, view, corners, half)
                     paint(plotter, view)
                     plotter.reset_camera_clipping_range()
-                    plotter.add_text(
+                    caption = plotter.add_text(
                         view.caption, position=(10, 10), font_size=TEXT_SIZE, color="black"
                     )
+                    # Legible where the head lies behind it.
+                    caption.prop.background_color = "white"
+                    caption.prop.background_opacity = CAPTION_GROUND
                 plotter.subplot(0, 0)
                 swatches = _legend_text(plotter, legend, height)
                 image = np.array(plotter.screenshot(return_img=True))[:, :, :3]
@@ -213,6 +218,7 @@ def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: s
         label_font_size=14,
     )
     bar.SetUnconstrainedFontSize(True)  # noqa: FBT003 (VTK's own signature)
+    bar.SetVerticalTitleSeparation(TITLE_GAP)
 
 
 def write_picture(path: Path, image: NDArray[np.uint8]) -> None:

@@ -1,4 +1,4 @@
-"""The embedded case: a synthetic class III head with its operation and its true face.
+"""The embedded case: a synthetic head with its operation and its true face.
 
 `truth.npz` next to this file holds the face after the operation: `vertices` (v, 3) float, mm, LPS;
 `triangles` (t, 3) integer, outward; `landmark_names` (k,) text and `landmarks` (k, 3) float, mm;
@@ -29,7 +29,7 @@ from cmfsim.values.surface_data import SurfaceData
 TRUTH_FILE = "truth.npz"
 MEMBERS = ("vertices", "triangles", "landmark_names", "landmarks", "parameters")
 
-# Of class III: a long mandible with a strong chin under a maxilla that lies back.
+# A mandible that is long and a chin that is strong next to the average synthetic head (3 and 2 mm).
 DEMO_PATIENT = PATIENTS[1]
 DEMO_PARAMETERS = DEMO_PATIENT.parameters
 # Le Fort I: forwards and up, and turned about the transverse axis through a landmark. Sagittal
@@ -46,10 +46,10 @@ MOST_TRIANGLES = 1_000_000
 
 MARK = "# cmfsim demo: written by this command, and overwritten by it."
 NOTE = (
-    "Not a patient, but a synthetic head (class III) and an operation of ordinary size. Skin, "
-    "bones and airway are computed from the formulas that define the head, so nothing was scanned "
-    "or segmented (cmfsim phantom writes a head with its CT). Landmarks are found automatically, "
-    "more accurately than on real heads. The tets are coarse, for speed."
+    "Not a patient, but a synthetic head (long mandible, strong chin) and an operation of ordinary "
+    "size. Skin, bones and airway are computed from the formulas that define the head, so nothing "
+    "was scanned or segmented (cmfsim phantom writes a head with its CT). Landmarks are found "
+    "automatically, more accurately than on real heads. The tets are coarse, for speed."
 )
 IN_SILICO = (
     " The post-operative face is computed as well, by other equations on a finer mesh with "
