@@ -55,7 +55,7 @@ def first_variant(page: Any) -> None:
     page.get_by_role("tab", name="mandible body").click()
     page.locator("#number-forwards").fill("-6")
     page.locator("#number-forwards").press("Enter")
-    page.get_by_role("button", name="Profile", exact=True).click()
+    page.get_by_role("button", name="Right profile", exact=True).click()
     top(page)
 
 
@@ -95,7 +95,7 @@ def chosen(page: Any) -> None:
     """One is chosen by its profile and saved."""
     page.locator("#show-map").uncheck()
     page.locator("#show-side").uncheck()
-    page.get_by_role("button", name="Profile", exact=True).click()
+    page.get_by_role("button", name="Right profile", exact=True).click()
     page.get_by_role("button", name="Setback 6", exact=True).click()
     with page.expect_download():
         page.locator("#save-plan").click()

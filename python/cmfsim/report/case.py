@@ -8,7 +8,17 @@ from cmfsim.errors import CaseInputError
 from cmfsim.report.band import band_section
 from cmfsim.report.causes import not_operated_blocks, statistics_table, thickness_blocks
 from cmfsim.report.clinical import clinical_sections
-from cmfsim.report.document import NOTHING, Alert, Document, Figure, Note, Section, Table, number
+from cmfsim.report.document import (
+    NOTHING,
+    Alert,
+    Document,
+    Figure,
+    Note,
+    Section,
+    Table,
+    View,
+    number,
+)
 from cmfsim.report.labels import MEASURES, MESH, MUSCLES, labelled
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, counted, grouped
@@ -36,6 +46,10 @@ PICTURES: Mapping[str, str] = {
     "sliding blue, free white.",
 }
 
+VIEW = (
+    "The face before and after, with the bones below it: drag to turn, Shift-drag to move, click "
+    "and use the wheel to zoom. Surfaces are simplified for the screen."
+)
 NO_PICTURES = (
     "This report has no pictures because the machine that wrote it could not draw them. "
     "Pictures need PyVista and OpenGL (pip install '.[view]' in cmfsim's folder; Debian: libgl1, "
@@ -50,6 +64,7 @@ def case_document(
     evaluation: Values | None = None,
     pictures: Mapping[str, bytes] | None = None,
     figures: Sequence[Figure] = (),
+    view: tuple[str, str] | None = None,
     left_out: str = "",
 ) -> Document:
     """The report of a case.
@@ -67,6 +82,8 @@ def case_document(
         PNG files of the model that is shown, by name, those of `PICTURES` first.
     figures : sequence of Figure
         Plots of the evaluation.
+    view : (str, str), optional
+        Markup and script policy of a view of the model that is shown.
     left_out : str
         What does not belong to these predictions and is missing for that.
 
@@ -89,7 +106,7 @@ def case_document(
     sections = [
         *_note_section(entry),
         _plan_section(entry, pictures),
-        _prediction_section(predictions, entry, pictures),
+        _prediction_section(predictions, entry, pictures, view),
         *clinical_sections(entry),
         *_band_sections(entry, pictures),
         *_evaluation_sections(evaluation, figures),
@@ -202,7 +219,10 @@ def _note_section(prediction: Values) -> list[Section]:
 
 
 def _prediction_section(
-    predictions: Sequence[Values], shown: Values, pictures: Mapping[str, bytes]
+    predictions: Sequence[Values],
+    shown: Values,
+    pictures: Mapping[str, bytes],
+    view: tuple[str, str] | None,
 ) -> Section:
     rows = tuple(
         (
@@ -217,11 +237,12 @@ def _prediction_section(
     columns = ("model", "mean", "mean in the face", "95 %", "largest")
     caption = "How far the skin moves, mm: all that is simulated, and the face alone."
     table = Table(columns, rows, caption)
+    turned = [View(*view, f"{VIEW} Model {shown['model']}.")] if view else []
     drawn: Sequence[Figure | Note] = [
         Figure(figure.image, f"{figure.caption} Model {shown['model']}.")
         for figure in _picture("prediction", pictures)
     ]
-    return Section("Prediction", (*(drawn or (Note(NO_PICTURES, "warning"),)), table))
+    return Section("Prediction", (*turned, *(drawn or (Note(NO_PICTURES, "warning"),)), table))
 
 
 def _band_sections(shown: Values, pictures: Mapping[str, bytes]) -> list[Section]:

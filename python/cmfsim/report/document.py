@@ -94,6 +94,18 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class View:
+    """A picture to turn: markup that is trusted, and the source of its script as a policy has it.
+
+    A document has one at most.
+    """
+
+    markup: str
+    script: str
+    caption: str
+
+
+@dataclass(frozen=True)
 class Alert:
     """A message at the top of a report: one line, with the details collapsed below it.
 
@@ -116,7 +128,7 @@ class Section:
     """A part of a report under its heading."""
 
     title: str
-    blocks: tuple[Note | Table | Figure, ...]
+    blocks: tuple[Note | Table | Figure | View, ...]
 
 
 @dataclass(frozen=True)

@@ -392,11 +392,12 @@ def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
 
 
 def read_parts(
-    folder: str | os.PathLike[str],
+    folder: str | os.PathLike[str], kinds: Sequence[str] | None = None
 ) -> dict[str, dict[str, tuple[SurfaceData, NDArray[np.float64]]]]:
     """The surfaces of a prediction that was written, with their vertices after the operation.
 
     folder: That `write_prediction` filled.
+    kinds: Of "bones" and "muscles", those to read; all if omitted.
     Returns: dict of str to dict of str to (SurfaceData, (v, 3)). "skin", "bones" and, in models
         with muscles, "muscles"; then by name. Muscles stay.
     Raises `FileNotFoundError`: A file is missing: another program's folder, or an older version's.
@@ -409,6 +410,8 @@ def read_parts(
         "skin": _read_part_file(checked_file(folder, summary, "face_before.vtp", AGAIN), ["skin"])
     }
     for kind, names in summary["parts"].items():
+        if kinds is not None and kind not in kinds:
+            continue
         path = checked_file(folder, summary, f"{kind}.vtp", AGAIN)
         found[kind] = _read_part_file(path, names)
     return found

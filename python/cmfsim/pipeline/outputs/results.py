@@ -34,6 +34,7 @@ from cmfsim.io.results.predictions import (
     is_prediction_file,
     is_result_file,
     predictions_of,
+    read_parts,
     read_prediction,
     read_prediction_picture,
     stale_results,
@@ -56,6 +57,7 @@ from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.face_regions import face_motion
 from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, page_state
 from cmfsim.planning.face_measures import clinical_figures
+from cmfsim.planning.face_view import face_view
 from cmfsim.report import Document, Figure, case_document, findings_of, render_page
 from cmfsim.report.chart_page import A4, draw_chart_page
 from cmfsim.values.anatomy import BoneSegment
@@ -462,7 +464,7 @@ def _document(
     left_out: str = "",
 ) -> Document:
     """The report of predictions in their places."""
-    shown, pictures = _shown(found)
+    place, pictures = _shown(found)
     shown_figures = []
     # The box plot first: it shows all models together.
     for name in sorted(figures, key=lambda name: name != "errors.png"):
@@ -471,18 +473,29 @@ def _document(
         shown_figures.append(Figure(figures[name], caption))
     return case_document(
         list(found.values()),
-        shown=shown["model"],
+        shown=found[place]["model"],
         evaluation=evaluation,
         pictures=pictures,
         figures=shown_figures,
+        view=_view(place),
         left_out=left_out,
     )
 
 
-def _shown(found: Mapping[Path, Mapping[str, Any]]) -> tuple[Mapping[str, Any], dict[str, bytes]]:
-    """The last of some predictions that has pictures, the last of all without any, and these."""
+def _view(place: Path) -> tuple[str, str] | None:
+    """The view of a prediction; none, with a warning, where its surfaces cannot be simplified."""
+    parts = read_parts(place, ("bones",))
+    try:
+        return face_view(parts)
+    except CmfsimError as error:
+        _log.warning("no view of the face to turn: %s", error)
+        return None
+
+
+def _shown(found: Mapping[Path, Mapping[str, Any]]) -> tuple[Path, dict[str, bytes]]:
+    """The folder of the last prediction that has pictures, of the last without any, and these."""
     pictures: dict[str, bytes] = {}
-    shown: Mapping[str, Any] = {}
+    shown = Path()
     for place, summary in found.items():
         drawn = {
             name: image
@@ -490,17 +503,19 @@ def _shown(found: Mapping[Path, Mapping[str, Any]]) -> tuple[Mapping[str, Any], 
             if (image := read_prediction_picture(place, summary, f"{name}.png")) is not None
         }
         if drawn or not pictures:
-            pictures, shown = drawn, summary
+            pictures, shown = drawn, place
     return shown, pictures
 
 
 def write_chart_page(folder: Path) -> str:
     """The name of the page for the chart, PDF, of the results in a folder; raises as the report."""
     found = predictions_of(folder)
-    shown, pictures = _shown(found)
+    place, pictures = _shown(found)
     findings = findings_of([*found.values()], None)
     write_figure(
-        folder / CHART_PAGE_FILE, A4, lambda page: draw_chart_page(page, shown, pictures, findings)
+        folder / CHART_PAGE_FILE,
+        A4,
+        lambda page: draw_chart_page(page, found[place], pictures, findings),
     )
     return CHART_PAGE_FILE
 

@@ -144,7 +144,7 @@ def page_content(
         "expected_error": errors.as_dict(),
         "correction": _correction(planning),
         "band": band_values,
-        **_framing(skin, arrays["active"]),
+        **framing(skin, arrays["active"]),
     }
     return PageContent(values, arrays, tuple(findings))
 
@@ -363,7 +363,7 @@ def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str
     }
 
 
-def _framing(skin: SurfaceData, active: NDArray[Any]) -> dict[str, Any]:
+def framing(skin: SurfaceData, active: NDArray[Any]) -> dict[str, Any]:
     """Where the picture looks, and how much it shows, mm: what moves, and some of the head."""
     vertices = skin.vertices
     moving = vertices[active] if len(active) else vertices

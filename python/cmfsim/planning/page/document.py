@@ -36,6 +36,13 @@ EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const|class)\b)", re.MUL
 # A name that a module defines at its top.
 DEFINED = re.compile(r"^(?:export )?(?:async )?(?:function|const|let|class) (\w+)", re.MULTILINE)
 FIELD = re.compile(r"@([a-z]+)@")
+# Parts that templates have in common, and the template of a picture within another page.
+INCLUDED = ("canvases", "scripts")
+VIEW = """<style>@style@</style>
+@canvases@
+<div class="controls" id="controls"></div>
+@scripts@
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,36 +90,81 @@ def document_text(document: Document) -> str:
     CaseError
         (also `ValueError`) Numbers that are not finite; scripts that cannot be joined.
     """
-    numbers, table = packed_arrays(document.arrays)
-    packages = dict.fromkeys((SHARED, document.package))
-    style = "".join(
-        path.read_text(encoding="utf-8")
-        for package in packages
-        if (path := files(package).joinpath("page.css")).is_file()
-    )
-    script = joined_scripts(
-        {
-            entry.name: entry.read_text(encoding="utf-8")
-            for package in packages
-            for entry in files(package).joinpath("scripts").iterdir()
-            if entry.name.endswith(".js")
-        },
-        document.main,
-    )
     texts = ("title", "facts", "footer", "stage", "panel", "picture")
+    packages = tuple(dict.fromkeys((SHARED, document.package)))
+    parts = _parts(document.values, document.arrays, packages, document.main)
     fields = {
         **{name: html.escape(getattr(document, name)) for name in texts},
-        "policy": _policy(script, style, is_served=document.is_served),
+        "policy": _policy(parts["script"], parts["style"], is_served=document.is_served),
         "state": html.escape(document.made_for),
         "disclaimer": DISCLAIMER,
-        "style": style,
-        "script": script,
-        "values": _json_in_html({**document.values, "arrays": table}),
+        **parts,
+    }
+    return _filled(_template("page"), fields)
+
+
+def view_markup(
+    values: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
+    *,
+    package: str,
+    main: str,
+    picture: str,
+) -> tuple[str, str]:
+    """The markup of a picture to turn, for a page of another kind, and its script's source policy.
+
+    Parameters
+    ----------
+    values, arrays : mapping
+        As of a document.
+    package, main : str
+        The package that has the first script, and its name.
+    picture : str
+        What it is, for screen readers.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) As `document_text`.
+    """
+    parts = _parts(values, arrays, (package,), main)
+    fields = {**parts, "picture": html.escape(picture)}
+    return _filled(VIEW, fields), f"'sha256-{_digest(parts['script'])}'"
+
+
+def _parts(
+    values: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
+    packages: tuple[str, ...],
+    main: str,
+) -> dict[str, str]:
+    """Style, script, values and numbers as a page has them; the shared picture has the first."""
+    numbers, table = packed_arrays(arrays)
+    paths = [files(SHARED) / "picture.css", *(files(name) / "page.css" for name in packages)]
+    scripts = {
+        entry.name: entry.read_text(encoding="utf-8")
+        for package in dict.fromkeys((SHARED, *packages))
+        for entry in (files(package) / "scripts").iterdir()
+        if entry.name.endswith(".js")
+    }
+    return {
+        "style": "".join(p.read_text(encoding="utf-8") for p in paths if p.is_file()),
+        "script": joined_scripts(scripts, main),
+        "values": _json_in_html({**values, "arrays": table}),
         "numbers": numbers,
     }
-    template = files(SHARED).joinpath("page.html").read_text(encoding="utf-8")
+
+
+def _filled(text: str, fields: Mapping[str, str]) -> str:
+    """A template with its fields, after the templates that it includes."""
+    for part in INCLUDED:
+        text = text.replace(f"@{part}@\n", _template(part))
     # In one pass, so that no text is searched for the fields of another.
-    return FIELD.sub(lambda match: fields[match[1]], template)
+    return FIELD.sub(lambda match: fields[match[1]], text)
+
+
+def _template(name: str) -> str:
+    return (files(SHARED) / f"{name}.html").read_text(encoding="utf-8")
 
 
 def joined_scripts(modules: Mapping[str, str], main: str = MAIN) -> str:

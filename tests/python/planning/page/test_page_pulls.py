@@ -44,7 +44,7 @@ def test_a_point_of_the_skin_is_pulled_by_numbers_as_python_plans_it(opened, pla
 
 
 def test_a_point_of_the_skin_is_dragged_and_bones_follow_live(opened, planning):
-    opened.get_by_role("button", name="Profile", exact=True).click()
+    opened.get_by_role("button", name="Right profile", exact=True).click()
     opened.locator("#show-pull").check()
     # The mandible alone: the maxilla is locked.
     maxilla = planning.segments.index("maxilla")

@@ -64,7 +64,7 @@ def test_the_measures_are_those_of_python(opened, planning):
 
 def test_every_view_draws_something_else(opened):
     pictures = {}
-    for name in ("Front", "Profile", "Left profile", "Three-quarter", "From below"):
+    for name in ("Front", "Right profile", "Left profile", "Three-quarter", "From below"):
         opened.get_by_role("button", name=name, exact=True).click()
         settle(opened)
         # Of all pixels, those that are not the ground.
@@ -143,7 +143,7 @@ def test_a_turn_leaves_the_chosen_centre_in_place(opened, planning):
 
 
 def test_handles_pull_the_segment_by_what_the_picture_shows(opened, planning):
-    opened.get_by_role("button", name="Profile", exact=True).click()
+    opened.get_by_role("button", name="Right profile", exact=True).click()
     settle(opened)
     before = motions_of(opened, planning)["mandible_body"]
     shape = opened.evaluate("cmfsimPage.handles.shapes.find((s) => s.key === 'forwards')")

@@ -13,7 +13,7 @@ import { connectKeys, connectPointing } from "./pointing.js";
 import { STAYS } from "./rigid.js";
 import { SiteModel } from "./site_model.js";
 import { SitePanel } from "./site_panel.js";
-import { unpack } from "./unpacking.js";
+import { start } from "./unpacking.js";
 import { addViews, slider } from "./view_buttons.js";
 
 const BACKGROUND = [0.933, 0.945, 0.961];
@@ -458,14 +458,4 @@ function mirrored(point, { point: middle, normal }) {
   return point.map((v, k) => v - 2 * away * normal[k]);
 }
 
-try {
-  const page = JSON.parse(document.getElementById("page-values").textContent);
-  const arrays = await unpack(document.getElementById("page-numbers").textContent, page.arrays);
-  // For the console, and for tests.
-  globalThis.cmfsimPage = new App(page, arrays);
-} catch (error) {
-  const box = document.getElementById("failure");
-  box.textContent = `The page cannot be shown: ${error.message}`;
-  box.hidden = false;
-  throw error;
-}
+await start(App);

@@ -7,7 +7,7 @@ import { DEGREE } from "./rigid.js";
 
 export const VIEWS = [
   { name: "Front", azimuth: 0, elevation: 0 },
-  { name: "Profile", azimuth: -90, elevation: 0 },
+  { name: "Right profile", azimuth: -90, elevation: 0 },
   { name: "Left profile", azimuth: 90, elevation: 0 },
   { name: "Three-quarter", azimuth: -40, elevation: 5 },
   { name: "From below", azimuth: 0, elevation: -89.9 },

@@ -18,7 +18,7 @@ import { Plans, beyondLimits } from "./plans.js";
 import { connectKeys, connectPointing } from "./pointing.js";
 import { drawProfile, variantColour } from "./profile.js";
 import { STAYS, partOf } from "./rigid.js";
-import { unpack } from "./unpacking.js";
+import { start } from "./unpacking.js";
 import { VariantPanel } from "./variant_panel.js";
 import { ViewPanel } from "./view_panel.js";
 
@@ -65,7 +65,7 @@ class App {
   }
 
   build() {
-    this.view = new ViewPanel(this);
+    this.view = new ViewPanel(this, ["side", "map", ...(this.face.band ? ["band"] : []), "handles", "pull"]);
     this.panel = new PlanPanel(this);
     this.pulling = new PullPanel(this);
     this.variants = new VariantPanel(this);
@@ -345,14 +345,4 @@ class App {
   }
 }
 
-try {
-  const page = JSON.parse(document.getElementById("page-values").textContent);
-  const arrays = await unpack(document.getElementById("page-numbers").textContent, page.arrays);
-  // For the console, and for tests.
-  globalThis.cmfsimPage = new App(page, arrays);
-} catch (error) {
-  const box = document.getElementById("failure");
-  box.textContent = `The page cannot be shown: ${error.message}`;
-  box.hidden = false;
-  throw error;
-}
+await start(App);

@@ -12,7 +12,8 @@ const CLICK_REACH = 4;
  * Connects the overlay with the app.
  *
  * app gives: overlay, camera, redraw(); canGrab(place) for the cursor; grab(place), what a press
- * takes hold of, as {drag(place), release()}, or null; and clicked(place), if it has clicks.
+ * takes hold of, as {drag(place), release()}, or null; and clicked(place), if it has clicks. If it
+ * is a part of a page to scroll, the wheel zooms only in a picture that was clicked on.
  */
 export function connectPointing(app) {
   const { overlay, camera } = app;
@@ -76,6 +77,7 @@ export function connectPointing(app) {
   overlay.addEventListener("pointercancel", lifted);
   overlay.addEventListener("contextmenu", (e) => e.preventDefault());
   overlay.addEventListener("wheel", (e) => {
+    if (app.isPart && document.activeElement !== overlay) return;
     e.preventDefault();
     camera.zoom(Math.exp(e.deltaY / 800));
     app.redraw();

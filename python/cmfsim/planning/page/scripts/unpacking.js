@@ -16,6 +16,21 @@ export async function unpack(text, table) {
   return arrays;
 }
 
+/** Makes the app of the page from its values and its arrays, or shows why there is none. */
+export async function start(App) {
+  try {
+    const page = JSON.parse(document.getElementById("page-values").textContent);
+    const arrays = await unpack(document.getElementById("page-numbers").textContent, page.arrays);
+    // For the console, and for tests.
+    globalThis.cmfsimPage = new App(page, arrays);
+  } catch (error) {
+    const box = document.getElementById("failure");
+    box.textContent = `The page cannot be shown: ${error.message}`;
+    box.hidden = false;
+    throw error;
+  }
+}
+
 /** Half precision (IEEE 754 binary16) as single precision. */
 export function fromHalf(halves) {
   const table = new Float32Array(65536);

@@ -4,21 +4,22 @@ import { MAP_COLOURS } from "./colours.js";
 import { element } from "./elements.js";
 import { addViews, slider } from "./view_buttons.js";
 
+/** What can be switched on, by key. */
+const BOXES = { side: "Side by side", map: "Colour by movement", band: "Colour by uncertainty", handles: "Handles", pull: "Pull the skin" };
+
 export class ViewPanel {
-  constructor(app) {
+  /** boxes: the keys of what this page can show. */
+  constructor(app, boxes) {
     this.app = app;
     this.values = { skin: 1, bones: 1, share: 1, side: false, map: false, band: false, handles: true, pull: false };
     addViews(app, "Whole face");
     const share = (key, label) => slider(`show-${key}`, label, this.values[key], (value) => this.set(key, value));
-    const box = (key, label) => element("label", {}, element("input", {
+    const box = (key) => element("label", {}, element("input", {
       type: "checkbox", checked: this.values[key], id: `show-${key}`,
       onchange: (e) => this.set(key, e.target.checked),
-    }), label);
+    }), BOXES[key]);
     document.getElementById("controls").append(
-      share("share", "Before – after"), share("skin", "Skin"), share("bones", "Bones"),
-      box("side", "Side by side"), box("map", "Colour by movement"),
-      ...(app.face.band ? [box("band", "Colour by uncertainty")] : []), box("handles", "Handles"),
-      box("pull", "Pull the skin"));
+      share("share", "Before – after"), share("skin", "Skin"), share("bones", "Bones"), ...boxes.map(box));
     this.legend = document.getElementById("legend");
   }
 

@@ -1,0 +1,81 @@
+"""A face before and after an operation, to turn in the browser, as a part of a report."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmfsim.planning.page.content import framing
+from cmfsim.planning.page.document import view_markup
+from cmfsim.surfaces.levels import simplified_surface
+from cmfsim.values.checks import Floats
+from cmfsim.values.skin_motion import carried_points
+from cmfsim.values.surface_data import SurfaceData
+
+Parts = Mapping[str, Mapping[str, tuple[SurfaceData, Floats]]]
+
+# Triangles that a report draws of the face, and of all bones together: 1 MB of its text.
+FACE_TRIANGLES, BONE_TRIANGLES, LEAST_BONE = 24_000, 30_000, 300
+# A vertex that moves by less than this, mm, does not decide what the picture shows; a segment that
+# does is drawn as one that stays.
+STAYS = 0.1
+# How much more than what moves the picture shows at first.
+ROUND_ABOUT = 1.3
+PICTURE = (
+    "The face before and after. Arrow keys rotate it, plus and minus zoom, 1 to 6 choose a view."
+)
+
+
+def face_view(parts: Parts) -> tuple[str, str]:
+    """The markup of the view of a prediction, and what its page must allow scripts from.
+
+    Parameters
+    ----------
+    parts : mapping of str to mapping of str to (SurfaceData, (v, 3) float64)
+        As `read_parts` has them: "skin" and "bones", each with its vertices after the operation.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) fast-simplification is missing and a surface has to be simplified.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    shown: list[dict[str, Any]] = []
+    bones = parts.get("bones", {})
+    count = sum(len(surface.triangles) for surface, _ in bones.values())
+    moving = 0
+    for name, (surface, after) in bones.items():
+        most = max(LEAST_BONE, BONE_TRIANGLES * len(surface.triangles) // count)
+        moves = float(np.linalg.norm(after - surface.vertices, axis=1).max()) > STAYS
+        shown.append({"kind": "bones", "colour": moving if moves else None})
+        moving += moves
+        _pack(arrays, name, surface, after, most)
+    ((skin, after),) = parts["skin"].values()
+    shown.append({"kind": "skin", "colour": None})
+    _pack(arrays, "skin", skin, after, FACE_TRIANGLES)
+    moved = np.linalg.norm(after - skin.vertices, axis=1)
+    values: dict[str, Any] = {
+        "parts": shown,
+        "most": max(1.0, float(np.ceil(2.0 * moved.max()) / 2.0)),
+        **framing(skin, np.flatnonzero(moved > STAYS)),
+    }
+    values["span"] *= ROUND_ABOUT
+    return view_markup(
+        values, arrays, package="cmfsim.planning.face_view", main="view_main.js", picture=PICTURE
+    )
+
+
+def _pack(
+    arrays: dict[str, NDArray[Any]], name: str, surface: SurfaceData, after: Floats, most: int
+) -> None:
+    """Adds a surface with how each vertex moves, in fewer triangles."""
+    fewer = simplified_surface(name, surface, most)
+    shift = after - surface.vertices
+    if fewer is not surface:
+        shift = carried_points(surface, shift, fewer.vertices)
+    key = f"part_{len(arrays) // 3}"
+    arrays[key] = fewer.vertices.astype(np.float32)
+    arrays[f"{key}_triangles"] = fewer.triangles.astype(np.uint32)
+    # Half precision: 0.004 mm on 8 mm.
+    arrays[f"{key}_shift"] = shift.astype(np.float16)
