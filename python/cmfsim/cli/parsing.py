@@ -203,6 +203,12 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     )
     file(report, "folder", "FOLDER", "folder written by predict")
     switch(report, "--pdf", "also write report.pdf, one page for the chart")
+    file(
+        report,
+        "--animation",
+        "FILE",
+        "also write the face on its way from before to after: .gif, or .mp4 by ffmpeg",
+    )
     report.set_defaults(run=study_commands.report)
 
 

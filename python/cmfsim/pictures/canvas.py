@@ -88,9 +88,27 @@ def draw(
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
+    image = drawn(
+        path.name, views, corners, size, paint, legend=legend, columns=columns, words=words
+    )
+    write_picture(path, image)
+
+
+def drawn(
+    name: str,
+    views: Sequence[View],
+    corners: Floats,
+    size: tuple[int, int],
+    paint: Callable[[Any, View], None],
+    *,
+    legend: Sequence[tuple[str, str]] = (),
+    columns: int | None = None,
+    words: Sequence[str] = (),
+) -> NDArray[np.uint8]:
+    """The views as `draw` writes them, (h, w, 3); `name` is that of the file, for messages."""
     width, height = (int(as_positive("picture size", n)) for n in size)
     pv = pyvista_module()
-    check_can_draw(path.name)
+    check_can_draw(name)
     lines = _wrapped(words, width)
     band = len(lines) * LEGEND_ROW + 16 if lines else 0
     height = max(height - band, height // 2)
@@ -128,12 +146,10 @@ def draw(
                 written = _band_of_text(lines, width, band)
     except (RuntimeError, OSError, AttributeError) as error:
         raise CaseInputError(
-            f"{path.name}: the picture cannot be drawn ({error}); {NO_OPENGL}"
+            f"{name}: the picture cannot be drawn ({error}); {NO_OPENGL}"
         ) from error
     _colour_swatches(image, swatches)
-    if band:
-        image = np.concatenate([image, written])
-    write_picture(path, image)
+    return np.concatenate([image, written]) if band else image
 
 
 def _legend_text(
@@ -223,9 +239,14 @@ def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: s
 
 def write_picture(path: Path, image: NDArray[np.uint8]) -> None:
     """Writes an (h, w, 3) image as PNG, under a temporary name first."""
+    write_whole(path, _png(image))
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Writes a file under a temporary name first."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        temporary.write_bytes(_png(image))
+        temporary.write_bytes(data)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -229,6 +229,23 @@ class Prediction(Frozen):
         window, title = _above("pictures.window"), f"{self.name}, {self.model} - cmfsim"
         window.view_parts(window.prediction_parts(self.parts), title=title, screenshot=screenshot)
 
+    def animate(self, path: str | os.PathLike[str]) -> None:
+        """Writes an animation of the face, from the front and the left: before, after, and back.
+
+        Parameters
+        ----------
+        path : path
+            Ends in `.gif`, or in `.mp4` where ffmpeg is installed.
+
+        Raises
+        ------
+        CaseError
+            (also `ValueError`) Another ending; a face that does not move; Pillow, PyVista, OpenGL
+            or ffmpeg is missing.
+        """
+        animate = _above("pictures.animation").animate_face
+        animate(path, self.face_before, self.face.vertices)
+
     def to_pyvista(self) -> Any:
         """The prediction as a `pyvista.MultiBlock`, in LPS mm, after the operation.
 

@@ -22,6 +22,7 @@ from cmfsim.pipeline.outputs.results import (
     REPORT_STAGE,
     WrittenPrediction,
     WrittenResults,
+    write_animation,
     write_case_report,
     write_chart_page,
     write_results,
@@ -317,6 +318,10 @@ def report(options: argparse.Namespace) -> int:
         progress.stage("writing the report")
         name = write_case_report(folder)
         pages = {"pdf": write_chart_page(folder)} if options.pdf else {}
+        if options.animation is not None:
+            progress.stage("drawing the animation")
+            write_animation(folder, options.animation)
+            pages["animation"] = str(options.animation.absolute())
     if name is None:
         return FAILED
     if options.json:

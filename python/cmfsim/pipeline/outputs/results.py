@@ -50,6 +50,7 @@ from cmfsim.pictures import (
     plan_picture,
     prediction_picture,
 )
+from cmfsim.pictures.animation import animate_face
 from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.painting import Painter
 from cmfsim.pipeline.building.stages import OnMuscles
@@ -518,6 +519,13 @@ def write_chart_page(folder: Path) -> str:
         lambda page: draw_chart_page(page, found[place], pictures, findings),
     )
     return CHART_PAGE_FILE
+
+
+def write_animation(folder: Path, path: Path) -> None:
+    """Writes an animation of the face that the report of a folder shows; raises as that does."""
+    place, _ = _shown(predictions_of(folder))
+    ((before, after),) = read_parts(place, ())["skin"].values()
+    animate_face(path, before, after)
 
 
 def _error_caption(model: str) -> str:
