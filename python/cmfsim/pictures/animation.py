@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, third_party
-from cmfsim.pictures.anatomy import SKIN_COLOUR
 from cmfsim.pictures.canvas import View, bounds, drawn, polydata, write_whole
-from cmfsim.pictures.faces import SKIN_SHADING
+from cmfsim.pictures.faces import add_skin
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
@@ -25,7 +25,12 @@ MOVES, AROUND = 0.1, 0.15
 ENDINGS = (".gif", ".mp4")
 
 
-def animate_face(path: str | os.PathLike[str], before: SurfaceData, after: Floats) -> None:
+def animate_face(
+    path: str | os.PathLike[str],
+    before: SurfaceData,
+    after: Floats,
+    colours: NDArray[np.uint8] | None = None,
+) -> None:
     """Writes an animation of a face, from the front and the left: before, after, and back.
 
     Parameters
@@ -35,6 +40,7 @@ def animate_face(path: str | os.PathLike[str], before: SurfaceData, after: Float
     before : SurfaceData
     after : (v, 3) float64, mm
         Its vertices after the operation.
+    colours : (v, 3) uint8, optional
 
     Raises
     ------
@@ -55,13 +61,9 @@ def animate_face(path: str | os.PathLike[str], before: SurfaceData, after: Float
         raise CaseInputError(f"{path.name}: no point of the face moves by more than {MOVES} mm")
     corners = bounds([before.vertices[moving], after[moving]])
     corners += AROUND * np.ptp(corners, axis=0) * np.array([[-1.0], [1.0]])
+    frame = partial(_frame, path.name, colours, corners)
     frames = [
-        _frame(
-            path.name,
-            SurfaceData(before.vertices + share * shift, before.triangles),
-            share,
-            corners,
-        )
+        frame(share, polydata(before.vertices + share * shift, before.triangles))
         # Slowly at both ends.
         for share in 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, STEPS + 1))
     ]
@@ -71,12 +73,12 @@ def animate_face(path: str | os.PathLike[str], before: SurfaceData, after: Float
     write_whole(path, data)
 
 
-def _frame(name: str, face: SurfaceData, share: float, corners: Floats) -> NDArray[np.uint8]:
-    shape = polydata(face.vertices, face.triangles)
-
+def _frame(
+    name: str, colours: NDArray[np.uint8] | None, corners: Floats, share: float, shape: Any
+) -> NDArray[np.uint8]:
     def paint(plotter: Any, view: View) -> None:
         del view
-        plotter.add_mesh(shape, color=SKIN_COLOUR, **SKIN_SHADING)
+        add_skin(plotter, shape, colours)
 
     way = {0.0: "before", 1.0: "after"}.get(round(share, 3), f"{share:.0%} of the way")
     return drawn(

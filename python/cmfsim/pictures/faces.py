@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
@@ -31,6 +32,15 @@ LEAST_SCALE = 0.01
 GHOST_COLOUR = "#7f8c9a"
 # A segment that moves less than this, mm, is drawn where it was: two surfaces in one place flicker.
 STAYS = 0.5
+
+
+def add_skin(plotter: Any, shape: Any, colours: NDArray[np.uint8] | None) -> None:
+    """Adds skin to a view, with the colours of its vertices where there are any."""
+    if colours is None:
+        plotter.add_mesh(shape, color=SKIN_COLOUR, **SKIN_SHADING)
+    else:
+        shape.point_data["colour"] = colours
+        plotter.add_mesh(shape, scalars="colour", rgb=True, **SKIN_SHADING)
 
 
 def picture_prediction(
@@ -60,6 +70,7 @@ def prediction_picture(prediction: Prediction, *, size: tuple[int, int] = TWO_RO
         # The mesh's own skin ends in a ragged rim; a whole head goes on past the picture.
         is_trimmed=prediction.patient.face is None,
         size=size,
+        colours=prediction.face_colours,
     )
 
 
@@ -71,6 +82,7 @@ def picture_faces(
     ends: SkinEnds,
     is_trimmed: bool,
     size: tuple[int, int],
+    colours: NDArray[np.uint8] | None = None,
 ) -> None:
     """Writes a picture of a face before and after; see `picture_prediction`."""
     moved = np.linalg.norm(after.vertices - before.vertices, axis=1)
@@ -83,7 +95,7 @@ def picture_faces(
         if is_trimmed:
             shape = trimmed(shape, ends)
         if not view.caption.startswith("movement"):
-            plotter.add_mesh(shape, color=SKIN_COLOUR, **SKIN_SHADING)
+            add_skin(plotter, shape, colours)
             return
         plotter.add_mesh(
             shape,

@@ -386,6 +386,31 @@ class CaseMuscles:
 
 
 @dataclass(frozen=True)
+class CasePhoto:
+    """The 3D photo whose colours the skin gets.
+
+    Attributes
+    ----------
+    file : Path
+        OBJ with its MTL and texture, or PLY with colours.
+    landmarks : Path or None
+        Skin landmarks on it, three at least, in its own frame, by which it is registered.
+    aligned : bool
+        Whether it lies in the frame of the other data already.
+    units : str
+        Of the photo and its landmarks.
+    """
+
+    file: Path
+    landmarks: Path | None = None
+    aligned: bool = False
+    units: str = "mm"
+
+    def __post_init__(self) -> None:
+        check_one_of("units", self.units, tuple(UNITS))
+
+
+@dataclass(frozen=True)
 class CasePostoperative:
     """The post-operative data.
 

@@ -64,6 +64,8 @@ class PatientModel(Frozen):
         Counts, quality, timings, versions, hashes of the inputs: plain values, ready for JSON.
     detailed_skin : callable or None
         Makes the skin of `face` if no surface of it was given.
+    face_colours : (v, 3) uint8 or None
+        Red, green, blue of the vertices of `face`, from the 3D photo of the case.
     """
 
     name: str
@@ -83,6 +85,7 @@ class PatientModel(Frozen):
     findings: tuple[Finding, ...] = ()
     summary: Mapping[str, Any] = field(default_factory=dict)
     detailed_skin: Callable[[], SurfaceData | None] | None = None
+    face_colours: NDArray[np.uint8] | None = None
 
     def __repr__(self) -> str:
         """Name, mesh, anatomy, plan and what was found."""

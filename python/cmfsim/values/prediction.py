@@ -161,6 +161,11 @@ class Prediction(Frozen):
         """The patient's face in full detail, as given or segmented; otherwise as in the mesh."""
         return self.patient.face or self.skin_before
 
+    @property
+    def face_colours(self) -> NDArray[np.uint8] | None:
+        """Red, green, blue of the vertices of `face`, (v, 3), if the case has a 3D photo."""
+        return self.patient.face_colours
+
     @cached_property
     def face(self) -> SurfaceData:
         """The predicted face: the vertices and triangles of `face_before`, carried by the skin."""
@@ -244,7 +249,7 @@ class Prediction(Frozen):
             or ffmpeg is missing.
         """
         animate = _above("pictures.animation").animate_face
-        animate(path, self.face_before, self.face.vertices)
+        animate(path, self.face_before, self.face.vertices, self.face_colours)
 
     def to_pyvista(self) -> Any:
         """The prediction as a `pyvista.MultiBlock`, in LPS mm, after the operation.

@@ -66,6 +66,24 @@ def test_a_bone_that_stays_has_the_colour_of_bone(page):
     assert page.evaluate("cmfsimPage.parts.map(p => p.colour[0])")[1] == pytest.approx(0.9)
 
 
+def test_the_skin_has_the_colours_of_a_photo(browser, parts, tmp_path):
+    colours = np.full((len(parts["skin"]["skin"][0].vertices), 3), (20, 220, 60), np.uint8)
+    path = tmp_path / "report.html"
+    view = View(*face_view(parts, colours), "caption")
+    path.write_text(render_page(Document("t", "s", sections=[Section("Face", (view,))])))
+    for page in open_page(browser, path):
+        _drawn(page)
+        red, green, blue, _ = page.evaluate(
+            """() => {
+              const { gl, width, height } = cmfsimPage.drawing;
+              const pixel = new Uint8Array(4);
+              gl.readPixels(width / 2, height / 2, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+              return [...pixel];
+            }"""
+        )
+        assert green > 2 * max(red, blue)
+
+
 def test_the_wheel_scrolls_the_report_until_the_picture_is_clicked_on(page):
     page.locator("#overlay").scroll_into_view_if_needed()
     page.locator("h2").click()

@@ -21,6 +21,7 @@ from cmfsim.io.cases.case_tables import (
     muscles_of,
     node_kinds_of,
     output_folder,
+    photo_of,
     postoperative_of,
     region_of,
     solver_of,
@@ -38,6 +39,7 @@ from cmfsim.values.case_parts import (
     CaseMotion,
     CaseMuscles,
     CaseOsteotomy,
+    CasePhoto,
     CasePostoperative,
     CaseSurfaces,
     Region,
@@ -52,7 +54,7 @@ CASE_FILE = "case.toml"
 TABLES = (
     "format", "version", "name", "note", "image", "surfaces", "landmarks", "region", "mesh", "lips",
     "osteotomies", "plan", "node_kinds", "tissue", "muscles", "solver", "band", "postoperative",
-    "output",
+    "photo", "output",
 )  # fmt: skip
 
 
@@ -90,6 +92,7 @@ class Case:
     solver : SolverOptions
     band : CaseBand
     postoperative : CasePostoperative or None
+    photo : CasePhoto or None
     note : str
         A remark for readers of the report, such as that the patient is synthetic.
     places : mapping of str to str
@@ -119,6 +122,7 @@ class Case:
     solver: SolverOptions = field(default_factory=SolverOptions)
     band: CaseBand = field(default_factory=CaseBand)
     postoperative: CasePostoperative | None = None
+    photo: CasePhoto | None = None
     note: str = ""
     places: Mapping[str, str] = field(default_factory=dict)
 
@@ -281,6 +285,7 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
             if "postoperative" in document
             else None
         ),
+        photo=photo_of(document.table("photo"), folder) if "photo" in document else None,
         note=document.text("note") if "note" in document else "",
         places=document.all_places(),
     )

@@ -17,6 +17,7 @@ from cmfsim.values.case_parts import (
     CaseLips,
     CaseMesh,
     CaseMuscles,
+    CasePhoto,
     CasePostoperative,
     CaseSurfaces,
     Plane,
@@ -324,6 +325,24 @@ def _muscle_moduli(table: Table) -> TissueModuli:
     with table.at("moduli" if "moduli" in table else None):
         moduli.resolved(table.text("preset", CaseMuscles().preset, PRESETS))
     return moduli
+
+
+def photo_of(table: Table, folder: Path) -> CasePhoto:
+    """The 3D photo of [photo]."""
+    table.only("file", "landmarks", "aligned", "units")
+    aligned = table.flag("aligned", default=False)
+    if aligned == ("landmarks" in table):
+        table.fail(
+            "aligned" if aligned else None,
+            "needs landmarks = a file with three skin landmarks or more on the photo, or aligned = "
+            "true if it lies in the frame of the other data already; not both",
+        )
+    return CasePhoto(
+        file_of(table, "file", folder),
+        file_or_none(table, "landmarks", folder),
+        aligned,
+        table.text("units", "mm", tuple(UNITS)),
+    )
 
 
 def postoperative_of(table: Table, folder: Path) -> CasePostoperative:

@@ -180,7 +180,7 @@ def beside(folder: Path, where: str, name: object) -> Path:
     leads_out = relative.is_absolute() or ".." in relative.parts or any(c in name for c in "\\:\0")
     # A link may not lead out of the folder either.
     if leads_out or not is_below(path, folder):
-        raise CaseInputError(f"{where} is {name!r}: a file in the folder of the scene is needed")
+        raise CaseInputError(f"{where} is {name!r}: a file in the same folder or below is needed")
     return path
 
 

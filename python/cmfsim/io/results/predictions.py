@@ -284,12 +284,13 @@ def write_prediction(
     `prediction.vtp` (the mesh's skin at rest with its `displacement`, and with its band where it
     has one), `prediction.stl` (the same where it goes), `face.vtp` and `face.stl` (the whole skin
     in full detail, after the operation), `face_before.vtp` (the same before it; both with the
-    `displacement` between them), `prediction.vtu` (tissue with `displacement`, `force`, muscle
-    `fraction` and `fibre`), `prediction.npz` (everything, for `read_result`), `bones.vtp` (segments
-    before the operation, with their `displacement`) and `muscles.vtp`, each vertex with the number
-    of its `part` (the summary lists their names), `timings.json`, and `prediction.json` (counts,
-    parameters, findings, versions, hashes). All files are moved into place together, or none is.
-    Predictions, a comparison and a report in the folder that belong to another plan are removed.
+    `displacement` between them and, if the case has a 3D photo, their `colour`), `prediction.vtu`
+    (tissue with `displacement`, `force`, muscle `fraction` and `fibre`), `prediction.npz`
+    (everything, for `read_result`), `bones.vtp` (segments before the operation, with their
+    `displacement`) and `muscles.vtp`, each vertex with the number of its `part` (the summary lists
+    their names), `timings.json`, and `prediction.json` (counts, parameters, findings, versions,
+    hashes). All files are moved into place together, or none is. Predictions, a comparison and a
+    report in the folder that belong to another plan are removed.
 
     Parameters
     ----------
@@ -335,10 +336,12 @@ def fill_prediction(
         write_triangles(file, skin.vertices, skin.triangles, moved)
     write_surface(fresh / names[1], prediction.skin)
     face, before = prediction.face, prediction.face_before
-    carried = face.vertices - before.vertices
+    carried = {"displacement": face.vertices - before.vertices}
+    if prediction.face_colours is not None:
+        carried["colour"] = prediction.face_colours
     for name, places in ((names[4], face.vertices), (names[6], before.vertices)):
         with replacing(fresh / name) as file:
-            write_triangles(file, places, before.triangles, {"displacement": carried})
+            write_triangles(file, places, before.triangles, carried)
     write_surface(fresh / names[5], face)
     with replacing(fresh / names[2]) as file:
         points = {"displacement": result.displacements, "force": result.forces}
@@ -415,6 +418,13 @@ def read_parts(
         path = checked_file(folder, summary, f"{kind}.vtp", AGAIN)
         found[kind] = _read_part_file(path, names)
     return found
+
+
+def read_face_colours(folder: Path) -> NDArray[np.uint8] | None:
+    """The colours of the vertices of the skin that `read_parts` reads; None without a 3D photo."""
+    path = checked_file(folder, read_prediction(folder), "face_before.vtp", AGAIN)
+    found = read_mesh(path).point_data.get("colour")
+    return None if found is None else found.astype(np.uint8)
 
 
 def _read_part_file(

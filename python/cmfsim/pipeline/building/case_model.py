@@ -4,7 +4,7 @@ import logging
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -105,6 +105,7 @@ def assembled(
             "plan_sources": dict(bones.sources),
         },
         detailed_skin=partial(_detailed_skin, head),
+        face_colours=head.colours,
     )
 
 
@@ -216,6 +217,14 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     else:
         head = Head(case, landmarks, anatomy)
     stages.add(check_skin(head.anatomy, head.skull))
+    if case.photo is not None:
+        # A case without a photo loads nothing of it.
+        from cmfsim.pipeline.building.skin.photo import with_photo  # noqa: PLC0415
+
+        stages.begin("placing the 3D photo")
+        skin, colours, placed = with_photo(head)
+        head = replace(head, skin=skin, colours=colours)
+        stages.add((placed,))
     # Tissue and muscles are placed by the anatomy and its landmarks, whatever becomes of the bones.
     with ThreadPoolExecutor(2) as beside:
         tissue = beside.submit(_meshed, head)

@@ -18,6 +18,7 @@ from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface_fil
 from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.images.dicom.series import dicom_files
 from cmfsim.io.images.image_files import read_image_file
+from cmfsim.io.meshes.photos import photo_files
 from cmfsim.io.results.models import is_model_file
 from cmfsim.io.slicer.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
@@ -214,7 +215,7 @@ def plan_key(case: Case) -> str:
     Raises `OSError`: A file that the case names cannot be read.
     """
     about = replace(
-        case, plan={}, achieved=False, muscles=None, postoperative=None, mesh=CaseMesh()
+        case, plan={}, achieved=False, muscles=None, postoperative=None, photo=None, mesh=CaseMesh()
     )
     folder = case.file.parent
     parts = ("image", "surfaces", "landmarks", "osteotomies")
@@ -281,6 +282,8 @@ def _files(case: Case) -> Iterator[Path]:
     after = case.postoperative
     if after is not None:
         optional += [after.skin, after.image, after.landmarks, *after.bones.values()]
+    if case.photo is not None:
+        optional += [*photo_files(case.photo.file), case.photo.landmarks]
     for motion in case.plan.values():
         optional += [motion.transform, motion.surface, motion.moved_surface]
     yield from (path for path in optional if path is not None)

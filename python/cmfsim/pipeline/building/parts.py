@@ -3,6 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cmfsim._core import TetMesh
 from cmfsim.io import Case
 from cmfsim.meshing import TissueRegion
@@ -28,6 +31,7 @@ class Head:
     landmarks: mapping of str to mapping of str to (3,), mm. "skull" and "skin".
     proposed: The landmarks, where they were found automatically.
     skin: The skin in full detail, where finding them has made it.
+    colours: Of its vertices, (v, 3), where the case has a 3D photo.
     """
 
     case: Case
@@ -35,6 +39,7 @@ class Head:
     anatomy: Anatomy
     proposed: ProposedLandmarks | None = None
     skin: SurfaceData | None = None
+    colours: NDArray[np.uint8] | None = None
 
     @property
     def skull(self) -> Mapping[str, Floats]:

@@ -34,6 +34,7 @@ from cmfsim.io.results.predictions import (
     is_prediction_file,
     is_result_file,
     predictions_of,
+    read_face_colours,
     read_parts,
     read_prediction,
     read_prediction_picture,
@@ -487,7 +488,7 @@ def _view(place: Path) -> tuple[str, str] | None:
     """The view of a prediction; none, with a warning, where its surfaces cannot be simplified."""
     parts = read_parts(place, ("bones",))
     try:
-        return face_view(parts)
+        return face_view(parts, read_face_colours(place))
     except CmfsimError as error:
         _log.warning("no view of the face to turn: %s", error)
         return None
@@ -525,7 +526,7 @@ def write_animation(folder: Path, path: Path) -> None:
     """Writes an animation of the face that the report of a folder shows; raises as that does."""
     place, _ = _shown(predictions_of(folder))
     ((before, after),) = read_parts(place, ())["skin"].values()
-    animate_face(path, before, after)
+    animate_face(path, before, after, read_face_colours(place))
 
 
 def _error_caption(model: str) -> str:

@@ -17,6 +17,8 @@ Parts = Mapping[str, Mapping[str, tuple[SurfaceData, Floats]]]
 
 # Triangles that a report draws of the face, and of all bones together: 1 MB of its text.
 FACE_TRIANGLES, BONE_TRIANGLES, LEAST_BONE = 24_000, 30_000, 300
+# Of a face whose vertices have the colours of a photo.
+PHOTO_TRIANGLES = 90_000
 # A vertex that moves by less than this, mm, does not decide what the picture shows; a segment that
 # does is drawn as one that stays.
 STAYS = 0.1
@@ -27,13 +29,15 @@ PICTURE = (
 )
 
 
-def face_view(parts: Parts) -> tuple[str, str]:
+def face_view(parts: Parts, colours: NDArray[np.uint8] | None = None) -> tuple[str, str]:
     """The markup of the view of a prediction, and what its page must allow scripts from.
 
     Parameters
     ----------
     parts : mapping of str to mapping of str to (SurfaceData, (v, 3) float64)
         As `read_parts` has them: "skin" and "bones", each with its vertices after the operation.
+    colours : (v, 3) uint8, optional
+        Of the vertices of the skin.
 
     Raises
     ------
@@ -53,7 +57,15 @@ def face_view(parts: Parts) -> tuple[str, str]:
         _pack(arrays, name, surface, after, most)
     ((skin, after),) = parts["skin"].values()
     shown.append({"kind": "skin", "colour": None})
-    _pack(arrays, "skin", skin, after, FACE_TRIANGLES)
+    fewer = _pack(
+        arrays, "skin", skin, after, FACE_TRIANGLES if colours is None else PHOTO_TRIANGLES
+    )
+    if colours is not None:
+        closest, _, triangles = skin.searched.closest(fewer.vertices)
+        corners = skin.triangles[triangles]
+        away = np.linalg.norm(skin.vertices[corners] - closest[:, None], axis=2)
+        nearest = colours[corners[np.arange(len(corners)), away.argmin(axis=1)]].astype(np.uint32)
+        arrays["skin_colours"] = nearest @ np.array([1, 1 << 8, 1 << 16], dtype=np.uint32)
     moved = np.linalg.norm(after - skin.vertices, axis=1)
     values: dict[str, Any] = {
         "parts": shown,
@@ -68,8 +80,8 @@ def face_view(parts: Parts) -> tuple[str, str]:
 
 def _pack(
     arrays: dict[str, NDArray[Any]], name: str, surface: SurfaceData, after: Floats, most: int
-) -> None:
-    """Adds a surface with how each vertex moves, in fewer triangles."""
+) -> SurfaceData:
+    """The surface in fewer triangles, added with how each vertex moves."""
     fewer = simplified_surface(name, surface, most)
     shift = after - surface.vertices
     if fewer is not surface:
@@ -79,3 +91,4 @@ def _pack(
     arrays[f"{key}_triangles"] = fewer.triangles.astype(np.uint32)
     # Half precision: 0.004 mm on 8 mm.
     arrays[f"{key}_shift"] = shift.astype(np.float16)
+    return fewer

@@ -12,11 +12,11 @@ const GROUND = [0.933, 0.945, 0.961];
 
 /** A surface that moves by a shift of each vertex. */
 class Moving {
-  constructor(drawing, { kind, colour }, before, triangles, shift) {
+  constructor(drawing, { kind, colour }, before, triangles, shift, paint) {
     Object.assign(this, { drawing, kind, before, triangles, shift });
-    this.colour = kind === "skin" ? SKIN : colour === null ? STILL_BONE : rgb(DISTINCT[colour % DISTINCT.length]).map((v) => 0.45 + 0.55 * v);
-    this.still = drawing.surface(before, triangles);
-    this.now = drawing.surface(before, triangles);
+    this.colour = paint ? [1, 1, 1] : kind === "skin" ? SKIN : colour === null ? STILL_BONE : rgb(DISTINCT[colour % DISTINCT.length]).map((v) => 0.45 + 0.55 * v);
+    this.still = drawing.surface(before, triangles, paint);
+    this.now = drawing.surface(before, triangles, paint);
     this.places = Float32Array.from(before);
     this.normals = new Float32Array(before.length);
     this.amounts = new Float32Array(before.length / 3).map((_, i) => Math.hypot(...shift.subarray(3 * i, 3 * i + 3)));
@@ -39,7 +39,7 @@ class App {
     this.overlay = document.getElementById("overlay");
     const take = (name) => arrays[name].values;
     // Bones first: what is seen through is drawn over them.
-    this.parts = page.parts.map((part, i) => new Moving(this.drawing, part, take(`part_${i}`), take(`part_${i}_triangles`), take(`part_${i}_shift`)));
+    this.parts = page.parts.map((part, i) => new Moving(this.drawing, part, take(`part_${i}`), take(`part_${i}_triangles`), take(`part_${i}_shift`), part.kind === "skin" ? arrays.skin_colours?.values : null));
     this.most = page.most;
     this.view = new ViewPanel(this, ["side", "map"]);
     connectPointing(this);

@@ -1,17 +1,18 @@
 // Surfaces drawn by WebGL 2: bones first, then the skin's nearest layer over them.
 
 const VERTEX = `#version 300 es
-in vec3 place; in vec3 normal; in float amount;
+in vec3 place; in vec3 normal; in float amount; in vec3 paint;
 uniform mat4 view; uniform mat4 motion; uniform float scale;
-out vec3 facing; out float share;
+out vec3 facing; out float share; out vec3 painted;
 void main() {
   gl_Position = view * motion * vec4(place, 1.0);
   facing = mat3(motion) * normal;
   share = amount * scale;
+  painted = paint;
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
-in vec3 facing; in float share;
+in vec3 facing; in float share; in vec3 painted;
 uniform vec3 colour; uniform vec3 light; uniform float opacity; uniform bool mapping;
 uniform sampler2D map;
 out vec4 pixel;
@@ -19,7 +20,7 @@ void main() {
   vec3 n = normalize(facing);
   float towards = dot(n, light);
   float shade = 0.28 + 0.72 * abs(towards);
-  vec3 base = mapping ? texture(map, vec2(clamp(share, 0.0, 1.0), 0.5)).rgb : colour;
+  vec3 base = mapping ? texture(map, vec2(clamp(share, 0.0, 1.0), 0.5)).rgb : colour * painted;
   pixel = vec4(base * shade + 0.10 * pow(abs(towards), 24.0), opacity);
 }`;
 
@@ -62,7 +63,7 @@ export class Drawing {
     this.program = gl.createProgram();
     gl.attachShader(this.program, compiled(gl, gl.VERTEX_SHADER, VERTEX));
     gl.attachShader(this.program, compiled(gl, gl.FRAGMENT_SHADER, FRAGMENT));
-    ["place", "normal", "amount"].forEach((name, i) => gl.bindAttribLocation(this.program, i, name));
+    ["place", "normal", "amount", "paint"].forEach((name, i) => gl.bindAttribLocation(this.program, i, name));
     gl.linkProgram(this.program);
     gl.useProgram(this.program);
     this.places = {};
@@ -76,13 +77,15 @@ export class Drawing {
       [gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
       [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
     ]) gl.texParameteri(gl.TEXTURE_2D, name, value);
+    // Of surfaces without colours of their vertices.
+    gl.vertexAttrib3f(3, 1, 1, 1);
     gl.enable(gl.DEPTH_TEST);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     this.width = this.height = 1;
   }
 
-  /** A surface on the graphics card. */
-  surface(places, triangles) {
+  /** A surface on the graphics card; paint: the colours of its vertices, red in the lowest byte. */
+  surface(places, triangles, paint) {
     const { gl } = this;
     const made = { array: gl.createVertexArray(), count: triangles.length, buffers: [] };
     const normals = new Float32Array(places.length);
@@ -95,6 +98,12 @@ export class Drawing {
       gl.enableVertexAttribArray(i);
       gl.vertexAttribPointer(i, size, gl.FLOAT, false, 0, 0);
     });
+    if (paint) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, paint, gl.STATIC_DRAW);
+      gl.enableVertexAttribArray(3);
+      gl.vertexAttribPointer(3, 3, gl.UNSIGNED_BYTE, true, 4, 0);
+    }
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
