@@ -28,8 +28,10 @@ import oracles
 from cmfsim.io.images.segmentations import read_labels, read_segmentation
 from cmfsim.io.markups import read_curves, write_curves
 from cmfsim.io.meshes.mesh_files import read_mesh
+from cmfsim.io.meshes.photos import read_photo
 from cmfsim.io.meshes.vtk.writing import write_tets
 from cmfsim.io.slicer.slicer_scenes import read_slicer_scene, unpack_bundle
+from cmfsim.pictures.canvas import write_picture
 
 
 @dataclass(frozen=True)
@@ -230,19 +232,20 @@ def _stl_text() -> bytes:
 def _ply(order: str, kinds: str, *, colours: bool) -> bytes:
     ball = _ball()
     points, faces = np.asarray(ball.vertices).tolist(), np.asarray(ball.triangles).tolist()
-    more = "property uchar red\n" if colours else ""
+    names = ("red", "green", "blue") if colours else ()
+    more = "".join(f"property uchar {name}\n" for name in names)
     head = (
         f"ply\nformat {order} 1.0\ncomment a ball\nelement vertex {len(points)}\n"
         f"property float x\nproperty float y\nproperty float z\n{more}"
         f"element face {len(faces)}\nproperty list {kinds} vertex_indices\nend_header\n"
     ).encode()
     if order == "ascii":
-        rows = [" ".join(map(str, p)) + (" 7" if colours else "") for p in points]
+        rows = [" ".join(map(str, p)) + (" 7 8 9" if colours else "") for p in points]
         return head + "\n".join([*rows, *(f"3 {a} {b} {c}" for a, b, c in faces), ""]).encode()
     e = ">" if "big" in order else "<"
     letters = {"uchar": "B", "int": "i", "uint": "I", "ushort": "H"}
     count, whole = (letters[k] for k in kinds.split())
-    body = b"".join(struct.pack(e + "3f", *p) + (b"\7" if colours else b"") for p in points)
+    body = b"".join(struct.pack(e + "3f", *p) + (b"\7\10\11" if colours else b"") for p in points)
     return head + body + b"".join(struct.pack(f"{e}{count}3{whole}", 3, *f) for f in faces)
 
 
@@ -256,6 +259,18 @@ def _obj(style: str) -> bytes:
             "f " + " ".join(f"{i}//{i}" if style == "normals" else str(i) for i in corners)
         )
     return "\n".join([*lines, ""]).encode()
+
+
+def _photo_obj(folder: Path, number: int) -> bool:
+    """A square with a texture, which is not damaged."""
+    if number:
+        return False
+    lines = ["mtllib it.mtl", "v 0 0 0", "v 1 0 0", "v 1 1 0", "v 0 1 0", "vt 0 0", "vt 1 0"]
+    lines += ["vt 1 1", "vt 0 1", "usemtl skin", "f 1/1 2/2 3/3", "f 1/1 3/3 4/4", ""]
+    (folder / "it.obj").write_text("\n".join(lines))
+    (folder / "it.mtl").write_text("newmtl skin\nmap_Kd it.png\n")
+    write_picture(folder / "it.png", np.full((4, 4, 3), 200, dtype=np.uint8))
+    return True
 
 
 def _vtk_array(name: str, kind: str, values: Any, width: int, form: str) -> str:
@@ -1012,6 +1027,17 @@ READERS: tuple[Reader, ...] = (
         ),
         _read_tets,
     ),
+    Reader(
+        "3D photo PLY",
+        "it.ply",
+        _texts(
+            "it.ply",
+            lambda: _ply("ascii", "uchar int", colours=True),
+            lambda: _ply("binary_little_endian", "uchar int", colours=True),
+        ),
+        read_photo,
+    ),
+    Reader("3D photo OBJ", "it.obj", _photo_obj, read_photo),
     Reader("OFF (meshio)", "it.off", _texts("it.off", lambda: _other(".off")), cmfsim.read_surface),
     Reader("Medit (meshio)", "it.mesh", _texts("it.mesh", lambda: _other(".mesh")), _read_mesh),
     Reader(

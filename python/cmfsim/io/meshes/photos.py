@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io.files.reading_writing import beside, check_readable, named, utf8_path
+from cmfsim.io.meshes.obj import read_obj
+from cmfsim.io.meshes.ply import read_ply
 from cmfsim.io.meshes.polygons import triangles_of
 from cmfsim.io.meshes.stated_frames import stated_frame
 from cmfsim.processes.child import ReaderError, read_in_child
@@ -65,7 +67,7 @@ class Photo:
         corners = self.triangles[triangles]
         if self.colours is not None:
             mixed = np.einsum("kc,kca->ka", shares, self.colours[corners].astype(np.float64))
-            return np.rint(mixed).clip(0, 255).astype(np.uint8)
+            return np.asarray(np.rint(mixed).clip(0, 255), dtype=np.uint8)
         places = np.einsum("kc,kca->ka", shares, self.places[corners])
         found = np.zeros((len(places), 3), dtype=np.uint8)
         for number, texture in enumerate(self.textures):
@@ -118,6 +120,9 @@ def read_photo(path: Path) -> Photo:
             raise CaseInputError(
                 "has no colours: it must name one material (mtllib) that names a texture (map_Kd)"
             )
+        # VTK forgives damage; these do not.
+        data = path.read_bytes()
+        vertices = (read_ply(data) if path.suffix.lower() == ".ply" else read_obj(data))[0]
         limits = ReadLimits(SECONDS, MEMORY)
         try:
             with utf8_path(path) as plain:
@@ -130,7 +135,11 @@ def read_photo(path: Path) -> Photo:
         except ReaderError as error:
             raise CaseInputError(f"cannot be read as a 3D photo: {error}") from error
         photo = _checked(answer.arrays)
-        if stated_frame(path.read_bytes(), path.suffix.lower()) == "RAS":
+        if photo.colours is not None and len(photo.vertices) != len(vertices):
+            raise CaseInputError(
+                f"has {len(vertices)} vertices, of which VTK reads {len(photo.vertices)}"
+            )
+        if stated_frame(data, path.suffix.lower()) == "RAS":
             return replace(photo, vertices=photo.vertices * (-1.0, -1.0, 1.0))
         return photo
 
