@@ -1,6 +1,10 @@
 """A page in a browser, which must have no error and ask for nothing."""
 
+import os
 import time
+from pathlib import Path
+
+import pytest
 
 READY = "globalThis.cmfsimPage?.timing.compute > 0"
 
@@ -22,6 +26,23 @@ def open_page(browser, path):
     # Files that are saved are blobs of the page.
     assert [url for url in asked if not url.startswith("blob:")] == [path.as_uri()]
     context.close()
+
+
+def serious_faults(page):
+    """Serious faults of accessibility that axe-core finds on a page; skips where it is absent."""
+    placed = Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js"
+    script = Path(os.environ.get("CMFSIM_AXE", placed))
+    if not script.is_file():
+        pytest.skip("axe-core is not installed: npm install --no-save axe-core, or CMFSIM_AXE")
+    page.evaluate(script.read_text(encoding="utf-8"))
+    found = page.evaluate("axe.run(document)")
+    assert len(found["passes"]) > 10
+    return [
+        (fault["impact"], fault["id"], node["html"][:200])
+        for fault in found["violations"]
+        if fault["impact"] in {"serious", "critical"}
+        for node in fault["nodes"]
+    ]
 
 
 def until(page, expression, seconds=20.0):

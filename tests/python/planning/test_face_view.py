@@ -5,7 +5,7 @@ import pytest
 
 import cmfsim
 import meshes
-from browser_page import open_page, until
+from browser_page import open_page, serious_faults, until
 from cmfsim.planning.face_view import FACE_TRIANGLES, face_view
 from cmfsim.report import Document, Section, View, render_page
 
@@ -82,6 +82,35 @@ def test_the_skin_has_the_colours_of_a_photo(browser, parts, tmp_path):
             }"""
         )
         assert green > 2 * max(red, blue)
+
+
+def test_a_distance_is_measured_between_two_clicks(page):
+    page.locator("#show-share").fill("0")
+    page.get_by_label("Colour by movement").uncheck()
+    page.get_by_role("button", name="Front", exact=True).click()
+    page.get_by_role("button", name="Whole face").click()
+    page.get_by_label("Measure").check()
+    _drawn(page)
+    overlay = page.locator("#overlay")
+    size, span = overlay.bounding_box(), page.evaluate("cmfsimPage.camera.span")
+    x, _, z = page.evaluate("cmfsimPage.camera.target")
+    scale = size["height"] / span
+    for left, up in ((-20.0, 0.0), (20.0, 30.0)):
+        across, down = size["width"] / 2 + scale * (left - x), size["height"] / 2 - scale * (up - z)
+        overlay.click(position={"x": across, "y": down})
+    _drawn(page)
+    # On the front of a ball of 60 mm; clicks are whole pixels.
+    found = np.array(page.evaluate("cmfsimPage.ruler.places()"))
+    wanted = [(-20.0, -np.sqrt(60.0**2 - 400.0), 0.0), (20.0, -np.sqrt(60.0**2 - 1300.0), 30.0)]
+    np.testing.assert_allclose(found, wanted, atol=1.5 / scale)
+    stated = float(page.locator(".controls .note").inner_text().split(" mm")[0])
+    assert stated == pytest.approx(np.linalg.norm(found[0] - found[1]), abs=0.051)
+    page.get_by_label("Measure").uncheck()
+    page.locator("#show-share").fill("1")
+
+
+def test_the_report_has_no_serious_fault_of_accessibility(page):
+    assert serious_faults(page) == []
 
 
 def test_the_wheel_scrolls_the_report_until_the_picture_is_clicked_on(page):

@@ -18,7 +18,7 @@ from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite, Si
 
 pytest.importorskip("fast_simplification")
 
-from browser_page import open_page, until
+from browser_page import open_page, serious_faults, until
 
 HIGH = 9.0
 DOUBTFUL = ("infradentale", "pogonion", "menton")
@@ -122,6 +122,10 @@ def look(page, azimuth, elevation, span, target):
 
 
 # What the page shows --------------------------------------------------------------------------
+
+
+def test_the_page_has_no_serious_fault_of_accessibility(opened):
+    assert serious_faults(opened) == []
 
 
 def test_sites_to_check_come_first_with_reason_and_definition(opened, content):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.planning.page.document import joined_scripts
 from cmfsim.values.motion import plan_digits
 
 SCRIPTS = Path(cmfsim.__file__).parent / "planning/page/scripts"
@@ -24,6 +25,17 @@ def answers(folder, text):
     (folder / "asked.js").write_text(text, encoding="utf-8")
     done = subprocess.run([NODE, "asked.js"], cwd=folder, capture_output=True, check=True)
     return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    "page", [("page", "main"), ("landmark_page", "landmarks_main"), ("face_view", "view_main")]
+)
+def test_the_scripts_of_each_page_are_one_that_is_valid(page, tmp_path):
+    folder, main = page
+    scripts = [*SCRIPTS.glob("*.js"), *(SCRIPTS.parents[1] / folder / "scripts").glob("*.js")]
+    texts = {path.name: path.read_text(encoding="utf-8") for path in scripts}
+    (tmp_path / "joined.mjs").write_text(joined_scripts(texts, f"{main}.js"), encoding="utf-8")
+    subprocess.run([NODE, "--check", "joined.mjs"], cwd=tmp_path, check=True)
 
 
 def test_a_decimal_comma_is_a_point_and_all_else_is_refused(tmp_path):

@@ -336,7 +336,7 @@ def fill_prediction(
         write_triangles(file, skin.vertices, skin.triangles, moved)
     write_surface(fresh / names[1], prediction.skin)
     face, before = prediction.face, prediction.face_before
-    carried = {"displacement": face.vertices - before.vertices}
+    carried: dict[str, NDArray[Any]] = {"displacement": face.vertices - before.vertices}
     if prediction.face_colours is not None:
         carried["colour"] = prediction.face_colours
     for name, places in ((names[4], face.vertices), (names[6], before.vertices)):

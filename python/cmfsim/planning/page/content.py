@@ -40,6 +40,8 @@ PRODUCT_STEP = 4
 LARGE_TURN, LARGE_SHIFT = 0.5, 30.0
 # How far behind its foremost point the profile is drawn, mm.
 PROFILE_DEPTH = 60.0
+# Pairs of the skin that jaw surgery does not move: they place the plane of the mirror image.
+EYES = ("exocanthion", "endocanthion")
 # How much of the height of the face a picture shows, and the least, mm.
 SPAN_SHARE, LEAST_SPAN = 1.15, 60.0
 
@@ -144,6 +146,7 @@ def page_content(
         "expected_error": errors.as_dict(),
         "correction": _correction(planning),
         "band": band_values,
+        "midplane": _midplane(planning.patient.landmarks.get("skin", {})),
         **framing(skin, arrays["active"]),
     }
     return PageContent(values, arrays, tuple(findings))
@@ -361,6 +364,16 @@ def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str
         },
         "occlusion_absent": "",
     }
+
+
+def _midplane(landmarks: Mapping[str, Floats]) -> dict[str, list[float]] | None:
+    """A point and the unit normal, to the left, of the plane between the corners of the eyes."""
+    sides = [[landmarks[f"{n}_{s}"] for n in EYES if f"{n}_{s}" in landmarks] for s in "LR"]
+    if not sides[0] or len(sides[0]) != len(sides[1]):
+        return None
+    left, right = np.mean(sides[0], axis=0), np.mean(sides[1], axis=0)
+    normal = (left - right) / np.linalg.norm(left - right)
+    return {"point": (0.5 * (left + right)).tolist(), "normal": normal.tolist()}
 
 
 def framing(skin: SurfaceData, active: NDArray[Any]) -> dict[str, Any]:

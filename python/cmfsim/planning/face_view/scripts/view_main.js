@@ -3,6 +3,8 @@
 import { Camera } from "./camera.js";
 import { SKIN, STILL_BONE, DISTINCT, mapped, rgb } from "./colours.js";
 import { Drawing, vertexNormals } from "./drawing.js";
+import { cleared } from "./elements.js";
+import { Ruler } from "./measuring.js";
 import { connectKeys, connectPointing } from "./pointing.js";
 import { STAYS } from "./rigid.js";
 import { start } from "./unpacking.js";
@@ -42,6 +44,7 @@ class App {
     this.parts = page.parts.map((part, i) => new Moving(this.drawing, part, take(`part_${i}`), take(`part_${i}_triangles`), take(`part_${i}_shift`), part.kind === "skin" ? arrays.skin_colours?.values : null));
     this.most = page.most;
     this.view = new ViewPanel(this, ["side", "map"]);
+    this.ruler = new Ruler(this, () => this.parts.map(({ kind, places, triangles }) => ({ places, triangles, opacity: this.view.values[kind] })));
     connectPointing(this);
     connectKeys(this);
     new ResizeObserver(() => this.redraw()).observe(this.overlay);
@@ -51,6 +54,9 @@ class App {
 
   canGrab() { return false; }
   grab() { return null; }
+  clicked(at) {
+    if (!this.view.values.side) this.ruler.clicked(at);
+  }
   undo() {}
   redo() {}
 
@@ -83,6 +89,8 @@ class App {
     drawing.clear(GROUND);
     if (side) drawing.draw(camera, this.shown(true), 0, 0.5);
     drawing.draw(camera, this.shown(false), side ? 0.5 : 0, 1);
+    const { pen, width, height } = cleared(this.overlay);
+    if (!side) this.ruler.draw(pen, camera, width, height);
     const after = share === 1 ? "After" : share === 0 ? "Before" : `${Math.round(100 * share)} % of the way`;
     document.getElementById("caption-left").textContent = side ? "Before" : after;
     document.getElementById("caption-right").textContent = side ? after : "";

@@ -5,7 +5,7 @@ import { Camera } from "./camera.js";
 import { ClosestPoint } from "./closest.js";
 import { SKIN, STILL_BONE, rgb } from "./colours.js";
 import { Drawing } from "./drawing.js";
-import { element } from "./elements.js";
+import { cleared, element } from "./elements.js";
 import { FilesPanel } from "./files_panel.js";
 import { History } from "./history.js";
 import { seenPoint } from "./picking.js";
@@ -14,7 +14,7 @@ import { STAYS } from "./rigid.js";
 import { SiteModel } from "./site_model.js";
 import { SitePanel } from "./site_panel.js";
 import { start } from "./unpacking.js";
-import { addViews, slider } from "./view_buttons.js";
+import { addViews, slider } from "./view_panel.js";
 
 const BACKGROUND = [0.933, 0.945, 0.961];
 const JAW = [0.80, 0.84, 0.87];
@@ -418,12 +418,7 @@ class App {
 
   /** A ring and the name at the chosen site. */
   mark() {
-    const ratio = globalThis.devicePixelRatio || 1;
-    const [width, height] = this.size;
-    this.overlay.width = Math.round(width * ratio);
-    this.overlay.height = Math.round(height * ratio);
-    const pen = this.overlay.getContext("2d");
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    const { pen, width, height } = cleared(this.overlay);
     const { point } = this.shown[this.chosen];
     const [x, y] = this.camera.project(point, width, height);
     const radius = (ballRadius(this.camera, true) * height) / this.camera.span + 6;

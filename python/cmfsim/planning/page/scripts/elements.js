@@ -15,6 +15,17 @@ export function element(tag, properties = {}, ...children) {
 export const button = (text, onclick, more = {}) =>
   element("button", { type: "button", textContent: text, onclick, ...more });
 
+/** The pen of a canvas as large as its element, in the element's pixels, on an empty ground. */
+export function cleared(canvas) {
+  const ratio = globalThis.devicePixelRatio || 1;
+  const { clientWidth: width, clientHeight: height } = canvas;
+  canvas.width = Math.round(width * ratio);
+  canvas.height = Math.round(height * ratio);
+  const pen = canvas.getContext("2d");
+  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+  return { pen, width, height };
+}
+
 /** A table of texts: heads, and rows whose first cell is their head. */
 export function table(caption, heads, rows) {
   return element("div", { className: "wide" }, element("table", {},

@@ -1,5 +1,6 @@
 // Handles on the chosen segment: three arrows to pull and three rings to turn, over the picture.
 
+import { cleared } from "./elements.js";
 import { moved } from "./rigid.js";
 
 const REACH = 16;
@@ -21,13 +22,7 @@ export class Handles {
 
   /** Draws the handles at where `motion` takes `point`; turns are about `centre`. */
   draw(camera, motion, point, centre) {
-    const ratio = globalThis.devicePixelRatio || 1;
-    const { clientWidth: width, clientHeight: height } = this.canvas;
-    this.canvas.width = Math.round(width * ratio);
-    this.canvas.height = Math.round(height * ratio);
-    const pen = this.context;
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.clearRect(0, 0, width, height);
+    const { pen, width, height } = cleared(this.canvas);
     this.shapes = [];
     if (!motion) return;
     const size = SIZE * camera.span;

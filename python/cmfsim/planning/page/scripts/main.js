@@ -9,6 +9,8 @@ import { ExportPanel } from "./export_panel.js";
 import { fileName, save } from "./exporting.js";
 import { Handles } from "./handles.js";
 import { MeasurePanel } from "./measure_panel.js";
+import { Ruler } from "./measuring.js";
+import { Mirror } from "./mirroring.js";
 import { PatientFace } from "./model.js";
 import { ExactSolver } from "./serving.js";
 import { PlanPanel } from "./plan_panel.js";
@@ -17,7 +19,7 @@ import { NUMBERS, clinicalNumbers } from "./clinical.js";
 import { Plans, beyondLimits } from "./plans.js";
 import { connectKeys, connectPointing } from "./pointing.js";
 import { drawProfile, variantColour } from "./profile.js";
-import { STAYS, partOf } from "./rigid.js";
+import { STAYS, movedAll, partOf } from "./rigid.js";
 import { start } from "./unpacking.js";
 import { VariantPanel } from "./variant_panel.js";
 import { ViewPanel } from "./view_panel.js";
@@ -52,7 +54,7 @@ class App {
     this.skin = this.drawing.surface(before, triangles);
     this.skinBefore = this.drawing.surface(before, triangles);
     this.bones = page.bones.map(({ segment }, i) => ({
-      segment,
+      segment, places: arrays[`bone_${i}`].values, triangles: arrays[`bone_${i}_triangles`].values,
       surface: this.drawing.surface(arrays[`bone_${i}`].values, arrays[`bone_${i}_triangles`].values),
       colour: segment === null ? STILL_BONE : rgb(DISTINCT[segment % DISTINCT.length]).map((v) => 0.45 + 0.55 * v),
     }));
@@ -66,6 +68,11 @@ class App {
 
   build() {
     this.view = new ViewPanel(this, ["side", "map", ...(this.face.band ? ["band"] : []), "handles", "pull"]);
+    this.ruler = new Ruler(this, () => this.surfaces());
+    this.mirror = new Mirror(this, this.page.midplane, () => {
+      const places = this.face.sitePlaces(this.motions);
+      return Object.fromEntries(this.page.skin_sites.map(({ name }) => [name, places[name]]));
+    });
     this.panel = new PlanPanel(this);
     this.pulling = new PullPanel(this);
     this.variants = new VariantPanel(this);
@@ -196,6 +203,7 @@ class App {
     this.pulling.show();
     this.measuring.show();
     this.trusting.show();
+    this.mirror.show();
     this.exporting.show();
     if (this.settled) this.variants.show();
     this.showError();
@@ -231,7 +239,7 @@ class App {
         : partOf(this.motions[segment], share, this.page.segments[segment].centre),
     }));
     const scale = (map || band) && !before ? 1 / this.most : 0;
-    return [...drawn, { surface: before ? this.skinBefore : this.skin, colour: SKIN, opacity: skin, motion: STAYS, scale }];
+    return [...drawn, ...(before ? [] : this.mirror.parts(this.skin)), { surface: before ? this.skinBefore : this.skin, colour: SKIN, opacity: skin, motion: STAYS, scale }];
   }
 
   draw() {
@@ -251,7 +259,22 @@ class App {
     // under them.
     const handled = handles && !side && share === 1 && !this.canPull;
     this.handles.draw(this.camera, handled ? this.panel.motion : null, this.panel.place, this.panel.turnsAbout);
+    if (!side) this.ruler.draw(this.handles.context, this.camera, this.overlay.clientWidth, this.overlay.clientHeight);
     if (this.canPull) this.pulling.draw(this.handles.context, this.camera, this.overlay.clientWidth, this.overlay.clientHeight);
+  }
+
+  clicked(at) {
+    if (!this.view.values.side) this.ruler.clicked(at);
+  }
+
+  /** What can be measured: skin and bones where they are drawn. */
+  surfaces() {
+    const { skin, bones } = this.view.values;
+    const shown = this.parts(false);
+    return [
+      { places: this.shownPlaces, triangles: this.face.triangles, opacity: skin },
+      ...this.bones.map(({ places, triangles }, i) => ({ places: movedAll(shown[i].motion, places), triangles, opacity: bones })),
+    ];
   }
 
   /** Whether the picture shows the skin where the plan has it, so that it can be pulled. */

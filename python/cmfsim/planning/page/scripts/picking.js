@@ -3,7 +3,7 @@
 /**
  * The point of a surface that is seen at (x, y) of a picture of this size, in pixels; null for none.
  *
- * Gives the point, mm, the index of its triangle, its depth (larger is nearer to the viewer, mm), and
+ * Gives the point, mm, the index of its triangle and the shares of its corners, its depth (larger is nearer to the viewer, mm), and
  * the corner that is nearest in the picture.
  */
 export function seenPoint(camera, places, triangles, [x, y], width, height) {
@@ -37,6 +37,7 @@ export function seenPoint(camera, places, triangles, [x, y], width, height) {
   return {
     point: [0, 1, 2].map((axis) => corners.reduce((sum, p, k) => sum + shares[k] * places[p + axis], 0)),
     triangle: best / 3,
+    shares,
     depth,
     vertex: nearest / 3,
   };

@@ -1,6 +1,6 @@
 // Mouse, pen, touch and keys over the picture: what the page lets be grabbed first, else the camera.
 
-import { look } from "./view_buttons.js";
+import { look } from "./view_panel.js";
 
 const TURN_PER_PIXEL = 0.4;
 const KEY_TURN = 5;

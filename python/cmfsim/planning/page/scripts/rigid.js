@@ -8,6 +8,15 @@ export function moved(m, [x, y, z]) {
   return [0, 4, 8].map((r) => m[r] * x + m[r + 1] * y + m[r + 2] * z + m[r + 3]);
 }
 
+/** The images of points, three numbers each. */
+export function movedAll(m, places) {
+  const out = new Float32Array(places.length);
+  for (let i = 0; i < places.length; i += 3) {
+    for (let r = 0; r < 3; r++) out[i + r] = m[4 * r] * places[i] + m[4 * r + 1] * places[i + 1] + m[4 * r + 2] * places[i + 2] + m[4 * r + 3];
+  }
+  return out;
+}
+
 /** The matrix with the rotation (9 numbers) that takes point `from` to point `to`. */
 export function motionOf(rotation, from, to) {
   const out = [...STAYS];

@@ -1,8 +1,26 @@
-// How the picture shows the face: opacity, before and after, side by side, colours of movement.
+// How the picture shows the face: standard views, opacity, before and after, side by side, colours.
 
+import { VIEWS } from "./camera.js";
 import { MAP_COLOURS } from "./colours.js";
-import { element } from "./elements.js";
-import { addViews, slider } from "./view_buttons.js";
+import { button, element } from "./elements.js";
+
+/** Turns the camera to a standard view by its number. */
+export function look(app, index) {
+  app.camera.look(VIEWS[index]);
+  app.redraw();
+}
+
+/** Buttons of the standard views, the last of which shows the whole. */
+export function addViews(app, whole) {
+  document.getElementById("views").append(
+    ...VIEWS.map((view, i) => button(view.name, () => look(app, i), { title: `key ${i + 1}` })),
+    button(whole, () => { app.camera.recentre(); app.redraw(); }, { title: "key 0" }));
+}
+
+/** A slider from 0 to 1 with its label. */
+export const slider = (id, label, value, onchange) => element("label", {}, label, element("input", {
+  type: "range", min: 0, max: 1, step: 0.01, value, id, oninput: (e) => onchange(Number(e.target.value)),
+}));
 
 /** What can be switched on, by key. */
 const BOXES = { side: "Side by side", map: "Colour by movement", band: "Colour by uncertainty", handles: "Handles", pull: "Pull the skin" };
