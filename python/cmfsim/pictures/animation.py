@@ -33,19 +33,9 @@ def animate_face(
 ) -> None:
     """Writes an animation of a face, from the front and the left: before, after, and back.
 
-    Parameters
-    ----------
-    path : path
-        Ends in `.gif`, or in `.mp4` where ffmpeg is installed.
-    before : SurfaceData
-    after : (v, 3) float64, mm
-        Its vertices after the operation.
-    colours : (v, 3) uint8, optional
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) As `Prediction.animate`.
+    path: Ends in `.gif`, or in `.mp4` where ffmpeg is installed.
+    after: Its vertices after the operation, mm.
+    Raises `CaseError`: As `Prediction.animate`.
     """
     path = Path(path)
     ending = path.suffix.lower()

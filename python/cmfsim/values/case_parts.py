@@ -389,16 +389,10 @@ class CaseMuscles:
 class CasePhoto:
     """The 3D photo whose colours the skin gets.
 
-    Attributes
-    ----------
-    file : Path
-        OBJ with its MTL and texture, or PLY with colours.
-    landmarks : Path or None
-        Skin landmarks on it, three at least, in its own frame, by which it is registered.
-    aligned : bool
-        Whether it lies in the frame of the other data already.
-    units : str
-        Of the photo and its landmarks.
+    file: OBJ with its MTL and texture, or PLY with colours.
+    landmarks: Skin landmarks on it, three at least, in its own frame, by which it is registered.
+    aligned: Whether it lies in the frame of the other data already.
+    units: Of the photo and its landmarks.
     """
 
     file: Path

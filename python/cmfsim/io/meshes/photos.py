@@ -40,19 +40,11 @@ NAMES: Mapping[str, re.Pattern[bytes]] = {
 class Photo:
     """A surface with colours: of its vertices, or in textures that its triangles refer to.
 
-    Attributes
-    ----------
-    vertices : (v, 3) float64
-        In the unit of the file; LPS if it states RAS, otherwise in its own frame.
-    triangles : (t, 3) int64
-    colours : (v, 3) uint8 or None
-        Red, green, blue.
-    places : (v, 2) float64
-        In the texture: to the right and up, 0 to 1.
-    number : (t,) int64
-        Of the texture of each triangle.
-    textures : tuple of (h, w, 3) uint8
-        From the lowest row up.
+    vertices: In the unit of the file; LPS if it states RAS, otherwise in its own frame.
+    colours: Red, green, blue of the vertices.
+    places: Of the vertices in the texture, to the right and up, 0 to 1.
+    number: Of the texture of each triangle.
+    textures: Each (h, w, 3), from the lowest row up.
     """
 
     vertices: Floats
@@ -81,12 +73,8 @@ class Photo:
 def photo_files(path: Path) -> list[Path]:
     """The files of a photo: itself, and of an OBJ its materials and their textures.
 
-    Raises
-    ------
-    FileNotFoundError
-        One is missing.
-    CaseError
-        (also `ValueError`) One that an OBJ names lies elsewhere.
+    Raises `FileNotFoundError`: One is missing.
+    Raises `CaseError`: One that an OBJ names lies elsewhere.
     """
     found = [path]
     for file in found:
@@ -101,12 +89,8 @@ def photo_files(path: Path) -> list[Path]:
 def read_photo(path: Path) -> Photo:
     """The photo in a file.
 
-    Raises
-    ------
-    FileNotFoundError
-        It, its material or its texture is missing.
-    CaseError
-        (also `ValueError`) Another format, no colours, whatever VTK complains of; VTK is missing.
+    Raises `FileNotFoundError`: It, its material or its texture is missing.
+    Raises `CaseError`: Another format, no colours, whatever VTK complains of; VTK is missing.
     """
     third_party("vtkmodules", "3D photos are read", "mesh")
     files = photo_files(path)

@@ -32,17 +32,9 @@ PICTURE = (
 def face_view(parts: Parts, colours: NDArray[np.uint8] | None = None) -> tuple[str, str]:
     """The markup of the view of a prediction, and what its page must allow scripts from.
 
-    Parameters
-    ----------
-    parts : mapping of str to mapping of str to (SurfaceData, (v, 3) float64)
-        As `read_parts` has them: "skin" and "bones", each with its vertices after the operation.
-    colours : (v, 3) uint8, optional
-        Of the vertices of the skin.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) fast-simplification is missing and a surface has to be simplified.
+    parts: As `read_parts` has them: "skin" and "bones", each with its vertices after the operation.
+    colours: Of the vertices of the skin.
+    Raises `CaseError`: fast-simplification is missing and a surface has to be simplified.
     """
     arrays: dict[str, NDArray[Any]] = {}
     shown: list[dict[str, Any]] = []

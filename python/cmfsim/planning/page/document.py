@@ -113,19 +113,9 @@ def view_markup(
 ) -> tuple[str, str]:
     """The markup of a picture to turn, for a page of another kind, and its script's source policy.
 
-    Parameters
-    ----------
-    values, arrays : mapping
-        As of a document.
-    package, main : str
-        The package that has the first script, and its name.
-    picture : str
-        What it is, for screen readers.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) As `document_text`.
+    package, main: The package that has the first script, and its name.
+    picture: What it is, for screen readers.
+    Raises `CaseError`: As `document_text`.
     """
     parts = _parts(values, arrays, (package,), main)
     fields = {**parts, "picture": html.escape(picture)}

@@ -33,11 +33,8 @@ TRIANGLES = 120_000
 def with_photo(head: Head) -> tuple[SurfaceData, NDArray[np.uint8], Finding]:
     """The skin of a head in full detail, the colours of its vertices, and how they came there.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A photo that cannot be read, has no colours, or does not lie on the
-        skin; landmarks that are missing or do not fit.
+    Raises `CaseError`: A photo that cannot be read, has no colours, or does not lie on the skin;
+        landmarks that are missing or do not fit.
     """
     given, where = head.case.photo, head.case.where("photo")
     if given is None:  # called for cases with a photo
