@@ -16,6 +16,7 @@ from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of
 from cmfsim.doctor.surgery.plan import SizedMotion, check_motion_size, check_typed, nothing_moves
 from cmfsim.errors import CaseError, CmfsimError, LandmarkError
 from cmfsim.io import Case, read_landmark_file, read_surface
+from cmfsim.io.meshes.photos import read_photo
 from cmfsim.io.slicer.transforms import motion_in_lps
 from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
@@ -50,13 +51,25 @@ def check_after(evidence: Evidence) -> Iterator[Finding]:
         yield from _check_landmarks(evidence.case, given.landmarks, skin)
 
 
-def _unreadable(where: str, error: CmfsimError) -> Finding:
-    return Finding(
-        "input-unreadable",
-        str(error),
-        where=where,
-        why="the prediction cannot be compared with the face after the operation",
-    )
+def check_photo(case: Case) -> Iterator[Finding]:
+    """A 3D photo that cannot be read, or has no colours; whether it fits is known on the head."""
+    if case.photo is None:
+        return
+    try:
+        read_photo(case.photo.file)
+        if case.photo.landmarks is not None:
+            read_landmark_file(case.photo.landmarks)
+    except (CmfsimError, OSError) as error:
+        why = "the skin cannot get its colours, and the case is not built"
+        yield _unreadable(case.where("photo"), error, why)
+
+
+def _unreadable(
+    where: str,
+    error: Exception,
+    why: str = "the prediction cannot be compared with the face after the operation",
+) -> Finding:
+    return Finding("input-unreadable", str(error), where=where, why=why)
 
 
 def _check_changed(evidence: Evidence, after: SurfaceData, *, severity: str) -> Iterator[Finding]:

@@ -7,7 +7,9 @@ import pytest
 
 import cmfsim
 import meshes
+from cmfsim.doctor.surgery.operation import check_photo
 from cmfsim.io import write_landmarks
+from cmfsim.pipeline.building.inputs import input_hashes, plan_key
 from cmfsim.pipeline.building.parts import Head
 from cmfsim.pipeline.building.skin.photo import GREY, with_photo
 from cmfsim.values.case_parts import CasePhoto
@@ -75,7 +77,7 @@ def test_the_skin_has_the_colours_where_the_photo_shows_it(skin, landmarks, phot
     assert (colours[front & (x > 2.0)] == (255, 0, 0)).all()
     assert (colours[front & (x < -2.0)] == (0, 255, 0)).all()
     assert (colours[y > 0.0] == GREY).all()
-    assert finding.code == "photo-placed"
+    assert (finding.code, finding.severity) == ("photo-placed", "note")
     assert "lies 0.0 mm from the skin" in finding.what
 
 
@@ -91,7 +93,43 @@ def test_a_photo_that_is_not_on_the_skin_is_refused(skin, landmarks, photo):
     refused(r"1 skin landmarks .* \(pronasale\): 3 are needed")
 
 
+def test_a_photo_of_a_wider_face_is_doubted(skin, landmarks, photo):
+    wider = cmfsim.SurfaceData(skin.vertices * (1.15, 1.0, 1.0), skin.triangles)
+    _, _, finding = with_photo(head_of(wider, landmarks, photo))
+    assert finding.severity == "warning"
+
+
 def test_sides_that_are_exchanged_are_refused(skin, landmarks, photo):
     swapped = {n[:-1] + {"L": "R", "R": "L"}.get(n[-1], n[-1]): p for n, p in landmarks.items()}
     with pytest.raises(cmfsim.CaseError, match="check names, sides and units"):
         with_photo(head_of(skin, swapped, photo))
+
+
+def test_the_table_needs_landmarks_or_alignment_and_its_files_are_inputs(tmp_path):
+    """Also the texture, which only the material names: results of another picture are stale."""
+
+    def case(table):
+        lines = ['format = "cmfsim-case"\nversion = 1\nname = "a"\n[surfaces]\nskin = "s.ply"']
+        lines += ['[surfaces.bones]\ncranium = "c.ply"\n[plan]', f"[photo]\n{table}", ""]
+        (tmp_path / "case.toml").write_text("\n".join(lines))
+        return cmfsim.Case.load(tmp_path / "case.toml")
+
+    for table in ('file = "p.obj"', 'file = "p.obj"\nlandmarks = "p.fcsv"\naligned = true'):
+        with pytest.raises(cmfsim.CaseError, match=r"needs landmarks = .* not both"):
+            case(table)
+    with pytest.raises(cmfsim.CaseError, match="units"):
+        case('file = "p.obj"\naligned = true\nunits = "miles"')
+    (tmp_path / "p.obj").write_text("mtllib p.mtl\n")
+    (tmp_path / "p.mtl").write_text("map_Kd p.png\n")
+    for name in ("s.ply", "c.ply", "p.png"):
+        (tmp_path / name).write_bytes(b"1")
+    read = case('file = "p.obj"\naligned = true')
+    hashes = input_hashes(read)
+    assert {"p.obj", "p.mtl", "p.png"} <= hashes.keys()
+    (finding,) = check_photo(read)
+    assert (finding.code, finding.severity) == ("input-unreadable", "error")
+    about = plan_key(read)
+    (tmp_path / "p.png").write_bytes(b"2")
+    assert input_hashes(read)["p.png"] != hashes["p.png"]
+    # Plans are about bones: a page stays valid.
+    assert plan_key(read) == about

@@ -21,6 +21,8 @@ from cmfsim.values.surface_data import SurfaceData
 REACH, GREY = 5.0, 170
 # A photo whose vertices are farther than this from the skin, mm, half of them, is not on it.
 MOST_AWAY = 2.5
+# From here on, mm, it may be another person's: two scans of one face leave less than 1 mm.
+DOUBTFUL = 1.2
 # Share of a photo that has no part in its registration (hair, neck, lips), and of its vertices as
 # many as decide it.
 TRIM, VERTICES, STEPS = 0.3, 4000, 300
@@ -69,7 +71,8 @@ def with_photo(head: Head) -> tuple[SurfaceData, NDArray[np.uint8], Finding]:
         f"the 3D photo lies {away:.1f} mm from the skin (median); {near.mean():.0%} of the skin "
         "has its colours, the rest is grey"
     )
-    return skin, colours, Finding("photo-placed", what, where=where)
+    severity = "warning" if away > DOUBTFUL else "note"
+    return skin, colours, Finding("photo-placed", what, severity=severity, where=where)
 
 
 def _registered(
