@@ -25,7 +25,7 @@ export async function start(App) {
     globalThis.cmfsimPage = new App(page, arrays);
   } catch (error) {
     const box = document.getElementById("failure");
-    box.textContent = `The page cannot be shown: ${error.message}`;
+    box.textContent = `The picture cannot be shown: ${error.message}`;
     box.hidden = false;
     throw error;
   }
