@@ -66,7 +66,10 @@ def with_photo(head: Head) -> tuple[SurfaceData, NDArray[np.uint8], Finding]:
     near = np.linalg.norm(nearest - skin.vertices, axis=1) <= REACH
     shares = barycentric(vertices[photo.triangles[triangles[near]]], nearest[near])
     colours = np.full((len(near), 3), GREY, dtype=np.uint8)
-    colours[near] = photo.colours_at(triangles[near], np.nan_to_num(shares, nan=1.0 / 3.0))
+    corners = photo.colours[photo.triangles[triangles[near]]].astype(np.float64)
+    # A triangle without area has the colour of its middle.
+    shares = np.nan_to_num(shares, nan=1.0 / 3.0)
+    colours[near] = np.einsum("kc,kca->ka", shares, corners).round().clip(0, 255)
     what = (
         f"the 3D photo lies {away:.1f} mm from the skin (median); {near.mean():.0%} of the skin "
         "has its colours, the rest is grey"
