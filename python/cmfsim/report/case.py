@@ -41,9 +41,6 @@ PICTURES: Mapping[str, str] = {
     "plan": "The plan: bone segments in their planned positions, with outlines of their "
     "original positions.",
     "muscles": "The muscles of the template, fitted to the skull by landmarks.",
-    "anatomy": "Skin and bone segments.",
-    "node_kinds": "Kinds of nodes (Kim et al. 2010, Figure 4): fixed pink, joined orange, "
-    "sliding blue, free white.",
 }
 
 VIEW = (
@@ -99,7 +96,7 @@ def case_document(
     appendix = [
         Section("Motions", tuple(motion_blocks(entry))),
         *_muscle_section(entry, predictions, pictures),
-        _model_section(predictions, entry, pictures),
+        _model_section(predictions, entry),
         _time_section(predictions),
         _input_section(entry),
     ]
@@ -409,9 +406,7 @@ def _moduli(used: Values) -> list[Note | Table | Figure]:
     ]
 
 
-def _model_section(
-    predictions: Sequence[Values], shown: Values, pictures: Mapping[str, bytes]
-) -> Section:
+def _model_section(predictions: Sequence[Values], shown: Values) -> Section:
     rows = []
     for entry in predictions:
         solved = entry["solution"]
@@ -448,8 +443,7 @@ def _model_section(
         for entry in predictions
         if (left := entry.get("left_out"))
     ]
-    blocks = [*_picture("node_kinds", pictures), *_picture("anatomy", pictures)]
-    return Section("Model", (*blocks, solved_table, kinds, mesh, *left_out))
+    return Section("Model", (solved_table, kinds, mesh, *left_out))
 
 
 def _time_section(predictions: Sequence[Values]) -> Section:
