@@ -20,6 +20,7 @@ from cmfsim.imaging.skins.air import air_level
 from cmfsim.imaging.skins.attached import attached_findings
 from cmfsim.imaging.skins.skin import Skin, find_skin
 from cmfsim.imaging.working_grid import COARSE, Working, working_grid
+from cmfsim.registration.proposed.shape_model.model import head_model
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.finding import Finding
@@ -91,14 +92,17 @@ def segment_head(
             progress(stage)
 
     points = None if landmarks is None else _checked(landmarks)
-    say("grid")
-    work, findings = working_grid(image, options)
-    hu, cupping = without_cupping(work)
-    work = replace(work, hu=hu)
-    all_findings: list[Finding] = [*findings, *cupping]
-    say("metal")
-    metal = find_metal(work, options)
     with ThreadPoolExecutor(THREADS) as beside:
+        # What separates the jaws of a head without landmarks depends on nothing of the image.
+        is_guessed = points is None and options.part_jaws
+        modelled = beside.submit(head_model) if is_guessed else None
+        say("grid")
+        work, findings = working_grid(image, options)
+        hu, cupping = without_cupping(work)
+        work = replace(work, hu=hu)
+        all_findings: list[Finding] = [*findings, *cupping]
+        say("metal")
+        metal = find_metal(work, options)
         say("skin")
         skin = find_skin(work, metal, options, beside)
         _check_head(work, skin.mask)
@@ -111,6 +115,8 @@ def segment_head(
         # Where the bone is and which of it is the jaw are found without each other.
         level = beside.submit(bone_level, bone, options)
         noticed = beside.submit(_noticed, work, skin, bone, options)
+        if modelled is not None:
+            modelled.result()
         bones, teeth, jaws = _bones(work, bone, skin, points, level, options=options, say=say)
         say("air")
         hollow = air_level(work, skin, bone, options)
