@@ -1,6 +1,7 @@
 """The model fitted to a head: pose, jaw, all sites with a covariance, and how well it fits."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,7 +25,7 @@ from cmfsim.registration.proposed.shape_model.model import (
     head_model,
 )
 from cmfsim.registration.proposed.shape_model.samples import HeadSamples
-from cmfsim.registration.proposed.shape_model.search import found_poses
+from cmfsim.registration.proposed.shape_model.search import Start, found_poses
 from cmfsim.registration.proposed.shape_model.state import JAW_DEVIATIONS, POSE_UNITS, State
 from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
@@ -36,6 +37,8 @@ LATER = ((2.5, 80), (2.0, 80), (2.0, 160), (1.5, 160), (1.5, 400), (1.0, 400))
 LAST = ((1.0, 400), (0.7, 400))
 OPENINGS = tuple(np.radians((0.0, 8.0, 16.0, 25.0)))
 COARSE_POINTS = 1200
+# Number of starts and openings that are tried concurrently.
+TRIED_AT_ONCE = 2
 AGAIN = ((1.0, 400), (0.7, 400))
 # A point of the model fits where the patient's surface is nearer than this, mm of the average head.
 FITS = 4.0
@@ -225,21 +228,20 @@ def fit_head(samples: HeadSamples) -> FittedHead:
 
 def _best(model: HeadModel, samples: HeadSamples, flip: Floats | None = None) -> FittedHead:
     coarse, few = model.coarse, samples.fewer(COARSE_POINTS)
-    best = _least(
-        refined(coarse, few, start.state(coarse), FIRST, still_jaw=True)
-        for start in found_poses(coarse, few, flip)
-    )
-    # A closed jaw lies too far from an open one for its pairs.
-    opened = [
-        refined(coarse, few, _opened(best.state, by), OPENED, still_jaw=True) for by in OPENINGS
-    ]
-    best = min(opened, key=lambda evidence: _jaw_gap(coarse, evidence))
+
+    def first(start: Start) -> Evidence:
+        return refined(coarse, few, start.state(coarse), FIRST, still_jaw=True)
+
+    def opened(angle: float) -> Evidence:
+        return refined(coarse, few, _opened(best.state, angle), OPENED, still_jaw=True)
+
+    with ThreadPoolExecutor(TRIED_AT_ONCE) as pool:
+        starts = pool.map(first, found_poses(coarse, few, flip))
+        best = min(starts, key=lambda evidence: evidence.score)
+        # A closed jaw lies too far from an open one for its pairs.
+        best = min(pool.map(opened, OPENINGS), key=lambda evidence: _jaw_gap(coarse, evidence))
     evidence = refined(coarse, few, best.state, LATER)
     return FittedHead(model, samples, refined(model, samples, evidence.state, LAST), {})
-
-
-def _least(tried: Iterable[Evidence]) -> Evidence:
-    return min(tried, key=lambda evidence: evidence.score)
 
 
 def _jaw_gap(model: HeadModel, evidence: Evidence) -> float:

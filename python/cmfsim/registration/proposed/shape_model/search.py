@@ -36,6 +36,8 @@ SIZE_DEVIATION = 0.1
 FIRST_CAP, SHRINK, LAST_CAP = 25.0, 0.8, 8.0
 # Points of bone and skin, rounds, and how many starts are kept, in turn.
 STAGES = ((150, 5, 30), (300, 14, 3))
+# Threads of a look-up.
+WORKERS = 2
 # Damping of a step, and weight of a usual size, as shares of the points.
 DAMPING, SIZE_WEIGHT = 0.02, 0.01
 
@@ -50,7 +52,7 @@ class Finder:
 
     def nearest(self, points: Floats, normals: Floats) -> tuple[Floats, NDArray[np.int64]]:
         """Distance, with that of the normals, and index, both of the leading shape of points."""
-        gaps, index = self._tree.query(_joined(points, normals).reshape(-1, 6))
+        gaps, index = self._tree.query(_joined(points, normals).reshape(-1, 6), workers=WORKERS)
         return gaps.reshape(points.shape[:-1]), index.reshape(points.shape[:-1])
 
 
