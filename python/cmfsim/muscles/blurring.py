@@ -1,14 +1,19 @@
 """Shares of muscle that fade into fat, instead of changing from tet to tet."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import TetMesh
+from cmfsim.errors import third_party
 from cmfsim.values.checks import Floats
 from cmfsim.values.tissue_data import TissueData
 
 # Rounds are not repeated beyond: a blur this wide in edges would be of no muscle that is left.
 MOST_ROUNDS = 64
+# Number of parts of the tets whose directions are found concurrently.
+HALVES = 2
 
 
 class Blur:
@@ -29,11 +34,15 @@ class Blur:
     """
 
     def __init__(self, mesh: TetMesh, weights: Floats, width: float) -> None:
-        self._corners = np.asarray(mesh.tets).astype(np.int64)
+        sparse = third_party("scipy.sparse", "muscles are blurred", "imaging")
+        corners = np.asarray(mesh.tets).astype(np.int32)
+        each = np.ones(corners.size), corners.ravel(), np.arange(0, corners.size + 1, 4)
+        # Sums over the corners of each tet; its transpose, over the tets of each node.
+        self._corners = sparse.csr_matrix(each, shape=(len(corners), mesh.n_nodes))
         volumes = np.abs(mesh.volumes)
-        self._volumes = np.repeat(volumes, 4)
-        self._of_nodes = np.bincount(self._corners.ravel(), weights=self._volumes)
-        centres = np.asarray(mesh.nodes)[self._corners].mean(axis=1)
+        self._volumes = volumes[:, None]
+        self._of_nodes = np.maximum(self._corners.T @ self._volumes, np.finfo(float).tiny)
+        centres = np.asarray(mesh.nodes)[corners].mean(axis=1)
         # Σ w (S |c|² − 2 c · S c + |c|²) / 3: how far a round spreads a tet's value along an axis.
         squares = np.einsum("ij,ij->i", centres, centres)
         mean = self._round(np.column_stack([centres, squares]))
@@ -49,12 +58,10 @@ class Blur:
         return values
 
     def _round(self, values: Floats) -> Floats:
-        flat, least = self._corners.ravel(), np.finfo(float).tiny
-        tets = np.empty_like(values)
-        for i, column in enumerate(values.T):
-            sums = np.bincount(flat, weights=self._volumes * np.repeat(column, 4))
-            nodes = sums / np.maximum(self._of_nodes, least)
-            tets[:, i] = nodes[self._corners].mean(axis=1)
+        nodes = self._corners.T @ (self._volumes * values)
+        nodes /= self._of_nodes
+        tets: Floats = self._corners @ nodes
+        tets /= 4.0
         return tets
 
 
@@ -111,7 +118,9 @@ def _principal(sums: Floats, is_muscle: NDArray[np.bool_]) -> Floats:
     matrices = np.empty((int(is_muscle.sum()), 3, 3))
     i, j = np.triu_indices(3)
     matrices[:, i, j] = matrices[:, j, i] = sums[is_muscle]
-    vectors = np.linalg.eigh(matrices)[1][:, :, 2]
+    with ThreadPoolExecutor(HALVES) as pool:
+        halves = pool.map(np.linalg.eigh, np.array_split(matrices, HALVES))
+        vectors = np.concatenate([found[1][:, :, 2] for found in halves])
     largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, np.newaxis], axis=1)
     fibre = np.zeros((len(sums), 3))
     fibre[is_muscle] = vectors * np.where(largest < 0.0, -1.0, 1.0)
