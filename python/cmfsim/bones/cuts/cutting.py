@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import product
 from typing import cast
 
 import numpy as np
@@ -17,7 +16,7 @@ from cmfsim.bones.segment_checks import check_segments
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
 from cmfsim.values.anatomy import BoneSegment
-from cmfsim.values.checks import as_number, check_instance
+from cmfsim.values.checks import Floats, as_number, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
@@ -325,28 +324,38 @@ def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
     # inside the cells that it cuts, and its zero would shift: so the diagonal becomes the limit.
     diagonal = float(np.linalg.norm(grid.spacing))
     parts = [[plane.distance_along(grid) for plane in group] for group in cut.groups]
-    scaled = np.empty(grid.values.shape, dtype=np.float32)
-    starts = [range(0, n, BLOCK) for n in grid.values.shape]
-    for corner in product(*starts):
-        block = tuple(slice(start, start + BLOCK) for start in corner)
-        # A sum of three parts, each of one axis, has its least and its most in a block where they
-        # have: most blocks lie on one side of all planes, and need no distance of their voxels.
-        here = [
-            [[line[_own(block, axis)] for axis, line in enumerate(lines)] for lines in group]
+    # A sum of three parts, each of one axis, has its least and its most in a block where they have:
+    # most blocks lie on one side of all planes, and need no distance of their voxels.
+    starts = [np.arange(0, n, BLOCK) for n in grid.values.shape]
+    least, most = (
+        _greatest_depth(
+            [
+                [end.reduceat(line, starts[a], axis=a) for a, line in enumerate(lines)]
+                for lines in group
+            ]
             for group in parts
-        ]
-        least, most = (
-            max(min(sum(float(end(line)) for line in lines) for lines in group) for group in here)
-            for end in (np.min, np.max)
         )
-        if least >= diagonal or most <= -diagonal:
-            scaled[block] = np.copysign(limit, least)
-            continue
-        depth = np.maximum.reduce(
-            [np.minimum.reduce([x + y + z for x, y, z in group]) for group in here]
+        for end in (np.minimum, np.maximum)
+    )
+    scaled: Levels = np.copysign(limit, least).astype(np.float32)
+    for axis, n in enumerate(grid.values.shape):
+        scaled = scaled.repeat(BLOCK, axis=axis).take(np.arange(n), axis=axis)
+    for corner in BLOCK * np.argwhere((least < diagonal) & (most > -diagonal)):
+        block = tuple(slice(start, start + BLOCK) for start in corner)
+        depth = _greatest_depth(
+            [[line[_own(block, a)] for a, line in enumerate(lines)] for lines in group]
+            for group in parts
         )
         scaled[block] = np.clip(depth * (limit / diagonal), -limit, limit)
     return scaled
+
+
+def _greatest_depth(groups: Iterable[Iterable[Sequence[Floats]]]) -> Floats:
+    """The depth in the union of groups of planes, by the parts of each distance."""
+    depth: Floats = np.maximum.reduce(
+        [np.minimum.reduce([x + y + z for x, y, z in group]) for group in groups]
+    )
+    return depth
 
 
 def _own(block: tuple[slice, ...], axis: int) -> tuple[slice, ...]:
