@@ -16,9 +16,8 @@ from cmfsim.imaging.morphology import (
     Volume,
     box_of,
     depth,
-    label,
+    grown,
     largest,
-    ndimage,
     reached,
     shrunk,
     smoothed,
@@ -181,7 +180,7 @@ def part_jaws(
         return Jaws(None, None, None, (_not_parted(reason),))
     # Pieces that the flood left to the skull, but that only the mandible holds, are the mandible's.
     rest = bone.mask[box] & ~mandible[box]
-    mandible[box] |= _touching(rest & ~_largest_piece(rest), mandible[box])
+    mandible[box] |= reached(rest & ~_largest_piece(rest), grown(mandible[box]))
     side = _side(mandible, bone.mask)
     return Jaws(side, mandible, height, tuple(findings))
 
@@ -189,18 +188,6 @@ def part_jaws(
 def _largest_piece(mask: Mask) -> Mask:
     """The largest piece of a mask; nothing of an empty one."""
     return largest(mask) if mask.any() else mask
-
-
-def _touching(mask: Mask, other: Mask) -> Mask:
-    """The pieces of a mask that a face joins to another mask."""
-    if not mask.any():
-        return mask
-    labels, sizes = label(mask)
-    near = ndimage().binary_dilation(other)
-    touches = np.zeros(len(sizes), dtype=bool)
-    touches[np.unique(labels[near & mask])] = True
-    touches[0] = False
-    return touches[labels]
 
 
 def _side(mandible: Mask, bone: Mask) -> Volume:
