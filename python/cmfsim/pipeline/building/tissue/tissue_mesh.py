@@ -19,6 +19,7 @@ from cmfsim.meshing import (
     report_of_part,
 )
 from cmfsim.meshing.lips import LipSeam
+from cmfsim.surfaces.levels import block_of
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -144,22 +145,31 @@ def needed_halvings(level: ImageData, anatomy: Anatomy) -> Counts:
     level: Of the tissue, on the anatomy's grid.
     Returns: (nx, ny, nz) uint8.
     """
-    tissue = level.values > 0.0
-    upper = np.zeros(tissue.shape, dtype=bool)
-    lower = np.zeros(tissue.shape, dtype=bool)
-    for name, bone in anatomy.bones.items():
-        jaw = lower if name == "mandible" else upper
-        jaw |= bone.values > 0.0
+    needed = np.zeros(level.values.shape, dtype=np.uint8)
+    mandible = anatomy.bones.get("mandible")
+    if mandible is None:
+        return needed
+    # Where a sum of distances below the width, and the depth there, depend on nothing outside.
     sx, sy, sz = (float(s) for s in level.spacing)
-    width = np.zeros(tissue.shape, dtype=np.float32)
-    for jaw in (upper, lower):
-        width += distance_image(jaw, (sx, sy, sz), within=MOUTH_WIDTH)
-    mouth = tissue & (width < MOUTH_WIDTH) & near_skin(anatomy, MOUTH_DEPTH)
+    reach = np.ceil((MOUTH_WIDTH + MOUTH_DEPTH) / level.spacing).astype(int) + 1
+    low, high = block_of(mandible.values > 0.0)
+    box = tuple(slice(max(a - r, 0), b + r) for a, b, r in zip(low, high, reach, strict=True))
+    lower = mandible.values[box] > 0.0
+    upper = np.zeros(lower.shape, dtype=bool)
+    for name, bone in anatomy.bones.items():
+        if name != "mandible":
+            upper |= bone.values[box] > 0.0
+    width = distance_image(lower, (sx, sy, sz), within=MOUTH_WIDTH)
+    width += distance_image(upper, (sx, sy, sz), within=MOUTH_WIDTH)
+    outside = anatomy.skin.values[box] <= 0.0
+    depth = distance_image(outside, (sx, sy, sz), within=MOUTH_DEPTH)
+    mouth = (level.values[box] > 0.0) & (width < MOUTH_WIDTH) & (depth < MOUTH_DEPTH)
     rows = np.flatnonzero(mouth.any(axis=(0, 2)))
     if len(rows):
         # The second axis of the grid runs from front to back.
         mouth[:, rows[0] + int(MOUTH_LENGTH / sy) + 1 :] = False
-    return mouth.astype(np.uint8)
+    needed[box] = mouth
+    return needed
 
 
 def lip_halvings(level: ImageData, seam: LipSeam, edge_length: float) -> Counts:
