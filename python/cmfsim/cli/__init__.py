@@ -17,9 +17,6 @@ from typing import Any
 
 from cmfsim.cli.exit_codes import BAD_INPUT, CLOSED, DONE, FAILED
 from cmfsim.cli.memory import keep_freed_memory
-from cmfsim.cli.parsing import make_parser
-from cmfsim.cli.patients.case_commands import print_findings
-from cmfsim.cli.terminal import FindingsError, ProgressHandler, print_error, spell_out
 from cmfsim.errors import CmfsimError, error_text
 
 __all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED", "main"]
@@ -40,6 +37,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         # The process is this command's; a caller's stays as it is.
         keep_freed_memory()
+        # The products here are thin: numpy's own threads only wait for each other, and keep
+        # processors from other work. It is read when numpy is loaded: below, by the commands.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from cmfsim.cli.terminal import print_error, spell_out  # noqa: PLC0415 (loads numpy)
+
     _open_closed_streams()
     if arguments is None:
         spell_out(sys.stdout, sys.stderr)
@@ -62,6 +64,8 @@ def _command(words: Sequence[str]) -> int:
     options = _parsed(words)
     if isinstance(options, int):
         return options
+    from cmfsim.cli.terminal import ProgressHandler  # noqa: PLC0415 (loads numpy)
+
     handler = ProgressHandler()
     logger = logging.getLogger("cmfsim")
     previous = logger.level
@@ -76,6 +80,8 @@ def _command(words: Sequence[str]) -> int:
 
 def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
     """The options of a command line, or the exit code if it has none."""
+    from cmfsim.cli.parsing import make_parser  # noqa: PLC0415 (loads numpy)
+
     parser = make_parser()
     if "--json" not in words:
         options = parser.parse_args(words)
@@ -98,6 +104,9 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from cmfsim.cli.patients.case_commands import print_findings  # noqa: PLC0415 (loads numpy)
+    from cmfsim.cli.terminal import FindingsError  # noqa: PLC0415 (loads numpy)
+
     try:
         return int(options.run(options))
     except BrokenPipeError:
@@ -121,6 +130,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _ended(options: argparse.Namespace, error: BaseException, code: int) -> int:
+    from cmfsim.cli.terminal import print_error  # noqa: PLC0415 (loads numpy)
+
     print_error(error)
     if getattr(options, "json", False):
         _print_json(type(error).__name__, error_text(error), code)
