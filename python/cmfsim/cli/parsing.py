@@ -14,8 +14,8 @@ from cmfsim.cli.patients import (
     template_commands,
     view_command,
 )
-from cmfsim.cli.research import population_commands, study_commands
-from cmfsim.cli.research.population_commands import add_population_commands
+from cmfsim.cli.research import lab_commands, study_commands
+from cmfsim.cli.research.lab_commands import add_population_commands
 from cmfsim.io import result_suffixes
 from cmfsim.lab.frontier import EDGES, FACTORS
 from cmfsim.muscles.template import WHERE
@@ -159,7 +159,7 @@ def _add_phantom(commands: Any, common: argparse.ArgumentParser) -> None:
     file(phantom, "folder", "FOLDER", "output folder")
     whole(phantom, "--person", "N", "number of the person; each N gives a different head")
     number(phantom, "--spacing", "MM", "CT voxel size (default 1)", default=1.0)
-    phantom.set_defaults(run=population_commands.phantom)
+    phantom.set_defaults(run=lab_commands.phantom)
 
 
 def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:
@@ -470,8 +470,8 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
         frontier,
         "-o --output",
         "OUT",
-        f"output folder (default {population_commands.FRONTIER_FOLDER})",
-        default=population_commands.FRONTIER_FOLDER,
+        f"output folder (default {lab_commands.FRONTIER_FOLDER})",
+        default=lab_commands.FRONTIER_FOLDER,
     )
     number(
         frontier,
@@ -513,4 +513,4 @@ def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     whole(frontier, "--threads", "N", "number of threads (default: all cores)")
     number(frontier, "--time-limit", "S", "time limit per job, s (default 600)", default=600.0)
     switch(frontier, "--fresh", "repeat finished runs")
-    frontier.set_defaults(run=population_commands.frontier)
+    frontier.set_defaults(run=lab_commands.frontier)

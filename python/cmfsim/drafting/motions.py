@@ -1,4 +1,4 @@
-"""The motions of the segments: the plan of a case, from a scene's transforms or from files."""
+"""The motions of segments: the plan of a case, from transforms, from files, or as it was typed."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

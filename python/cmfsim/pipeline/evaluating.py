@@ -1,4 +1,4 @@
-"""One case by several models, compared with the face after the operation."""
+"""One case by several models, compared with the face after the operation, which is checked."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""One case from its files to the predicted face."""
+"""One case from its files to the predicted face, checked before it begins."""
 
 import logging
 from collections.abc import Callable, Iterator, Sequence

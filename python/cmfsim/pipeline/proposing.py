@@ -1,4 +1,4 @@
-"""Landmarks of a head that has none: found on its surfaces, by the synthetic head and templates."""
+"""Landmarks of a head, found on its surfaces by the synthetic head and templates, or filled in."""
 
 from __future__ import annotations
 

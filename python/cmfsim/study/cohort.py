@@ -1,4 +1,4 @@
-"""Many cases by several models: each in a process of its own, kept when it was done before."""
+"""Many cases by several models, each in a process of its own and kept once done; their report."""
 
 import json
 import os

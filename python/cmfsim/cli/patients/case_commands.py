@@ -1,4 +1,4 @@
-"""`cmfsim doctor` and `cmfsim build`: patient cases."""
+"""`cmfsim init`, `cmfsim doctor` and `cmfsim build`: patient cases."""
 
 import argparse
 import dataclasses

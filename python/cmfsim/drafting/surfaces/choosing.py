@@ -1,4 +1,4 @@
-"""The surfaces of a case, their unit and their frame, with the reasons."""
+"""The surfaces of a case, their unit and frame, with the reasons; teeth go to their bones."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

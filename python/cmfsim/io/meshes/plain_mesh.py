@@ -1,4 +1,4 @@
-"""A mesh as a file has it: points, cells by type, and values on both; checked whoever read it."""
+"""A mesh as a file has it: points, cells, values, checked whoever read it; tets repaired."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The output folder of `cmfsim predict`: skin, tissue and a summary for each model."""
+"""The output folder of `cmfsim predict`: skin, tissue and a summary, which is checked when read."""
 
 import json
 import os

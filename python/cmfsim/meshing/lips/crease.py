@@ -1,4 +1,4 @@
-"""The line where the lips meet, on the skin: the deepest points of its profiles across the mouth.
+"""The frame of a mouth, and the line where its lips meet: the deepest points across the skin.
 
 Where the lips stand apart this is the end of the gap, and where they are closed the crease between
 them. Profiles are taken in planes along the mouth's frame; a path through all of them, found by

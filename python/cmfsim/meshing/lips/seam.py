@@ -1,4 +1,4 @@
-"""The seam between the lips: the sheet along which the tissue of a closed mouth is separated."""
+"""The seam along which the tissue of a closed mouth is separated, and each lip beside it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

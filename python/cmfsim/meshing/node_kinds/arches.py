@@ -1,4 +1,4 @@
-"""The two dental arches: from skull landmarks, or from the teeth that the image shows."""
+"""The dental arches, from skull landmarks or from teeth in the image, and what slides on them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Building blocks of anatomy: levels that are positive inside, and how they melt together.
+"""Building blocks of anatomy: smooth curves, and levels that are positive inside and melt together.
 
 A level is close to the signed distance in mm near its surface. Coordinates come as three arrays
 that broadcast, so that a grid is evaluated from its axes and what depends on one axis alone is

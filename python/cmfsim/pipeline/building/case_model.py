@@ -1,4 +1,4 @@
-"""Builds the patient's model of a case."""
+"""Builds the patient's model of a case, and puts it together with its summary."""
 
 import logging
 import platform

@@ -1,4 +1,4 @@
-"""The motions of the bone segments of a case; a segment is cut where its motion is torn."""
+"""The motions of the bone segments of a case, with findings; a torn segment is cut there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`cmfsim phantom`, `virtual-patients` and `benchmark`: synthetic heads, their truth, scores."""
+"""`cmfsim phantom`, `virtual-patients`, `benchmark` and `bench frontier`: methods are tried."""
 
 import argparse
 import json
@@ -50,7 +50,7 @@ def frontier(options: argparse.Namespace) -> int:
                 progress.stage("making a head and imaging it")
                 write_phantom_case(path.parent, make_head(), spacing=PHANTOM_SPACING)
         case = Case.load(path)
-        base = _base(case, options)
+        base = _base_choice(case, options)
         choices = sweep_choices(
             base,
             edges=options.edges,
@@ -81,19 +81,19 @@ def frontier(options: argparse.Namespace) -> int:
         answer = {**found.as_dict(), "output": str(options.output), "files": names}
         print(json.dumps(answer, allow_nan=False))
     else:
-        print(_text(found))
+        print(_frontier_text(found))
         print(f"written  {escaped(str(options.output))}: {', '.join(names)}")
     return DONE
 
 
-def _base(case: Case, options: argparse.Namespace) -> Choice:
+def _base_choice(case: Case, options: argparse.Namespace) -> Choice:
     """The case's own choice, with the changes given on the command line."""
     own = case_choice(case)
     words = {"edge_length": options.edge_length, "model": options.model}
     return replace(own, **{name: value for name, value in words.items() if value is not None})
 
 
-def _text(found: Frontier) -> str:
+def _frontier_text(found: Frontier) -> str:
     """Base and front in a few lines; the rest is on the page."""
     lines = [
         f"{escaped(found.case)}: distance on the face from the reference, mm, and time",
@@ -101,8 +101,8 @@ def _text(found: Frontier) -> str:
     ]
     base = found.base
     for row in [base, *(row for row in found.front if row is not base), found.reference]:
-        whole = row.error.get(WHOLE)
-        if whole is None or row.solve_wall is None or row.build_wall is None:
+        error = row.error.get(WHOLE)
+        if error is None or row.solve_wall is None or row.build_wall is None:
             lines.append(f"  {row.choice.edge_length:4g}  base: {escaped(row.failure)}")
             continue
         changed = row.choice.changes(base.choice)
@@ -111,7 +111,7 @@ def _text(found: Frontier) -> str:
         peak = "–" if row.solve_peak is None else f"{row.solve_peak:.0f}"
         lines.append(
             f"  {row.choice.edge_length:4g}  {row.choice.element:<7}  {row.choice.kinematics:<12}  "
-            f"{whole.mean:6.3f} {whole.p95:5.2f} {whole.max:5.2f}  {row.build_wall:7.1f}  "
+            f"{error.mean:6.3f} {error.p95:5.2f} {error.max:5.2f}  {row.build_wall:7.1f}  "
             f"{row.solve_wall.median:7.2f}  {peak:>7}  {role}"
         )
     failed = sum(bool(row.failure) for row in found.rows)
