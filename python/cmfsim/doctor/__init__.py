@@ -2,10 +2,9 @@
 
 `diagnose` reads the files of a case and looks; it changes and writes nothing. `evidence` is what
 was read, `placement` asks whether it lies where it should, `surfaces` whether it is sound,
-`operation` whether cuts and plan can be meant, `plan_size` whether motions have a bone's size,
-`plan` the plan in words, `moved` whether a bone before and after is one bone,
-`after` whether what is given after the operation belongs together, `muscles` whether these can be
-placed.
+`operation` whether cuts and plan can be meant and what is given after the operation belongs
+together, `plan` whether motions have a bone's size, and states the plan in words, `moved_bones`
+whether a bone before and after is one bone, `muscles` whether these can be placed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from cmfsim.doctor.evidence import gather
-from cmfsim.doctor.report import findings_text
+from cmfsim.doctor.report import findings_text as findings_text
 from cmfsim.doctor.sites.landmarks import check_automatic
 from cmfsim.doctor.sites.placement import check_placement
 from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
@@ -26,20 +25,13 @@ from cmfsim.doctor.surgery.operation import (
     pieces_of,
     vertices_of,
 )
-from cmfsim.doctor.surgery.plan import SizedMotion, check_motion_size, state_plan
+from cmfsim.doctor.surgery.plan import SizedMotion as SizedMotion
+from cmfsim.doctor.surgery.plan import check_motion_size as check_motion_size
+from cmfsim.doctor.surgery.plan import state_plan
 from cmfsim.doctor.tissue_ends import check_ends, check_lips
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import SEVERITIES, Finding
-
-__all__ = [
-    "Examination",
-    "SizedMotion",
-    "check_motion_size",
-    "diagnose",
-    "examine",
-    "findings_text",
-]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """A first case file from what lies in a folder: `cmfsim init`.
 
 `finds` reads and measures files, `scene_finds` what a scene of 3D Slicer holds, `gathering` both;
-`roles` knows what names say; `surfaces`, `choices` and `plans` decide what each thing is for, and
+`roles` knows what names say; `surfaces`, `choices` and `motions` decide what each thing is for, and
 turn what they cannot decide into questions; `draft` writes the case file.
 """
 

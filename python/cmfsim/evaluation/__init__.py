@@ -1,55 +1,29 @@
 """Predictions against the post-operative skin: partners, distances, regions, tests (paper 3.2)."""
 
-from cmfsim.evaluation.comparison import SkinComparison, compare_skins
-from cmfsim.evaluation.conformal import calibrate, cases_needed, covered_interval, region_scores
-from cmfsim.evaluation.models import (
-    NO_CHANGE,
-    WHOLE,
-    ErrorTable,
-    Improvement,
-    ModelComparison,
-    compare_models,
-    error_table,
-)
-from cmfsim.evaluation.regions import REGIONS, skin_regions, unmoved_regions
-from cmfsim.evaluation.statistics import (
-    LEAST_PAIRS,
-    DistanceStatistics,
-    PairedChange,
-    PairedTest,
-    distance_statistics,
-    paired_change,
-    wilcoxon_test,
-)
-from cmfsim.evaluation.unmoved import ThicknessChange, compare_unmoved, fitted_thickness
-from cmfsim.values.landmark_sites import SKIN_LANDMARKS
-
-__all__ = [
-    "LEAST_PAIRS",
-    "NO_CHANGE",
-    "REGIONS",
-    "SKIN_LANDMARKS",
-    "WHOLE",
-    "DistanceStatistics",
-    "ErrorTable",
-    "Improvement",
-    "ModelComparison",
-    "PairedChange",
-    "PairedTest",
-    "SkinComparison",
-    "ThicknessChange",
-    "calibrate",
-    "cases_needed",
-    "compare_models",
-    "compare_skins",
-    "compare_unmoved",
-    "covered_interval",
-    "distance_statistics",
-    "error_table",
-    "fitted_thickness",
-    "paired_change",
-    "region_scores",
-    "skin_regions",
-    "unmoved_regions",
-    "wilcoxon_test",
-]
+from cmfsim.evaluation.comparison import SkinComparison as SkinComparison
+from cmfsim.evaluation.comparison import compare_skins as compare_skins
+from cmfsim.evaluation.conformal import calibrate as calibrate
+from cmfsim.evaluation.conformal import cases_needed as cases_needed
+from cmfsim.evaluation.conformal import covered_interval as covered_interval
+from cmfsim.evaluation.conformal import region_scores as region_scores
+from cmfsim.evaluation.models import NO_CHANGE as NO_CHANGE
+from cmfsim.evaluation.models import WHOLE as WHOLE
+from cmfsim.evaluation.models import ErrorTable as ErrorTable
+from cmfsim.evaluation.models import Improvement as Improvement
+from cmfsim.evaluation.models import ModelComparison as ModelComparison
+from cmfsim.evaluation.models import compare_models as compare_models
+from cmfsim.evaluation.models import error_table as error_table
+from cmfsim.evaluation.regions import REGIONS as REGIONS
+from cmfsim.evaluation.regions import skin_regions as skin_regions
+from cmfsim.evaluation.regions import unmoved_regions as unmoved_regions
+from cmfsim.evaluation.statistics import LEAST_PAIRS as LEAST_PAIRS
+from cmfsim.evaluation.statistics import DistanceStatistics as DistanceStatistics
+from cmfsim.evaluation.statistics import PairedChange as PairedChange
+from cmfsim.evaluation.statistics import PairedTest as PairedTest
+from cmfsim.evaluation.statistics import distance_statistics as distance_statistics
+from cmfsim.evaluation.statistics import paired_change as paired_change
+from cmfsim.evaluation.statistics import wilcoxon_test as wilcoxon_test
+from cmfsim.evaluation.unmoved import ThicknessChange as ThicknessChange
+from cmfsim.evaluation.unmoved import compare_unmoved as compare_unmoved
+from cmfsim.evaluation.unmoved import fitted_thickness as fitted_thickness
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS as SKIN_LANDMARKS

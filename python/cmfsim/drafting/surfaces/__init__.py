@@ -1,6 +1,5 @@
 """The surfaces of a case, their unit and their frame, with the reasons."""
 
-from cmfsim.drafting.surfaces.anatomy import Anatomy, Question
-from cmfsim.drafting.surfaces.choosing import choose_surfaces
-
-__all__ = ["Anatomy", "Question", "choose_surfaces"]
+from cmfsim.drafting.surfaces.anatomy import Anatomy as Anatomy
+from cmfsim.drafting.surfaces.anatomy import Question as Question
+from cmfsim.drafting.surfaces.choosing import choose_surfaces as choose_surfaces

@@ -1,32 +1,17 @@
 """Error against run time: what each choice of a prediction costs, and what it buys."""
 
-from cmfsim.lab.frontier.choice import (
-    EDGES,
-    FACTORS,
-    Choice,
-    case_choice,
-    reference_choice,
-    sweep_choices,
-)
-from cmfsim.lab.frontier.files import frontier_page
-from cmfsim.lab.frontier.frontier_run import frontier
-from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread, pareto_front
-from cmfsim.lab.frontier.skin_points import SKIN, WHOLE, skin_errors
-
-__all__ = [
-    "EDGES",
-    "FACTORS",
-    "SKIN",
-    "WHOLE",
-    "Choice",
-    "Frontier",
-    "FrontierRow",
-    "Spread",
-    "case_choice",
-    "frontier",
-    "frontier_page",
-    "pareto_front",
-    "reference_choice",
-    "skin_errors",
-    "sweep_choices",
-]
+from cmfsim.lab.frontier.choice import EDGES as EDGES
+from cmfsim.lab.frontier.choice import FACTORS as FACTORS
+from cmfsim.lab.frontier.choice import Choice as Choice
+from cmfsim.lab.frontier.choice import case_choice as case_choice
+from cmfsim.lab.frontier.choice import reference_choice as reference_choice
+from cmfsim.lab.frontier.choice import sweep_choices as sweep_choices
+from cmfsim.lab.frontier.files import frontier_page as frontier_page
+from cmfsim.lab.frontier.frontier_run import frontier as frontier
+from cmfsim.lab.frontier.rows import Frontier as Frontier
+from cmfsim.lab.frontier.rows import FrontierRow as FrontierRow
+from cmfsim.lab.frontier.rows import Spread as Spread
+from cmfsim.lab.frontier.rows import pareto_front as pareto_front
+from cmfsim.lab.frontier.skin_points import SKIN as SKIN
+from cmfsim.lab.frontier.skin_points import WHOLE as WHOLE
+from cmfsim.lab.frontier.skin_points import skin_errors as skin_errors
