@@ -1,7 +1,8 @@
 """How far landmarks are off that follow those placed by hand.
 
 On the two real heads with landmarks (the folder named by CMFSIM_DATA): sites that are placed lie
-where the operator put them, and only the others are measured. Two minutes.
+where the operator put them, and only the others are measured. A second table shows which deviations
+make the placed sites of each head likeliest. Two minutes.
 
     python benches/placed_sites.py --markdown docs/landmarks.md
 """
@@ -17,6 +18,9 @@ import numpy as np
 import cmfsim
 from cmfsim.io import read_landmark_file, read_surface
 from cmfsim.pipeline.proposing import ProposedHead, filled_landmarks
+from cmfsim.registration.proposed.shape_model.model import SITES
+from cmfsim.registration.proposed.shape_model.site_covariance import average_sites, prior_covariance
+from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, SiteState
 from marked import publish
@@ -29,6 +33,8 @@ CLOSE = 4.0
 SHIFT, DOUBTFUL = np.array([0.0, 4.0, 12.0]), 10.0
 THREE = (("skull", "nasion"), ("skull", "pogonion"), ("skull", "gonion_L"))
 OF_JAW = (("skull", "menton"), ("skull", "gonion_L"), ("skull", "infradentale"))
+# Deviations of which the likelihood is stated: each site's own, mm, and factors on those of shape.
+OWN, SHARES = (1.0, 1.5, 2.0, 2.5, 3.0), (0.7, 1.0, 1.4)
 SEVEN = (
     *(("skull", n) for n in ("nasion", "supradentale", "menton", "gonion_L", "gonion_R")),
     ("skull", "zygomatic_arch_L"),
@@ -47,7 +53,31 @@ def main() -> None:
         "|---|---|---|---|---|---|",
         *(row for folder, name in HEADS.items() for row in _rows(data / folder, name)),
     ]
-    publish(options.markdown, NAME, "\n".join(rows))
+    likely = [
+        f"| head | {' | '.join(f'own {own:g} mm' for own in OWN)} |",
+        f"|---{'|---' * len(OWN)}|",
+        *(row for folder, name in HEADS.items() for row in _likelihoods(data / folder, name)),
+    ]
+    publish(options.markdown, NAME, "\n".join([*rows, "", *likely]))
+
+
+def _likelihoods(folder: Path, name: str) -> Iterator[str]:
+    """The logarithm of the likelihood of a head's sites, by the deviations of the prior."""
+    found = {
+        kind: read_landmark_file(folder / f"{kind}_landmarks.mrk.json").points
+        for kind in ("skull", "skin")
+    }
+    mean = average_sites()
+    places = np.array([found[kind][label] for kind, label in SITES])
+    linear, offset, _ = robust_similarity(places, mean, np.ones(len(mean)), 6.0)
+    away = (places @ linear.T + offset - mean).ravel()
+    for share in SHARES:
+        values = []
+        for own in OWN:
+            prior = prior_covariance(own, share)
+            spread = np.linalg.slogdet(prior)[1]
+            values.append(-0.5 * (away @ np.linalg.solve(prior, away) + spread))
+        yield f"| {name}, shape × {share:g} | {' | '.join(f'{v:.0f}' for v in values)} |"
 
 
 def _rows(folder: Path, name: str) -> Iterator[str]:

@@ -15,7 +15,7 @@ from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.registration.proposed import TemplateHead, landmarks_from
 from cmfsim.registration.proposed.average_head import average_head
-from cmfsim.registration.site_covariance import (
+from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
     SiteDistribution,
     SiteKey,

@@ -43,7 +43,9 @@ def test_a_nodding_head_with_an_open_mouth_has_its_sites(nodding):
 
 def test_a_known_site_moves_its_neighbours_and_lowers_their_errors(nodding):
     site, beside, far = ("skull", "menton"), ("skull", "pogonion"), ("skull", "glabella")
-    places, errors = nodding.given({site: nodding.sites[site] + [6.0, 0.0, 0.0]}, 1.0)
+    found = nodding.distribution.given({site: nodding.sites[site] + [6.0, 0.0, 0.0]})
+    places = dict(zip(found.names, found.mean, strict=True))
+    errors = dict(zip(found.names, found.errors, strict=True))
     assert errors[beside] < nodding.errors[beside]
     assert places[beside][0] > nodding.sites[beside][0]
     shift = np.linalg.norm(places[far] - nodding.sites[far])

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from cmfsim.registration.proposed.average_head import average_head
-from cmfsim.registration.site_covariance import PLACED_STD, SiteDistribution, site_covariance
+from cmfsim.registration.proposed.shape_model.site_covariance import (
+    PLACED_STD,
+    SiteDistribution,
+    site_covariance,
+)
 from cmfsim.values.landmark_sites import site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 

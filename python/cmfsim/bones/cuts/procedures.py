@@ -17,13 +17,12 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim._core import rigid_fit
 from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure
 from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.registration.proposed.shape_model.site_covariance import placed_distribution
 from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, SKULL_LANDMARKS, is_lower_site
-from cmfsim.values.motion import carried
 
 # The sites of each procedure. Nasion is not among those of Le Fort I: it would only state which
 # side of the plane of the upper teeth is up.
@@ -153,33 +152,28 @@ def with_missing_sites(
     if not missing:
         return points, ()
     is_lower = is_lower_site(NEEDED[kind][0])
-    reference = REFERENCE_PLACES["skull"]
-    known = [n for n in reference if n in landmarks and is_lower_site(n) == is_lower]
-    if not _spread([landmarks[name] for name in known]):
+    known = {n: p for n, p in landmarks.items() if n in REFERENCE_PLACES["skull"]}
+    own = [name for name in known if is_lower_site(name) == is_lower]
+    if not _spread([known[name] for name in own]):
         asked = [name for name in PLACING[kind] if name not in landmarks]
         raise LandmarkInputError(
             f"{kind} needs the landmark {asked[0]!r}"
             + (f" and {len(asked) - 1} more ({', '.join(asked[1:])})" if asked[1:] else "")
             + ": place it, or give the planes of the cut"
         )
-    average = np.array([reference[name] for name in known])
-    matrix = rigid_fit(average, [landmarks[name] for name in known], scale=True).matrix
-    back: Floats = np.linalg.inv(matrix).astype(np.float64)
-    for name in missing:
-        expected = reference[name]
-        partner = {"_L": f"{name[:-2]}_R", "_R": f"{name[:-2]}_L"}.get(name[-2:], "")
-        if partner in landmarks:
-            own = carried(back, landmarks[partner])
-            expected = expected + (own - reference[partner]) * [-1.0, 1.0, 1.0]
-        points[name] = carried(matrix, expected)
-    return points, (_estimated(kind, missing, len(known)),)
+    expected = placed_distribution(known)
+    places = dict(zip(expected.names, expected.mean, strict=True))
+    errors = dict(zip(expected.names, expected.errors, strict=True))
+    points |= {name: places["skull", name] for name in missing}
+    worst = max(errors["skull", name] for name in missing)
+    return points, (_estimated(kind, missing, len(known), worst),)
 
 
-def _estimated(kind: str, missing: Sequence[str], count: int) -> Finding:
+def _estimated(kind: str, missing: Sequence[str], count: int, error: float) -> Finding:
     return Finding(
         "cut-site-estimated",
         f"{kind} is placed with {', '.join(missing)} estimated from {count} other landmarks and an "
-        "average head",
+        f"average head; they may be {error:.0f} mm off",
         where=kind,
     )
 

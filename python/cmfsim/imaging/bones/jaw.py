@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import LandmarkError
 from cmfsim.imaging.bones.bone import Bone
-from cmfsim.imaging.bones.model_seeds import fitted_to, model_box, model_seeds
+from cmfsim.imaging.bones.model_seeds import bite_sites, fitted_to, model_box, model_seeds
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
@@ -25,7 +25,6 @@ from cmfsim.imaging.morphology import (
 )
 from cmfsim.imaging.skins.skin import Skin
 from cmfsim.imaging.working_grid import Working
-from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
@@ -92,6 +91,7 @@ BEFORE_RAMUS = 5.0
 # The middle of the condyle from the supraglenoid landmark: towards the midline, back, up, mm;
 # within 2 mm in the four joints of two skulls in which it was measured.
 CONDYLE = (15.0, 0.5, -12.0)
+CONDYLES = ("condyle_L", "condyle_R")
 # Depth in bone that counts as much as FLOOD_HU, mm.
 FLOOD_DEPTH = 3.0
 # A joint space is dark before it is open, HU.
@@ -152,20 +152,26 @@ def part_jaws(
     box = _box(work, bone, given) if head is None else model_box(work, head)
     domain = np.asfortranarray(bone.mask[box])
     part = work.part(box)
+    dense = np.clip(smoothed(bone.hu[box], 0.7, work.spacing) / np.float32(FLOOD_HU), 0.0, 2.0)
+    dense[~domain] = 0.0
     if head is None:
         seeds = _seeds(part, bone, given, box)
         rows = _occlusal_points(given) or _one_row(given)
-        height = None if rows is None else float(rows[0][2])
     else:
-        seeds = _model_seeds(part, bone, head, given, box)
-        teeth = (head.sites["skull", name] for name in ("supradentale", "infradentale"))
-        height = 0.5 * float(sum(place[2] for place in teeth))
+        sites, is_seen = bite_sites(part, dense, head, BEFORE_RAMUS)
+        rows = _occlusal_points(sites)
+        crown = CROWN if is_seen else MODEL_CROWN
+        seeds = model_seeds(part, domain, head)
+        if bone.cavity is not None:
+            seeds[bone.cavity[box]] = 2
+        _tooth_rows(seeds, sites, *_axes(part, domain), crown=crown)
+        _placed(seeds, domain, part, given)
+    height = None if rows is None else float(rows[0][2])
     if not ((seeds == 1).any() and (seeds == 2).any()):
         if (on_other := _on_other_jaw(work, given)) is not None:
             return Jaws(None, None, None, (on_other,))
         return Jaws(None, None, None, (_not_parted("the landmarks are far from bone"),))
     deep = depth(domain, work.spacing) / np.float32(FLOOD_DEPTH)
-    dense = np.clip(smoothed(bone.hu[box], 0.7, work.spacing) / np.float32(FLOOD_HU), 0.0, 2.0)
     # What lies among seeds of its own kind is known, and floods nothing.
     inner = shrunk(seeds == 2)
     basins = watershed(-(deep + dense), seeds, domain & ~inner)
@@ -281,13 +287,17 @@ def _seeds(
     if bone.cavity is not None:
         seeds[bone.cavity[box]] = 2
     _tooth_rows(seeds, landmarks, x, y, z)
-    # Landmarks last: they are what a person said.
-    _balls(seeds, domain, work, landmarks, names=ON_CRANIUM, value=2)
-    condyles = _condyles(landmarks)
-    on_mandible = (*ON_MANDIBLE, *condyles)
-    _balls(seeds, domain, work, landmarks | condyles, names=on_mandible, value=1)
-    seeds[~domain] = 0
+    _placed(seeds, domain, work, landmarks | _condyles(landmarks))
     return seeds
+
+
+def _placed(
+    seeds: NDArray[np.int32], domain: Mask, work: Working, landmarks: Mapping[str, Floats]
+) -> None:
+    """Adds balls at landmarks, last: they are what a person said."""
+    _balls(seeds, domain, work, landmarks, names=ON_CRANIUM, value=2)
+    _balls(seeds, domain, work, landmarks, names=(*ON_MANDIBLE, *CONDYLES), value=1)
+    seeds[~domain] = 0
 
 
 def _axes(work: Working, domain: Mask) -> tuple[Any, Any, Any]:
@@ -297,23 +307,6 @@ def _axes(work: Working, domain: Mask) -> tuple[Any, Any, Any]:
         for a, (o, s, n) in enumerate(zip(work.origin, work.spacing, domain.shape, strict=True))
     )
     return x, y, z
-
-
-def _model_seeds(
-    work: Working, bone: Bone, head: FittedHead, given: Mapping[str, Floats], box: Block
-) -> NDArray[np.int32]:
-    """The seeds of the model, and those of landmarks, which are what a person said."""
-    domain = bone.mask[box]
-    seeds = model_seeds(work, domain, head)
-    if bone.cavity is not None:
-        seeds[bone.cavity[box]] = 2
-    x, y, z = _axes(work, domain)
-    sites = {name: place for (kind, name), place in head.sites.items() if kind == "skull"}
-    _tooth_rows(seeds, sites, x, y, z, crown=MODEL_CROWN)
-    _balls(seeds, domain, work, given, names=ON_CRANIUM, value=2)
-    _balls(seeds, domain, work, given, names=ON_MANDIBLE, value=1)
-    seeds[~domain] = 0
-    return seeds
 
 
 def _condyles(landmarks: Mapping[str, Floats]) -> dict[str, Floats]:

@@ -1,13 +1,13 @@
 """Seeds of mandible and cranium by the model of shape, for heads without landmarks."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import third_party
 from cmfsim.imaging.bones.bone import Bone
-from cmfsim.imaging.morphology import Block, Mask, ndimage
+from cmfsim.imaging.morphology import Block, Mask, Volume, ndimage
 from cmfsim.imaging.skins.skin import Skin
 from cmfsim.imaging.working_grid import Working
 from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead, fit_head
@@ -25,6 +25,12 @@ NEAR, CLEAR = 7.0, 5.0
 # All bone higher or farther back in the average head is no mandible's, mm; and the box of the flood
 # ends above the joints at this height.
 ABOVE, BEHIND, BOX_TOP = 15.0, 12.0, 35.0
+# The bite is looked for within so many deviations of the model, in layers of this height that are
+# smoothed over the one below, mm. Within this range beside it are crowns, with so many times the
+# bone at least.
+SPREAD, LAYER, SOFT = 3.0, 0.5, 1.0
+CROWNS, CONTRAST = (2.0, 12.0), 1.25
+BITE_SITES = ("supradentale", "infradentale", "occlusal_line_L", "occlusal_line_R")
 # Error of a click, mm.
 CLICK = 2.0
 
@@ -120,3 +126,88 @@ def model_seeds(work: Working, domain: Mask, head: FittedHead) -> NDArray[np.int
     seeds = np.zeros(domain.shape, dtype=np.int32, order="F")
     seeds[tuple(index.T)] = kinds
     return seeds
+
+
+def bite_sites(
+    work: Working, dense: Volume, head: FittedHead, before_ramus: float
+) -> tuple[dict[str, Floats], bool]:
+    """The model's sites of the tooth rows, moved to the bite where the image shows it, and whether.
+
+    Parameters
+    ----------
+    work : Working
+        The block of `dense`.
+    dense : (nx, ny, nz) float32
+        How much bone each voxel holds.
+    head : FittedHead
+    before_ramus : float, mm
+        Of the end of the rows in front of the sites at the ramus.
+    """
+    sites = {name: head.sites["skull", name] for name in BITE_SITES}
+    front = 0.5 * (sites["supradentale"] + sites["infradentale"])
+    left, right = sites["occlusal_line_L"], sites["occlusal_line_R"]
+    normal = np.cross(left - front, right - front)
+    normal *= np.sign(normal[2]) / np.linalg.norm(normal)
+    errors = [
+        SPREAD * head.deviation([("skull", name) for name in pair], normal)
+        for pair in (BITE_SITES[:2], BITE_SITES[2:])
+    ]
+    index = np.argwhere(dense > 0.0)
+    places = work.origin + work.spacing * index
+    back = 0.5 * float(left[1] + right[1])
+    low, high = sorted((float(left[0]), float(right[0])))
+    heights = (places - front) @ normal
+    taken = (places[:, 0] > low) & (places[:, 0] < high) & (places[:, 1] < back - before_ramus)
+    taken &= np.abs(heights) < max(errors) + CROWNS[1]
+    along = (places[taken, 1] - front[1]) / (back - front[1])
+    soft = max(SOFT, 0.5 * float(work.spacing.max()))
+    shifts = bite_shifts(heights[taken], along, dense[tuple(index[taken].T)], errors, soft)
+    if shifts is None:
+        return sites, False
+    moves = np.repeat(shifts, 2)
+    return {n: sites[n] + move * normal for n, move in zip(BITE_SITES, moves, strict=True)}, True
+
+
+def bite_shifts(
+    heights: Floats, along: Floats, dense: Floats, reach: Sequence[float], soft: float
+) -> tuple[float, float] | None:
+    """How far the bite lies above a plane at the incisors and at the ends of the rows, mm.
+
+    Between two rows of crowns is a layer with less bone than in either. None where no layer within
+    reach is poorer than its neighbours, as without teeth.
+
+    Parameters
+    ----------
+    heights : (n,) float64, mm
+        Of voxels of the rows over the plane.
+    along : (n,) float64
+        0 at the incisors, 1 at the ends.
+    dense : (n,) float64
+        How much bone each holds.
+    reach : (2,) float, mm
+        At incisors and ends.
+    soft : float, mm
+        Over which layers are smoothed.
+    """
+    half = max(reach) + CROWNS[1]
+    edges = np.arange(-half, half + LAYER, LAYER)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    planes, profiles = [], []
+    for rise in np.arange(-sum(reach), sum(reach) + LAYER, LAYER):
+        counts, _ = np.histogram(heights - rise * along, edges, weights=dense)
+        profile = ndimage().gaussian_filter1d(counts, soft / LAYER, mode="constant")
+        for k in np.flatnonzero(
+            (np.abs(middles) <= reach[0]) & (np.abs(middles + rise) <= reach[1])
+        ):
+            planes.append((profile[k], middles[k], middles[k] + rise))
+            profiles.append(profile)
+    costs, fronts, ends = np.array(planes).T
+    ties = costs <= 1.02 * costs.min() + 1e-9
+    front, end = float(fronts[ties].mean()), float(ends[ties].mean())
+    nearest = int(np.argmin(np.hypot(fronts - front, ends - end)))
+    for sign in (-1.0, 1.0):
+        away = sign * (middles - fronts[nearest])
+        beside = profiles[nearest][(away > CROWNS[0]) & (away < CROWNS[1])]
+        if not beside.max() > CONTRAST * costs.min():
+            return None
+    return front, end

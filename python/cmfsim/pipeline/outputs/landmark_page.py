@@ -11,7 +11,7 @@ from cmfsim.planning.landmark_page import (
     landmark_page_text,
 )
 from cmfsim.registration.proposed.average_head import average_head
-from cmfsim.registration.site_covariance import PLACED_STD, SiteDistribution
+from cmfsim.registration.proposed.shape_model.site_covariance import PLACED_STD, SiteDistribution
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, SiteState
 
 PAGE_FILE = "landmarks.html"

@@ -78,7 +78,9 @@ def with_model(
     """
     kind = found.kind
     sound = {(kind, n): s.point for n, s in found.sites.items() if not s.doubt}
-    places, errors = head.given(sound, KNOWN * size)
+    followed = head.distribution.given(sound, dict.fromkeys(sound, KNOWN * size / np.sqrt(3.0)))
+    places = dict(zip(followed.names, followed.mean, strict=True))
+    errors = dict(zip(followed.names, followed.errors.tolist(), strict=True))
     sites: dict[str, ProposedSite] = {}
     missing = dict(found.missing)
     for name, site in found.sites.items():

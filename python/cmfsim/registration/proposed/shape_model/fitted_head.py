@@ -1,6 +1,6 @@
 """The model fitted to a head: pose, jaw, all sites with a covariance, and how well it fits."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +26,7 @@ from cmfsim.registration.proposed.shape_model.model import (
 )
 from cmfsim.registration.proposed.shape_model.samples import HeadSamples
 from cmfsim.registration.proposed.shape_model.search import Start, found_poses
+from cmfsim.registration.proposed.shape_model.site_covariance import SiteDistribution
 from cmfsim.registration.proposed.shape_model.state import JAW_DEVIATIONS, POSE_UNITS, State
 from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
@@ -117,34 +118,18 @@ class FittedHead:
     @cached_property
     def errors(self) -> Mapping[tuple[str, str], float]:
         """Expected distance of each site from the true one, mm."""
-        variances = np.diag(self.covariance).reshape(-1, 3).sum(axis=1)
-        return dict(zip(SITES, np.sqrt(variances), strict=True))
+        return dict(zip(SITES, self.distribution.errors.tolist(), strict=True))
 
-    def given(
-        self, points: Mapping[tuple[str, str], Floats], error: float
-    ) -> tuple[dict[tuple[str, str], Floats], dict[tuple[str, str], float]]:
-        """All sites and their expected errors, mm, if some are known: by the covariance alone.
+    def deviation(self, sites: Sequence[tuple[str, str]], direction: Floats) -> float:
+        """Standard deviation of the mean of some sites along a unit vector, mm."""
+        weights = np.zeros((len(SITES), 3))
+        weights[[SITES.index(site) for site in sites]] = direction / len(sites)
+        return float(np.sqrt(weights.ravel() @ self.covariance @ weights.ravel()))
 
-        Parameters
-        ----------
-        points : mapping of (kind, label) to (3,) float64, mm
-            In the patient's frame.
-        error : float, mm
-            Of each.
-        """
-        places = np.array([self.sites[site] for site in SITES]).ravel()
-        covariance = self.covariance
-        rows = [SITES.index(site) for site in points]
-        if rows:
-            taken = np.concatenate([np.arange(3 * row, 3 * row + 3) for row in rows])
-            away = np.array([*points.values()]).ravel() - places[taken]
-            among = covariance[np.ix_(taken, taken)] + error**2 / 3.0 * np.eye(len(taken))
-            gain = np.linalg.solve(among, covariance[taken]).T
-            places = places + gain @ away
-            covariance = covariance - gain @ covariance[taken]
-        sums = np.maximum(np.diag(covariance), 0.0).reshape(-1, 3).sum(axis=1)
-        moved = dict(zip(SITES, places.reshape(-1, 3), strict=True))
-        return moved, dict(zip(SITES, np.sqrt(sums).tolist(), strict=True))
+    @property
+    def distribution(self) -> SiteDistribution:
+        """Where the sites are expected, and how their errors depend on one another."""
+        return SiteDistribution(SITES, np.array([*self.sites.values()]), self.covariance)
 
     def shows(self, point: Floats) -> bool:
         """Whether the image shows a place of the patient's frame."""

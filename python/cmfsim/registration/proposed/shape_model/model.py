@@ -46,6 +46,18 @@ class Kernel:
             total += deviation**2 * np.exp(-squares / length**2)
         return total
 
+    def sides_covariance(self, points: Floats) -> Floats:
+        """Of the displacements of points that are alike on both sides, (3 n, 3 n) mm².
+
+        Across, what is odd about x = 0 is alike; what differs is the reverse, and smaller.
+        """
+        even, odd = _folded(self, points, points)
+        share = self.asymmetry**2
+        blocks = np.zeros((len(points), 3, len(points), 3))
+        blocks[:, 0, :, 0] = odd + share * even
+        blocks[:, 1, :, 1] = blocks[:, 2, :, 2] = even + share * odd
+        return blocks.reshape(3 * len(points), -1)
+
 
 @dataclass(frozen=True, eq=False)
 class SmoothModes:
@@ -103,7 +115,8 @@ SITES = tuple(("skull", name) for name in SKULL_LANDMARKS) + tuple(
 )
 # What skulls of one size differ by: measures over the whole skull have standard deviations of 4 to
 # 7 mm within a population, 3 to 5 mm of them beyond size, and those over 30 mm some 2 mm (Howells
-# 1973, Farkas 1994). Sides differ by a third of that.
+# 1973, Farkas 1994). Sides differ by a third of that. Of two real heads, one makes these deviations
+# the likeliest and the other 0.7 times as much (`benches/placed_sites.py`).
 HEAD = Kernel(((120.0, 3.5), (60.0, 2.2), (30.0, 1.0)), 0.35, 30)
 # The mandible against the cranium: classes II and III, width, height of the rami.
 JAW = Kernel(((70.0, 2.5), (35.0, 1.0)), 0.35, 8)
@@ -197,9 +210,7 @@ def head_model() -> HeadModel:
         ]
     )
     everything, every_part = np.concatenate([points, sites]), np.concatenate([parts, site_parts])
-    share = np.where(every_part == MANDIBLE, 1.0, 0.0)
-    on_skin = every_part == SKIN
-    share[on_skin] = _skin_share(everything[on_skin])
+    share = jaw_shares(everything, every_part == MANDIBLE, every_part == SKIN)
     modes = _modes(everything, every_part, share)
     n = len(points)
     return HeadModel(
@@ -257,10 +268,11 @@ def _thinned(surface: SurfaceData) -> tuple[Floats, Floats, Floats]:
     return vertices[index], units[index], share
 
 
-def _skin_share(points: Floats) -> Floats:
-    """How far skin follows the jaw: from the mouth's corners down, in front of the ears."""
+def jaw_shares(points: Floats, on_jaw: NDArray[np.bool_], on_skin: NDArray[np.bool_]) -> Floats:
+    """How far points follow the jaw: skin from the mouth's corners down, in front of the ears."""
     _, y, z = points.T
-    share: Floats = _step(z, -38.0, -54.0) * _step(y, 25.0, -15.0) * _step(z, -118.0, -88.0)
+    skin = _step(z, -38.0, -54.0) * _step(y, 25.0, -15.0) * _step(z, -118.0, -88.0)
+    share: Floats = np.where(on_skin, skin, on_jaw.astype(np.float64))
     return share
 
 
