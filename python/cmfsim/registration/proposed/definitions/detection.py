@@ -15,7 +15,6 @@ from cmfsim.registration.proposed.definitions.skull_sites import (
     skull_views,
 )
 from cmfsim.registration.proposed.pose import Pose, surface_samples
-from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
@@ -94,23 +93,3 @@ def _points(surface: SurfaceData) -> Floats:
     area = Surface(surface.vertices, surface.triangles).area
     count = min(MOST_POINTS, int(DENSITY * float(area)))
     return surface_samples(surface, max(count, 1000))[0]
-
-
-def biases(
-    template: TemplateHead, head: HeadSurfaces, pose: Pose
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    """How far the landmarks of a template lie from where its sites are found, (3,) each.
-
-    Of skull and skin, in the frame and size of the average head.
-    """
-    found = detect(head, pose)
-    pairs = ((found.skull, template.skull), (found.skin, template.skin_landmarks))
-    skull, skin = (
-        {
-            name: pose.into(true[name][None])[0] / pose.size - place
-            for name, place in sites.items()
-            if name in true
-        }
-        for sites, true in pairs
-    )
-    return skull, skin

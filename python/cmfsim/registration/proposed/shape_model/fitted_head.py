@@ -27,7 +27,12 @@ from cmfsim.registration.proposed.shape_model.model import (
 from cmfsim.registration.proposed.shape_model.samples import HeadSamples
 from cmfsim.registration.proposed.shape_model.search import Start, found_poses
 from cmfsim.registration.proposed.shape_model.site_covariance import SiteDistribution
-from cmfsim.registration.proposed.shape_model.state import JAW_DEVIATIONS, POSE_UNITS, State
+from cmfsim.registration.proposed.shape_model.state import (
+    JAW_DEVIATIONS,
+    POSE_UNITS,
+    State,
+    rotation_of,
+)
 from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 
@@ -46,14 +51,26 @@ FITS = 4.0
 # Share of the visible face that must fit: heads have 0.7 to 0.8, a crude
 # one of a few ellipsoids 0.54, balls and tubes 0.4.
 LEAST_FIT, FACE_BACK, FACE_TOP = 0.48, 0.0, 60.0
+# Of a head that lies otherwise up to 0.47 fits: below this, it is compared with such heads.
+SURE_FIT = 0.6
+QUARTER = 0.5 * np.pi
 # A part of the face and the skull's base that the head's own frame is taken from, mm: back, up.
 FRAME_BACK, FRAME_TOP, FRAME_DISTANCE, FRAME_ROUNDS = 20.0, 70.0, 4.0, 10
 # Surfaces say little of where along them a site lies: relief finer than the modes, mm.
 ALONG_SURFACE = 4.5
-FLIPS = {
-    "upside down": np.array([-1.0, 1.0, -1.0]),
-    "with its face to the back": np.array([-1.0, -1.0, 1.0]),
-    "upside down and with its face to the back": np.array([1.0, -1.0, -1.0]),
+# How a head may lie in an image whose axes are wrong, with what brings it upright. One axis that is
+# reversed looks like two, because a head is its own mirror image.
+AXES = np.eye(3)
+LYING = {
+    "upside down": AXES * [-1.0, 1.0, -1.0],
+    "with its face to the back": AXES * [-1.0, -1.0, 1.0],
+    "upside down and with its face to the back": AXES * [1.0, -1.0, -1.0],
+    "with its face to the left": rotation_of(-QUARTER * AXES[2]),
+    "with its face to the right": rotation_of(QUARTER * AXES[2]),
+    "with its vertex to the left": rotation_of(-QUARTER * AXES[1]),
+    "with its vertex to the right": rotation_of(QUARTER * AXES[1]),
+    "with its vertex to the front": rotation_of(-QUARTER * AXES[0]),
+    "with its vertex to the back": rotation_of(QUARTER * AXES[0]),
 }
 
 
@@ -195,15 +212,19 @@ def fit_head(samples: HeadSamples) -> FittedHead:
     """
     model = head_model()
     best = _best(model, samples)
+    if best.fits >= SURE_FIT:
+        return best
+    coarse, few = model.coarse, samples.fewer(COARSE_POINTS)
+    scores = {how: found_poses(coarse, few, turn)[0].score for how, turn in LYING.items()}
+    how = min(scores, key=lambda name: scores[name])
+    other = _best(model, samples, LYING[how])
+    if other.fits >= max(LEAST_FIT, best.fits):
+        raise LandmarkInputError(
+            f"the head lies {how} in LPS coordinates, so left and right cannot be trusted "
+            "either: export the image again with its orientation, or correct the axes"
+        )
     if best.fits >= LEAST_FIT:
         return best
-    for how, flip in FLIPS.items():
-        other = _best(model, samples, flip)
-        if other.fits >= max(LEAST_FIT, best.fits):
-            raise LandmarkInputError(
-                f"the head lies {how} in LPS coordinates, so left and right cannot be trusted "
-                "either: export the image again with its orientation, or correct the axes"
-            )
     raise LandmarkInputError(
         f"{100.0 * best.fits:.0f} % of an average face lie within {FITS:g} mm of these bones "
         f"in the best pose ({100.0 * LEAST_FIT:.0f} % needed): they are not a head, or show "
@@ -211,7 +232,7 @@ def fit_head(samples: HeadSamples) -> FittedHead:
     )
 
 
-def _best(model: HeadModel, samples: HeadSamples, flip: Floats | None = None) -> FittedHead:
+def _best(model: HeadModel, samples: HeadSamples, turn: Floats | None = None) -> FittedHead:
     coarse, few = model.coarse, samples.fewer(COARSE_POINTS)
 
     def first(start: Start) -> Evidence:
@@ -221,7 +242,7 @@ def _best(model: HeadModel, samples: HeadSamples, flip: Floats | None = None) ->
         return refined(coarse, few, _opened(best.state, angle), OPENED, still_jaw=True)
 
     with ThreadPoolExecutor(TRIED_AT_ONCE) as pool:
-        starts = pool.map(first, found_poses(coarse, few, flip))
+        starts = pool.map(first, found_poses(coarse, few, turn))
         best = min(starts, key=lambda evidence: evidence.score)
         # A closed jaw lies too far from an open one for its pairs.
         best = min(pool.map(opened, OPENINGS), key=lambda evidence: _jaw_gap(coarse, evidence))

@@ -85,23 +85,23 @@ class Start:
         return State(self.linear, self.offset, np.zeros(N_JAW), np.zeros(model.n_modes))
 
 
-def found_poses(model: HeadModel, samples: HeadSamples, flip: Floats | None = None) -> list[Start]:
+def found_poses(model: HeadModel, samples: HeadSamples, turn: Floats | None = None) -> list[Start]:
     """The best similarities, best first.
 
     Parameters
     ----------
     model : HeadModel
     samples : HeadSamples
-    flip : (3,) float64, optional
-        −1 for axes that are reversed first: how an image lies whose axes are wrong.
+    turn : (3, 3) float64, optional
+        What comes first: how an image lies whose axes are wrong.
     """
-    starts = list(_starts(model, samples, np.ones(3) if flip is None else flip))
+    starts = list(_starts(model, samples, np.eye(3) if turn is None else turn))
     for count, rounds, kept in STAGES:
         starts = _descended(model, samples.fewer(count), starts, rounds)[:kept]
     return starts
 
 
-def _starts(model: HeadModel, samples: HeadSamples, flip: Floats) -> Iterator[Start]:
+def _starts(model: HeadModel, samples: HeadSamples, upright: Floats) -> Iterator[Start]:
     """Similarities that bring the front onto the front and the top onto the top."""
     points = samples.skin if len(samples.skin) else samples.bone
     own = model.points[(model.parts == SKIN) == bool(len(samples.skin))]
@@ -109,7 +109,7 @@ def _starts(model: HeadModel, samples: HeadSamples, flip: Floats) -> Iterator[St
     above = MISSING_ABOVE if np.isfinite(samples.high[2]) else MISSING_ABOVE[:1]
     for nod, lean, turn in product(np.radians(TURNS), repeat=3):
         rotation = rotation_of(np.array([nod, 0.0, 0.0])) @ rotation_of(np.array([0.0, lean, 0.0]))
-        rotation = rotation @ rotation_of(np.array([0.0, 0.0, turn])) * flip
+        rotation = rotation @ rotation_of(np.array([0.0, 0.0, turn])) @ upright
         turned = points @ rotation.T
         for size, missing in product(SIZES, above):
             x, y, z = turned.T / size

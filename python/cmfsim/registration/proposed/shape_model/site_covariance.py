@@ -29,8 +29,8 @@ from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 # 2 mm at most sites (docs/landmarks.md).
 PLACED_STD = 1.0
 # What each site has on its own, alike on both sides: relief, and what an operator takes it to be.
-# Of two real heads, either alone makes 2 mm the likeliest (`benches/placed_sites.py`).
-OWN_STD = 2.0
+# The likeliest of two real heads together (`benches/placed_sites.py`).
+OWN_STD = 1.5
 # Uncertainty of the pose before any site is seen: shift in mm, turn in radians, relative size.
 SHIFT_STD, TURN_STD, SIZE_STD = 15.0, 0.2, 0.08
 # Errors of proposed sites are alike on a part, because a wrong pose or a wrong cut between the jaws
