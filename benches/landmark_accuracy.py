@@ -2,22 +2,26 @@
 
 Real heads (the folder named by CMFSIM_DATA, else ../shared/data; skipped where absent), each with
 the synthetic head as the only template and with the other real head as a further one; variants of
-the CT that are cropped or degraded; and synthetic heads, whose landmarks are known.
+the CT that are cropped or degraded; and synthetic heads, whose landmarks are known. What was
+measured before a change is kept with --keep, and compared with --before, head by head and site by
+site.
 
-    python benches/landmark_accuracy.py --markdown docs/landmarks.md
+    python benches/landmark_accuracy.py --markdown docs/landmarks.md [--keep FILE] [--before FILE]
 """
 
 import argparse
+import json
 import os
 import platform
 import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 import cmfsim
 import ct_variants as variants
@@ -83,6 +87,24 @@ def synthetic_rows(count: int) -> Iterator[Row]:
         head = cmfsim.make_head(parameters)
         truth = (head.skull_landmarks, head.skin_landmarks)
         yield measured(f"synthetic {number}", *head_surfaces(head.anatomy(1.5)), truth)
+
+
+def turned_rows(count: int) -> Iterator[Row]:
+    """Synthetic heads of other sizes, turned by 40° about one axis after another."""
+    for number in range(count):
+        factor, sign = (0.75, 1.0, 1.15)[number % 3], (1.0, -1.0)[number // 3 % 2]
+        angles = np.roll([40.0 * sign, 0.0, 0.0], number % 3)
+        head = cmfsim.make_head(cmfsim.HeadParameters.random(200 + number))
+        turn = factor * Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        bones, skin = head_surfaces(head.anatomy(1.5))
+        surfaces = {n: replace(s, vertices=s.vertices @ turn.T) for n, s in bones.items()}
+        moved = None if skin is None else replace(skin, vertices=skin.vertices @ turn.T)
+        truth = tuple(
+            {n: turn @ p for n, p in points.items()}
+            for points in (head.skull_landmarks, head.skin_landmarks)
+        )
+        name = f"synthetic, size {factor:g}, turned by {np.array2string(angles, precision=0)}"
+        yield measured(name, surfaces, moved, (truth[0], truth[1]))
 
 
 def real_rows(data: Path) -> Iterator[Row]:
@@ -216,6 +238,32 @@ def _sites(real: Sequence[Row], synthetic: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
+def changes(before: Path, rows: Sequence[Row]) -> str:
+    """What differs by half a millimetre and more from errors that were kept, and the means."""
+    kept = json.loads(before.read_text(encoding="utf-8"))
+    lines = ["| head | before | now | sites that differ by 0.5 mm and more |", "|---|---|---|---|"]
+    for row in rows:
+        old = kept.get(row.name, {})
+        now = {f"{label} ({kind})": error for (kind, label), error in row.errors.items()}
+        moved = [
+            f"{site} {old[site]:.1f} → {error:.1f}"
+            for site, error in now.items()
+            if site in old and abs(error - old[site]) >= 0.5
+        ]
+        means = [np.mean([*errors.values()]) if errors else np.nan for errors in (old, now)]
+        lines.append(f"| {row.name} | {means[0]:.2f} | {means[1]:.2f} | {', '.join(moved)} |")
+    return "\n".join(lines)
+
+
+def keep(path: Path, rows: Sequence[Row]) -> None:
+    """Writes the errors of all heads by site, mm."""
+    errors = {
+        row.name: {f"{label} ({kind})": error for (kind, label), error in row.errors.items()}
+        for row in rows
+    }
+    path.write_text(json.dumps(errors), encoding="utf-8")
+
+
 def _cell(values: Sequence[float]) -> str:
     return ", ".join(f"{value:.1f}" for value in values) or "–"
 
@@ -230,6 +278,8 @@ def main() -> None:
     parser.add_argument("--synthetic", type=int, default=20, help="synthetic heads (default 20)")
     parser.add_argument("--no-real", action="store_true", help="synthetic heads alone")
     parser.add_argument("--markdown", type=Path, help="page whose marked place is filled")
+    parser.add_argument("--keep", type=Path, help="file for the errors by head and site")
+    parser.add_argument("--before", type=Path, help="such a file, to compare with")
     options = parser.parse_args()
     data = Path(os.environ.get("CMFSIM_DATA", ROOT.parent / "shared" / "data"))
     real: list[Row] = []
@@ -237,7 +287,12 @@ def main() -> None:
         real = list(_shown(real_rows(data)))
     elif not options.no_real:
         print(f"{data} is absent: real heads are skipped (set CMFSIM_DATA)")
+    real += _shown(turned_rows(options.synthetic // 3))
     synthetic = list(_shown(synthetic_rows(options.synthetic)))
+    if options.keep:
+        keep(options.keep, [*real, *synthetic])
+    if options.before:
+        print(changes(options.before, [*real, *synthetic]))
     publish(options.markdown, NAME, page(real, synthetic))
 
 
