@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+import cmfsim
+from cmfsim.imaging.bones.model_seeds import bite_shifts
 from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.shape_model.fitted_head import fit_head
 from cmfsim.registration.proposed.shape_model.model import HINGE
@@ -50,3 +52,36 @@ def test_a_known_site_moves_its_neighbours_and_lowers_their_errors(nodding):
     assert places[beside][0] > nodding.sites[beside][0]
     shift = np.linalg.norm(places[far] - nodding.sites[far])
     assert shift < np.linalg.norm(places[beside] - nodding.sites[beside])
+
+
+@pytest.mark.parametrize(
+    ("how", "axis", "angle"),
+    [("vertex to the front", (1, 0, 0), 90.0), ("face to the left", (0, 0, 1), 90.0)],
+)
+def test_a_head_that_lies_on_its_side_is_refused_with_how_it_lies(how, axis, angle):
+    head = average_head()
+    turn = rigid_motion(angle=angle, axis=axis, centre=(0, 0, 0))
+    bone = joined_surface([*head.bones.values()])
+    with pytest.raises(cmfsim.LandmarkError, match=f"the head lies with its {how}"):
+        fit_head(samples_of(_moved(bone, turn), _moved(head.skin, turn)))
+
+
+def _rows(tilt, gap=1.0):
+    """Voxels of two rows of crowns: half as much bone in the bite, which leans by `tilt` mm."""
+    along, heights = (
+        axis.ravel() for axis in np.meshgrid(np.linspace(0, 1, 30), np.arange(-20, 20, 0.5))
+    )
+    bite = 2.0 + tilt * along
+    return heights, along, np.where(np.abs(heights - bite) < gap, 0.5, 1.0)
+
+
+@pytest.mark.parametrize("tilt", [-3.0, 0.0, 4.0])
+def test_the_bite_is_the_layer_with_least_bone(tilt):
+    front, end = bite_shifts(*_rows(tilt), (8.0, 8.0), 1.0)
+    assert abs(front - 2.0) < 0.6
+    assert abs(end - front - tilt) < 0.8
+
+
+def test_rows_without_a_poorer_layer_show_no_bite():
+    heights, along, dense = _rows(0.0)
+    assert bite_shifts(heights, along, np.ones_like(dense), (8.0, 8.0), 1.0) is None

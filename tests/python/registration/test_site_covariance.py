@@ -7,6 +7,7 @@ from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
     SiteDistribution,
+    placed_distribution,
     site_covariance,
 )
 from cmfsim.values.landmark_sites import site_part
@@ -69,6 +70,17 @@ def test_a_missing_site_is_where_the_others_put_it(bone):
         away = np.linalg.norm(found.mean[i] - average_head().skull[name])
         assert away < 2.0
         assert away < found.errors[i]
+
+
+def test_a_missing_site_departs_from_the_average_as_its_partner_does():
+    places = dict(average_head().skull)
+    del places["supra_m2_R"]
+    places["supra_m2_L"] = places["supra_m2_L"] + [6.0, 0.0, 3.0]
+    found = placed_distribution(places)
+    row = found.names.index(("skull", "supra_m2_R"))
+    away = found.mean[row] - average_head().skull["supra_m2_R"]
+    assert -6.0 < away[0] < -3.0
+    assert 1.5 < away[2] < 3.0
 
 
 def test_a_head_in_another_pose_and_size_has_the_same_distribution(bone):
