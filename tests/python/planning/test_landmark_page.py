@@ -446,7 +446,7 @@ def test_given_sites_stay_others_follow_and_missing_ones_are_filled_in(head):
     assert found.skull["menton"].origin == "placed"
     infradentale = found.skull["infradentale"]
     assert infradentale.origin == "moved"
-    assert np.linalg.norm(infradentale.point - truth.skull["infradentale"]) < 0.6 * HIGH
+    assert np.linalg.norm(infradentale.point - truth.skull["infradentale"]) < 0.65 * HIGH
     assert infradentale.error < 10.0
     gone = found.skull[GONE]
     assert gone.origin == "filled"
