@@ -37,8 +37,8 @@ const LINK_STIFFNESS: f64 = 2.0;
 const NEAR_SHARE: f64 = 0.5;
 /// Distance beyond the border of an open surface, over its mean edge, up to which a node may still touch it.
 const BORDER_REACH: f64 = 0.25;
-/// Largest decrease of a gap in one round for a node that passes through its surface, over the mean edge: bones
-/// move no further in a step.
+/// Largest decrease of a gap in one round for a node that passes through its surface, over the mean edge: while
+/// bones move, the planes that move with them stop it earlier.
 const JUMP_SHARE: f64 = 1.0;
 /// Depth behind a surface, over its mean edge, from which a node that was beyond its border is taken to have
 /// come around it.
@@ -385,15 +385,23 @@ impl Pairs {
         Round { number, links }
     }
 
-    /// Σ ½ k ⟨λ/k − g⟩₊² over `planes` at displacements `u` of all nodes, N mm: the contribution of contact to
-    /// the energy.
-    pub fn energy(&self, planes: &Planes, u: &[[f64; 3]], touching: &Touching) -> f64 {
+    /// The slope of Σ ½ k ⟨λ/k − g⟩₊² over `planes`, N mm, at any share of the way between displacements `from`
+    /// and `to` of all nodes: the contribution of contact to that of the energy.
+    pub fn press(
+        &self,
+        planes: &Planes,
+        (from, to): (&[[f64; 3]], &[[f64; 3]]),
+        touching: &Touching,
+    ) -> impl Fn(f64) -> f64 {
         let each = self.candidates.iter().zip(&planes.at).zip(&touching.multipliers);
-        each.map(|((c, plane), force)| {
-            let deep = plane.as_ref().map_or(0.0, |p| (force / c.stiffness - p.at(u)).max(0.0));
-            0.5 * c.stiffness * deep * deep
-        })
-        .sum()
+        let force = |((c, plane), force): ((&Candidate, &Option<Plane>), &f64)| {
+            let plane = plane.as_ref()?;
+            let (start, end) = (plane.at(from), plane.at(to));
+            let (force, rate) = (force - c.stiffness * start, c.stiffness * (end - start));
+            Some((force, rate, end - start))
+        };
+        let ways: Vec<(f64, f64, f64)> = each.filter_map(force).collect();
+        move |share| ways.iter().map(|(f, rate, way)| -(f - share * rate).max(0.0) * way).sum()
     }
 
     /// The residuals of `round` at displacements `rows` of the unknown nodes, given the `gap` of each plane.

@@ -8,7 +8,6 @@
 
 use std::sync::Arc;
 
-use crate::algebra::line_search::{Descent, first_of_halves};
 use crate::boundary::Motion;
 use crate::contact::pairs::{Left, Pairs, Round, Touching};
 use crate::contact::planes::Planes;
@@ -25,7 +24,7 @@ use crate::statics::solution::{Clock, TouchResult};
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
 /// Motion of the bones in one step, over the mean edge of the tissue that may be touched.
-const STEP_EDGES: f64 = 1.0;
+const STEP_EDGES: f64 = 2.0;
 /// Depth, over the same edge, that a node may reach in a step; if it goes deeper, the step is halved.
 const DEEP_EDGES: f64 = 0.75;
 /// Shortest step, as a share of the plan.
@@ -42,7 +41,7 @@ const SEEN: f64 = 50.0;
 /// the node has passed through the surface.
 const THROUGH: f64 = 15.0;
 /// Maximum number of rounds of an intermediate step, which the next step continues, and of the last step.
-const MOST_ROUNDS_ON_THE_WAY: usize = 2;
+const MOST_ROUNDS_ON_THE_WAY: usize = 1;
 const MOST_ROUNDS: usize = 60;
 /// Number of rounds, at the end of the maximum, that are solved to the tolerance.
 const LAST_ROUNDS: usize = 5;
@@ -51,14 +50,18 @@ const LAST_ROUNDS: usize = 5;
 const STILL: f64 = 4.0;
 /// Rounds of a step that use the normals as they are found; after that, oscillating normals are damped.
 const SHARP_ROUNDS: usize = 6;
-/// Smallest share of a round that is tried before one half of it is taken, whatever its energy.
-const SHORTEST_SHARE: f64 = 1.0 / 16.0;
+/// Shortest share of a round, whatever its energy, and the bisections that find the share.
+const SHORTEST_SHARE: f64 = 1.0 / 32.0;
+const BISECTIONS: usize = 20;
+/// Slope of the energy at the end of a round, over that at its start, up to which all of it is taken.
+const FLAT_SHARE: f64 = 0.05;
 /// Rounds of a step with the planes at its start, and the depth behind them, over the mean edge, at which they
 /// end.
 const MOST_ROUNDS_AHEAD: usize = 8;
 const AHEAD_EDGES: f64 = 0.05;
-/// Relative accuracy of a round, in the energy norm, before the last ones.
-const ROUGH_SHARE: f64 = 0.1;
+/// Relative accuracy of a round, in the energy norm, before the last ones: which nodes touch changes more in a
+/// round than its error does.
+const ROUGH_SHARE: f64 = 0.3;
 /// Maximum number of nodes listed in an error.
 const NAMED_NODES: usize = 10;
 
@@ -218,13 +221,11 @@ impl TouchingPlan<'_> {
         let u = self.reduction.filled(goal.prescribed, &pose.rows);
         let mut pose = PartialState { u, ..pose.clone() };
         let deep = AHEAD_EDGES * self.pairs.mean_edge();
-        let close = LOOSE * self.close();
         for round in 1..=MOST_ROUNDS_AHEAD {
             let links = self.pairs.round(ahead, &pose.u, &pose.touching);
-            let (rows, found) = self.linked(&links, (&pose, contact), goal, Some(close), solve)?;
+            let (rows, found) = self.linked(&links, (&pose, contact), goal, true, solve)?;
             // The first round moves the sliding nodes with their bones.
-            let share =
-                if round == 1 { 1.0 } else { self.share(&pose, (ahead, &links), &rows, goal) };
+            let share = if round == 1 { 1.0 } else { self.share(&pose, ahead, &rows, goal) };
             pose = self.moved(&pose, &rows, found, share, goal);
             if share == 1.0 {
                 pose.touching.follow(&links, &pose.rows);
@@ -258,9 +259,8 @@ impl TouchingPlan<'_> {
             pose.touching.gaps = planes.gaps();
             let round = self.pairs.round(&planes, &pose.u, &pose.touching);
             let begun = self.begun(&pose);
-            let (rows, contact) =
-                self.linked(&round, (&pose, begun), goal, rough.then_some(close), solve)?;
-            let share = if rough { self.share(&pose, (&planes, &round), &rows, goal) } else { 1.0 };
+            let (rows, contact) = self.linked(&round, (&pose, begun), goal, rough, solve)?;
+            let share = if rough { self.share(&pose, &planes, &rows, goal) } else { 1.0 };
             let next = self.moved(&pose, &rows, contact, share, goal);
             let change = largest_change(&pose.u, &next.u);
             pose = next;
@@ -306,12 +306,12 @@ impl TouchingPlan<'_> {
         PartialState { u, rows, contact, touching: pose.touching.clone() }
     }
 
-    /// How far to go from `pose` towards the solution `rows` of a round: the step is halved until the sum of
-    /// elastic energy and contact energy against the planes decreases (Armijo 1966).
+    /// How far to go from `pose` towards the solution `rows` of a round: to the smallest sum of elastic energy and
+    /// contact energy against the planes, which is convex along the way.
     fn share(
         &self,
         pose: &PartialState,
-        (planes, round): (&Planes, &Round),
+        planes: &Planes,
         rows: &[[f64; 3]],
         goal: &StepTarget<'_>,
     ) -> f64 {
@@ -323,23 +323,28 @@ impl TouchingPlan<'_> {
         };
         let mut way: Vec<[f64; 3]> =
             rows.iter().zip(&pose.rows).map(|(to, from)| sub(*to, *from)).collect();
-        let pressing: f64 = round.links.iter().map(|l| l.pull(&pose.rows) * l.along(&way)).sum();
         // The contact forces of sliding nodes do no work along their surfaces.
         for node in self.sliding.iter().flat_map(|s| s.nodes()) {
             way[node.row as usize] = [0.0; 3];
         }
         let work = |f: &[[f64; 3]]| -> f64 { f.iter().zip(&way).map(|(f, w)| dot(*f, *w)).sum() };
         let (from, to) = (work(&first), work(&last));
-        let slope = from - pressing;
-        let pressed = |u: &[[f64; 3]]| self.pairs.energy(planes, u, &pose.touching);
-        let start = pressed(&pose.u);
-        let descent = Descent { slope, slack: 0.0 };
-        let found = first_of_halves(SHORTEST_SHARE, |share| {
-            let u = self.reduction.filled(goal.prescribed, &between(&pose.rows, rows, share));
-            let elastic = share * (from + 0.5 * share * (to - from));
-            descent.accepts(share, start, elastic + pressed(&u)).then_some(())
-        });
-        found.map_or(0.5 * SHORTEST_SHARE, |((), share)| share)
+        let end = self.reduction.filled(goal.prescribed, rows);
+        let press = self.pairs.press(planes, (&pose.u, &end), &pose.touching);
+        let slope = |share: f64| from + share * (to - from) + press(share);
+        if slope(1.0) <= FLAT_SHARE * slope(0.0).abs() {
+            return 1.0;
+        }
+        let (mut low, mut high) = (0.0, 1.0);
+        for _ in 0..BISECTIONS {
+            let middle = 0.5 * (low + high);
+            if slope(middle) > 0.0 {
+                high = middle;
+            } else {
+                low = middle;
+            }
+        }
+        low.max(SHORTEST_SHARE)
     }
 
     /// Positions of the sliding nodes in `pose`.
@@ -353,22 +358,25 @@ impl TouchingPlan<'_> {
     /// The body under the links of a `round` from `pose`: displacements of the rows, and contact if nodes
     /// slide.
     ///
-    /// `rough`: gap of sliding nodes, mm, that is accepted in an intermediate round.
+    /// `rough`: one step of Newton's method for the sliding nodes, wherever it ends: in an intermediate round,
+    /// what touches changes as much.
     fn linked(
         &self,
         round: &Round,
         (pose, contact): (&PartialState, Option<ContactStart>),
         goal: &StepTarget<'_>,
-        rough: Option<f64>,
+        rough: bool,
         solve: &mut PlanSolve<'_>,
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>)> {
         let rows = &pose.rows[..];
-        let linked = RowLinks { links: &round.links, share: rough.map(|_| ROUGH_SHARE) };
+        let linked = RowLinks { links: &round.links, share: rough.then_some(ROUGH_SHARE) };
         let Some(sliding) = self.sliding else {
             return Ok((self.system.solve_linked(goal.b, linked, rows, solve)?, None));
         };
         let mut options = *self.options;
-        options.contact.allowed = options.contact.allowed.max(rough.unwrap_or(0.0));
+        if rough {
+            options.contact.allowed = f64::INFINITY;
+        }
         let begin = contact.map(|contact| WarmStart { rows, contact });
         let motions = goal.motions;
         let settle = ContactSolve { sliding, motions, begin, options: &options, linked };
