@@ -1,4 +1,4 @@
-"""A local server for the planning page, which solves plans exactly as they are made.
+"""A local server for pages: the planning page, whose plans it solves as they are made, and others.
 
 It listens on the local address only, but any web site open in the same browser can send requests to
 it. Every request must therefore have the random token of this launch in its path and the exact host
@@ -14,7 +14,9 @@ import socket
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
-from typing import Any
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -42,6 +44,9 @@ SAFE_HEADERS = {
 METHODS = ("GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 # Status of an answer that nobody waits for any more.
 GONE = 408
+# The call of which only the newest waits.
+SOLVE = "solve"
+T = TypeVar("T")
 # Time that open connections have to finish after Ctrl-C, s.
 LAST_SECONDS = 1
 
@@ -65,7 +70,7 @@ def check_token(given: str, token: str) -> None:
     RefusedError
     """
     if not hmac.compare_digest(given.encode(), token.encode()):
-        raise RefusedError(404, "not found")
+        raise NOT_FOUND
 
 
 def check_headers(headers: Mapping[str, str], address: str, *, sends: bool) -> None:
@@ -78,7 +83,7 @@ def check_headers(headers: Mapping[str, str], address: str, *, sends: bool) -> N
     address : str
         Host and port, such as "127.0.0.1:8765".
     sends : bool
-        Whether the request sends a plan.
+        Whether the request sends something.
 
     Raises
     ------
@@ -97,9 +102,9 @@ def check_headers(headers: Mapping[str, str], address: str, *, sends: bool) -> N
         raise RefusedError(415, "application/json is needed")
     length = headers.get("content-length", "")
     if not length.isdecimal():
-        raise RefusedError(411, "the length of the plan is needed")
+        raise RefusedError(411, "the length of the body is needed")
     if int(length) > MOST_BYTES:
-        raise RefusedError(413, f"a plan has at most {MOST_BYTES} bytes")
+        raise RefusedError(413, f"at most {MOST_BYTES} bytes can be sent")
 
 
 def plan_of_body(planning: PlanningModel, body: bytes) -> dict[str, Floats]:
@@ -144,22 +149,40 @@ def _centres(planning: PlanningModel) -> dict[str, Floats]:
     return dict(zip(planning.segments, planning.columns.centres, strict=True))
 
 
-class PlanningServer:
-    """A local server for one patient.
+@dataclass(frozen=True)
+class Reply:
+    """What a request is answered with.
+
+    Attributes
+    ----------
+    body : bytes
+    kind : str
+        Its media type.
+    headers : mapping of str to str
+        Besides `SAFE_HEADERS`.
+    """
+
+    body: bytes
+    kind: str = "text/html; charset=utf-8"
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+class LocalServer:
+    """A local server of pages, and of what they ask for.
 
     Parameters
     ----------
-    planning : PlanningModel
-    content : PageContent
-    case_file : str
-        For the command that the page shows.
+    pages : mapping of str to callable
+        What GET is answered with, by the name behind the token; "" is the first page.
+    calls : mapping of str to callable
+        What POST of a body is answered with. It may raise `RefusedError` or a `CmfsimError`.
     port : int or socket
         0 picks a free one; or what `open_port` returned.
 
     Attributes
     ----------
     url : str
-        Address of the page, including the token of this launch.
+        Address of the first page, including the token of this launch.
 
     Raises
     ------
@@ -171,15 +194,14 @@ class PlanningServer:
 
     def __init__(
         self,
-        planning: PlanningModel,
-        content: PageContent,
+        pages: Mapping[str, Callable[[], Reply]],
+        calls: Mapping[str, Callable[[bytes], Reply]],
         *,
-        case_file: str = "case.toml",
         port: int | socket.socket = 0,
     ) -> None:
-        self._planning = planning
+        self._pages, self._calls = pages, calls
         self._token = secrets.token_urlsafe(32)
-        self._page = page_text(content, case_file=case_file, is_served=True)
+        self._line = _Line()
         self._uvicorn = _module("uvicorn")
         self._responses = _module("starlette.responses")
         application = self._application()
@@ -200,10 +222,12 @@ class PlanningServer:
 
     def run(self) -> None:
         """Serves until `stop` is called or the process is interrupted."""
-        try:
-            self._server.run(sockets=[self._socket])
-        finally:
-            self._socket.close()
+        # Uvicorn closes its connections first, then raises it again.
+        with contextlib.suppress(KeyboardInterrupt):
+            try:
+                self._server.run(sockets=[self._socket])
+            finally:
+                self._socket.close()
 
     def stop(self) -> None:
         """Ends `run` from another thread."""
@@ -211,74 +235,65 @@ class PlanningServer:
 
     def _application(self) -> Any:
         applications, routing = _module("starlette.applications"), _module("starlette.routing")
-        line = _Line()
 
-        async def page(request: Any) -> Any:
-            return self._guarded(request, sends=False) or self._responses.HTMLResponse(
-                self._page, headers=SAFE_HEADERS
-            )
-
-        async def solve(request: Any) -> Any:
-            refused = self._guarded(request, sends=True)
-            if refused is not None:
-                return refused
+        async def answer(request: Any) -> Any:
             try:
-                body = await _limited_body(request)
-                plan = plan_of_body(self._planning, body)
-                async with line.turn():
-                    # Nothing is solved for a page that has gone.
-                    if not await request.is_disconnected():
-                        return await _in_thread(self._solved, plan)
+                reply = await self._reply(request)
             except RefusedError as error:
                 return self._refusal(error)
             except CmfsimError as error:
                 return self._refusal(RefusedError(422, str(error)))
-            return self._refusal(RefusedError(GONE, "the page has gone"))
+            return self._responses.Response(
+                reply.body, media_type=reply.kind, headers={**SAFE_HEADERS, **reply.headers}
+            )
 
-        async def nothing(request: Any) -> Any:
-            there = request.path_params["token"].partition("/")[2] in {"", "solve"}
-            error = RefusedError(405, "method not allowed") if there else NOT_FOUND
-            return self._guarded(request, sends=False) or self._refusal(error)
-
-        application = applications.Starlette(
-            routes=[
-                routing.Route("/{token}/", page, methods=["GET"]),
-                routing.Route("/{token}/solve", solve, methods=["POST"]),
-                routing.Route("/{token:path}", nothing, methods=METHODS),
-            ]
-        )
+        route = routing.Route("/{place:path}", answer, methods=METHODS)
+        application = applications.Starlette(routes=[route])
         # Starlette would redirect before any check.
         application.router.redirect_slashes = False
         return application
 
-    def _guarded(self, request: Any, *, sends: bool) -> Any:
-        """The refusal of a request that the page did not send; None otherwise."""
-        try:
-            check_headers(request.headers, self._address, sends=sends)
-            check_token(request.path_params["token"].partition("/")[0], self._token)
-        except RefusedError as error:
-            return self._refusal(error)
-        return None
+    async def _reply(self, request: Any) -> Reply:
+        """The answer to a request, once it is known to come from the page."""
+        check_headers(request.headers, self._address, sends=False)
+        token, slash, name = request.path_params["place"].partition("/")
+        check_token(token, self._token)
+        if name not in self._pages and name not in self._calls:
+            raise NOT_FOUND
+        if slash and request.method == "GET" and name in self._pages:
+            return await _in_thread(self._pages[name])
+        if request.method != "POST" or name not in self._calls:
+            raise RefusedError(405, "method not allowed")
+        check_headers(request.headers, self._address, sends=True)
+        body = await _limited_body(request)
+        if name != SOLVE:
+            return await _in_thread(partial(self._calls[name], body))
+        async with self._line.turn():
+            # Nothing is solved for a page that has gone.
+            if await request.is_disconnected():
+                raise RefusedError(GONE, "the page has gone")
+            return await _in_thread(partial(self._calls[name], body))
 
     def _refusal(self, error: RefusedError) -> Any:
         return self._responses.PlainTextResponse(
             str(error), status_code=error.status, headers=SAFE_HEADERS
         )
 
-    def _solved(self, plan: Any) -> Any:
-        """The exact displacements of the skin's nodes, float32, with a summary of the solution."""
-        begun = time.perf_counter()
-        prediction = self._planning.solve(plan)
-        shift = np.ascontiguousarray(prediction.skin_displacements, dtype="<f4")
-        figures = {
-            "seconds": time.perf_counter() - begun,
-            "contact_converged": bool(prediction.result.summary["contact_converged"]),
-        }
-        return self._responses.Response(
-            shift.tobytes(),
-            media_type="application/octet-stream",
-            headers={**SAFE_HEADERS, "X-Solution": json.dumps(figures)},
-        )
+
+def solved_plan(planning: PlanningModel, plan: Mapping[str, Floats]) -> tuple[Floats, Any]:
+    """The exact displacements of the skin's nodes, mm, with a summary of the solution."""
+    begun = time.perf_counter()
+    prediction = planning.solve(plan)
+    return prediction.skin_displacements, {
+        "seconds": time.perf_counter() - begun,
+        "contact_converged": bool(prediction.result.summary["contact_converged"]),
+    }
+
+
+def solved_reply(shift: Floats, figures: Any) -> Reply:
+    """The answer to a plan that was solved: float32, with the summary in a header."""
+    body = np.ascontiguousarray(shift, dtype="<f4").tobytes()
+    return Reply(body, "application/octet-stream", {"X-Solution": json.dumps(figures)})
 
 
 class _Line:
@@ -314,10 +329,10 @@ class _Line:
                 self._is_solving = False
 
 
-async def _in_thread(work: Callable[[Any], Any], argument: Any) -> Any:
+async def _in_thread(work: Callable[[], T]) -> T:
     """What a function returns, called in a thread that does not keep the process from ending."""
     loop = asyncio.get_running_loop()
-    answer: asyncio.Future[Any] = loop.create_future()
+    answer: asyncio.Future[T] = loop.create_future()
 
     def settle(result: Any, error: BaseException | None) -> None:
         if answer.done():
@@ -330,7 +345,7 @@ async def _in_thread(work: Callable[[Any], Any], argument: Any) -> Any:
     def run() -> None:
         result, failed = None, None
         try:
-            result = work(argument)
+            result = work()
         except Exception as error:  # noqa: BLE001 (raised again where it is waited for)
             failed = error
         # The loop has ended where the process is about to.
@@ -347,8 +362,24 @@ async def _limited_body(request: Any) -> bytes:
     async for chunk in request.stream():
         body += chunk
         if len(body) > MOST_BYTES:
-            raise RefusedError(413, f"a plan has at most {MOST_BYTES} bytes")
+            raise RefusedError(413, f"at most {MOST_BYTES} bytes can be sent")
     return body
+
+
+def planning_server(
+    planning: PlanningModel,
+    content: PageContent,
+    *,
+    case_file: str = "case.toml",
+    port: int | socket.socket = 0,
+) -> LocalServer:
+    """The server of `serve_planning`, which does not run yet."""
+    page = page_text(content, case_file=case_file, is_served=True).encode()
+
+    def solve(body: bytes) -> Reply:
+        return solved_reply(*solved_plan(planning, plan_of_body(planning, body)))
+
+    return LocalServer({"": lambda: Reply(page)}, {SOLVE: solve}, port=port)
 
 
 def serve_planning(
@@ -386,16 +417,14 @@ def serve_planning(
     >>> cmfsim.serve_planning(planning, content, on_start=print)  # doctest: +SKIP
     http://127.0.0.1:41037/kXm…/
     """
-    server = PlanningServer(planning, content, case_file=case_file, port=port)
+    server = planning_server(planning, content, case_file=case_file, port=port)
     if on_start is not None:
         on_start(server.url)
-    # Uvicorn closes its connections first, then raises it again.
-    with contextlib.suppress(KeyboardInterrupt):
-        server.run()
+    server.run()
 
 
 def open_port(port: int = 0) -> socket.socket:
-    """A socket that holds a port of this machine; `PlanningServer` takes it in place of a number.
+    """A socket that holds a port of this machine; `LocalServer` takes it in place of a number.
 
     Raises
     ------

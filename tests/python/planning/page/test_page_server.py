@@ -16,7 +16,9 @@ from planning_steps import motions_of, settle, type_number
 
 import cmfsim
 from browser_page import READY, until
-from cmfsim.planning.server import PlanningServer, open_port
+from cmfsim.planning import server as planning_servers
+from cmfsim.planning.server import open_port, planning_server
+from local_requests import asked, origin_of, wait_for
 from planning_head import other_plan
 
 pytest.importorskip("skimage")
@@ -27,30 +29,13 @@ pytest.importorskip("meshio")
 def server(planning, content):
     pytest.importorskip("starlette")
     pytest.importorskip("uvicorn")
-    running = PlanningServer(planning, content)
+    running = planning_server(planning, content)
     thread = threading.Thread(target=running.run)
     thread.start()
     yield running
     running.stop()
     thread.join(timeout=20)
     assert not thread.is_alive()
-
-
-def asked(url, body=None, method=None, **headers):
-    """Status, body and headers of an answer; names of headers with _ for -."""
-    parts = urlsplit(url)
-    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=30)
-    own = {"Host": parts.netloc, **{n.replace("_", "-"): v for n, v in headers.items()}}
-    try:
-        connection.request(method or ("GET" if body is None else "POST"), parts.path, body, own)
-        answer = connection.getresponse()
-        return answer.status, answer.read(), answer.headers
-    finally:
-        connection.close()
-
-
-def origin_of(url):
-    return f"http://{urlsplit(url).netloc}"
 
 
 def plan_body(planning, plan):
@@ -144,12 +129,12 @@ def held(server, planning, monkeypatch):
     """Solving waits for the test: the shifts that were begun, how to go on, and how to send one."""
     begun, go, connections = [], threading.Event(), []
 
-    def solved(plan):
+    def solved(_, plan):
         begun.append(round(float(plan["maxilla"][1, 3]), 3))
         go.wait(20)
-        return server._responses.PlainTextResponse("solved")
+        return np.zeros((1, 3)), {}
 
-    monkeypatch.setattr(server, "_solved", solved)
+    monkeypatch.setattr(planning_servers, "solved_plan", solved)
 
     def posted(shift):
         parts = urlsplit(server.url)
@@ -164,13 +149,6 @@ def held(server, planning, monkeypatch):
     go.set()
     for connection in connections:
         connection.close()
-
-
-def wait_for(condition):
-    deadline = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def test_of_plans_that_wait_the_newest_is_solved_and_the_others_refused(held):
