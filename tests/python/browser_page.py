@@ -1,12 +1,29 @@
-"""A page in a browser, which must have no error and ask for nothing."""
+"""The browser that opens pages, where one is installed, and a page that must ask for nothing."""
 
 import os
+import shutil
 import time
 from pathlib import Path
 
 import pytest
 
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
 READY = "globalThis.cmfsimPage?.timing.compute > 0"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
+    with playwright.sync_playwright() as driver:
+        # Without its sandbox: tests may run as root, and open pages that they have made.
+        chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
 
 
 def open_page(browser, path):

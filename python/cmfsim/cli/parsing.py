@@ -60,6 +60,7 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
 
     _add_demo(commands, common)
     _add_init(commands, common)
+    _add_desk(commands, common)
     _add_view(commands, common)
 
     doctor = commands.add_parser(
@@ -131,6 +132,30 @@ def _add_init(commands: Any, common: argparse.ArgumentParser) -> None:
         "(left side up) in degrees, about the teeth or the chin. Again for another segment",
     )
     init.set_defaults(run=case_commands.init)
+
+
+def _add_desk(commands: Any, common: argparse.ArgumentParser) -> None:
+    desk = commands.add_parser(
+        "desk",
+        parents=[common],
+        help="from a folder with a scan to a saved plan and its report, in the browser",
+        epilog="Everything is saved in the case.toml there. Only this machine can open the page.",
+    )
+    file(desk, "folder", "FOLDER", "folder with a CT or surfaces, or with a case")
+    _add_page_options(desk)
+    desk.set_defaults(run=plan_command.desk)
+
+
+def _add_page_options(command: argparse.ArgumentParser) -> None:
+    """Where a page is served, and whether it is opened."""
+    command.add_argument(
+        "--port",
+        metavar="N",
+        type=_port,
+        default=0,
+        help="port from 1024 to 65535 (default: a free one)",
+    )
+    switch(command, "--no-open", "do not open the page")
 
 
 def _add_view(commands: Any, common: argparse.ArgumentParser) -> None:
@@ -268,14 +293,7 @@ def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
         "solve plans exactly while the page is open, on this machine only, until Ctrl-C",
     )
     add_band_options(plan)
-    plan.add_argument(
-        "--port",
-        metavar="N",
-        type=_port,
-        default=0,
-        help="port from 1024 to 65535 (default: a free one)",
-    )
-    switch(plan, "--no-open", "do not open the page")
+    _add_page_options(plan)
     plan.set_defaults(run=plan_command.plan)
 
 

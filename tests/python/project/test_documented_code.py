@@ -233,6 +233,7 @@ COARSE = (
 # Commands that are not run: they never end, need data that is not ours, or take hours.
 NOT_RUN = (
     (["plan", "case.toml", "--serve"], "until Ctrl-C"),
+    (["desk"], "until Ctrl-C"),
     (["template", "import"], "BodyParts3D"),
     (["predict", "--band", "--calibration"], "a calibration of the 36 patients of the page"),
     (["bench", "frontier"], "hours"),

@@ -218,6 +218,11 @@ def procedure_options(kind: str) -> dict[str, float]:
     return {name: default for name, (default, _, _) in _OPTIONS[kind].items()}
 
 
+def option_ranges(kind: str) -> dict[str, tuple[float, float, float]]:
+    """The default, lowest and highest value of each option of a procedure, mm or degrees."""
+    return dict(_OPTIONS[kind])
+
+
 def place_procedure(
     kind: str, landmarks: Mapping[str, ArrayLike], options: Mapping[str, float] | None = None
 ) -> Procedure:

@@ -1,4 +1,4 @@
-"""`cmfsim plan`: the planning page of a case."""
+"""`cmfsim plan`: the planning page of a case; `cmfsim desk`: from a scan to a plan."""
 
 import argparse
 import json
@@ -6,6 +6,7 @@ import socket
 import sys
 import time
 import webbrowser
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from cmfsim.cli.exit_codes import DONE
 from cmfsim.cli.options import band_options
 from cmfsim.cli.patients.case_commands import case_of, checked
 from cmfsim.cli.terminal import Notices, StageProgress, can_open, escaped, open_page
+from cmfsim.errors import CaseInputError
 from cmfsim.pipeline.outputs.planning_page import PLAN_FILE
 from cmfsim.pipeline.planning import TARGET_STD, PlanningPage, make_planning_page
 from cmfsim.planning.face_planning import FacePlan
@@ -71,19 +73,46 @@ def plan(options: argparse.Namespace) -> int:
 def _serve(
     options: argparse.Namespace, made: PlanningPage, case_file: str, listener: socket.socket
 ) -> None:
-    """Serves the page until it is interrupted; its address is printed first."""
-
-    def started(url: str) -> None:
-        if options.json:
-            print(json.dumps({"url": url}), flush=True)
-        else:
-            print(f"page   {url}\nOnly this machine can open it; stop with Ctrl-C.", flush=True)
-        if not options.no_open and can_open():
-            webbrowser.open(url)
-
+    """Serves the page until it is interrupted."""
     serve_planning(
-        made.planning, made.content, case_file=case_file, port=listener, on_start=started
+        made.planning,
+        made.content,
+        case_file=case_file,
+        port=listener,
+        on_start=lambda url: _show(options, "page", url),
     )
+
+
+def _show(options: argparse.Namespace, what: str, url: str) -> None:
+    """Prints the address of a page that is served, and opens it."""
+    if options.json:
+        print(json.dumps({"url": url}), flush=True)
+    else:
+        print(f"{what}   {url}\nOnly this machine can open it; stop with Ctrl-C.", flush=True)
+    if not options.no_open and can_open():
+        webbrowser.open(url)
+
+
+def desk(options: argparse.Namespace) -> int:
+    """Serves the desk of a folder until it is interrupted."""
+    # Landmarks and procedures: other commands do not load them.
+    from cmfsim.desk.server import desk_server  # noqa: PLC0415
+    from cmfsim.desk.session import Session  # noqa: PLC0415
+
+    folder: Path = options.folder
+    if not folder.exists():
+        raise FileNotFoundError(f"{folder}: no such folder")
+    if folder.is_file() and folder.suffix != ".toml":
+        raise CaseInputError(f"{folder.name}: name a folder, or a case.toml")
+    session = Session(folder)
+    server = desk_server(session, open_port(options.port))
+    session.begin()
+    _show(options, "desk", server.url)
+    try:
+        server.run()
+    finally:
+        session.end()
+    return DONE
 
 
 def _error_text(errors: ExpectedError) -> str:

@@ -258,5 +258,6 @@ def landmark_page_text(content: LandmarkContent) -> str:
             arrays=content.arrays,
             package="cmfsim.planning.landmark_page",
             main="landmarks_main.js",
+            is_served=bool(content.values.get("on_desk")),
         )
     )

@@ -1,5 +1,6 @@
 // Files of landmarks: saved for the case, and loaded by the file picker or by dropping them.
 
+import { call, deskState } from "./desk_calls.js";
 import { button, copied, element } from "./elements.js";
 import { save } from "./exporting.js";
 import { decidedOf, sitesOf } from "./loading.js";
@@ -17,8 +18,10 @@ export class FilesPanel {
     this.file = element("input", { type: "file", accept: ".json", multiple: true, id: "landmark-files", onchange: () => this.loadAll([...this.file.files]) });
     const kinds = KINDS.filter((kind) => app.page.sites.some((s) => s.kind === kind));
     this.lines = ["[landmarks]", ...kinds.map((kind) => `${kind} = "${fileOf(kind)}"`), 'automatic = "missing"'].join("\n");
+    this.kinds = kinds;
     this.root = element("div", {},
       element("h2", { textContent: "Save" }),
+      app.page.on_desk ? this.caseRow() : null,
       element("div", { className: "row" }, ...kinds.map((kind) =>
         button(`Save the ${kind}`, () => this.save(kind), { id: `save-${kind}`, title: fileOf(kind) }))),
       this.note = element("p", { className: "note", id: "save-note" }),
@@ -43,10 +46,33 @@ export class FilesPanel {
       : "All sites are saved, each with its state as its description.";
   }
 
-  save(kind) {
+  /** Saves into the case, where the page was opened from the desk. */
+  caseRow() {
+    deskState().then(({ seen }) => { this.seen = seen; });
+    return element("div", { className: "row" },
+      button("Save in the case", () => this.saveInCase(), { id: "save-in-case" }),
+      element("a", { href: "./", textContent: "Back to the desk" }));
+  }
+
+  async saveInCase() {
+    try {
+      const texts = Object.fromEntries(this.kinds.map((kind) => [kind, this.markups(kind)]));
+      ({ seen: this.seen } = await call("save-landmarks", { seen: this.seen, ...texts }));
+      this.app.savedAt = this.app.history.now;
+      globalThis.location.assign("./");
+    } catch (error) {
+      this.app.report(`Not saved: ${error.message}.`);
+    }
+  }
+
+  /** The text of the file of a kind. */
+  markups(kind) {
     const { page, shown } = this.app;
-    const sites = page.sites.flatMap((site, i) => (site.kind === kind ? [{ name: site.name, doubt: site.doubt, ...saved(shown[i]) }] : []));
-    save(fileOf(kind), markupsText(sites), "application/json");
+    return markupsText(page.sites.flatMap((site, i) => (site.kind === kind ? [{ name: site.name, doubt: site.doubt, ...saved(shown[i]) }] : [])));
+  }
+
+  save(kind) {
+    save(fileOf(kind), this.markups(kind), "application/json");
     this.app.savedAt = this.app.history.now;
   }
 

@@ -119,6 +119,13 @@ export class Drawing {
     });
   }
 
+  /** Other amounts for the vertices of a surface. */
+  recolour(surface, amounts) {
+    const { gl } = this;
+    gl.bindBuffer(gl.ARRAY_BUFFER, surface.buffers[2]);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, amounts);
+  }
+
   /** Fits the picture to the size of its element, in device pixels. */
   fit() {
     const ratio = Math.min(2, globalThis.devicePixelRatio || 1);

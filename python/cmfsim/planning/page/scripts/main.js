@@ -3,6 +3,7 @@
 import { BandPanel } from "./band_panel.js";
 import { Camera } from "./camera.js";
 import { SKIN, STILL_BONE, DISTINCT, mapped, rgb } from "./colours.js";
+import { DeskPanel } from "./desk_panel.js";
 import { Drawing, vertexNormals } from "./drawing.js";
 import { element } from "./elements.js";
 import { ExportPanel } from "./export_panel.js";
@@ -79,10 +80,11 @@ class App {
     this.measuring = new MeasurePanel(this);
     this.trusting = new BandPanel(this);
     this.exporting = new ExportPanel(this);
+    this.desk = new DeskPanel(this);
     this.profile = element("canvas", { className: "profile", role: "img", "aria-label": "Midline profile" });
     this.profileNote = element("p", { className: "note" });
     document.getElementById("panel").append(
-      this.panel.root, this.pulling.root, this.variants.root,
+      this.desk.root, this.panel.root, this.pulling.root, this.variants.root,
       element("div", {}, element("h2", { textContent: "Midline profile" }), this.profile, this.profileNote),
       this.measuring.root, this.trusting.root, this.exporting.root);
     connectPointing(this);
@@ -205,6 +207,7 @@ class App {
     this.trusting.show();
     this.mirror.show();
     this.exporting.show();
+    this.desk.show();
     if (this.settled) this.variants.show();
     this.showError();
     this.showTeeth();
