@@ -178,6 +178,7 @@ from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
 from cmfsim.pipeline.evaluating import evaluate as evaluate
 from cmfsim.pipeline.outputs.model import build_case as build_case
 from cmfsim.pipeline.outputs.planning_page import write_planning_page as write_planning_page
+from cmfsim.pipeline.outputs.splint import make_splint as make_splint
 from cmfsim.pipeline.planning import PlanningPage as PlanningPage
 from cmfsim.pipeline.planning import make_planning_page as make_planning_page
 from cmfsim.pipeline.predicting import predict as predict
@@ -185,6 +186,7 @@ from cmfsim.pipeline.predicting import predict_models as predict_models
 from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks
 from cmfsim.planning.face_measures import CEPHALOMETRIC_MEASURES as CEPHALOMETRIC_MEASURES
 from cmfsim.planning.face_measures import MEASURES as MEASURES
+from cmfsim.planning.face_measures import OCCLUSAL_MEASURES as OCCLUSAL_MEASURES
 from cmfsim.planning.face_measures import BoneSite as BoneSite
 from cmfsim.planning.face_measures import FaceSites as FaceSites
 from cmfsim.planning.face_measures import Measure as Measure
@@ -193,12 +195,19 @@ from cmfsim.planning.face_measures import clinical_figures as clinical_figures
 from cmfsim.planning.face_measures import face_sites as face_sites
 from cmfsim.planning.face_measures import measure_face as measure_face
 from cmfsim.planning.face_measures import measure_sites as measure_sites
+from cmfsim.planning.face_measures import occlusion as occlusion
 from cmfsim.planning.face_planning import FacePlan as FacePlan
 from cmfsim.planning.face_planning import FaceSearch as FaceSearch
 from cmfsim.planning.face_planning import MeasureTarget as MeasureTarget
 from cmfsim.planning.face_planning import PointTarget as PointTarget
 from cmfsim.planning.face_planning import SurfaceTarget as SurfaceTarget
 from cmfsim.planning.face_planning import plan_for_face as plan_for_face
+from cmfsim.planning.occlusion import ContactMap as ContactMap
+from cmfsim.planning.occlusion import Splint as Splint
+from cmfsim.planning.occlusion import ToothRow as ToothRow
+from cmfsim.planning.occlusion import contact_map as contact_map
+from cmfsim.planning.occlusion import splint_between as splint_between
+from cmfsim.planning.occlusion import tooth_rows as tooth_rows
 from cmfsim.planning.page import PageContent as PageContent
 from cmfsim.planning.page import page_content as page_content
 from cmfsim.planning.page import page_text as page_text

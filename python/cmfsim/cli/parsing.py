@@ -14,6 +14,7 @@ from cmfsim.cli.patients import (
     template_commands,
     view_command,
 )
+from cmfsim.cli.patients.splint_command import add_splint
 from cmfsim.cli.research import lab_commands, study_commands
 from cmfsim.cli.research.lab_commands import add_population_commands
 from cmfsim.io import result_suffixes
@@ -84,6 +85,7 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
     build.set_defaults(run=case_commands.build)
 
     _add_study_commands(commands, common, changed)
+    add_splint(commands, named)
 
     _add_phantom(commands, common)
 

@@ -14,6 +14,7 @@ from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
 from cmfsim.pictures.distances import (
     DISTANCE_LIMIT,
     band_picture,
+    contacts_picture,
     distance_colour,
     picture_band,
     picture_distance_grid,
@@ -34,6 +35,7 @@ __all__ = [
     "ViewPart",
     "band_picture",
     "chart_errors",
+    "contacts_picture",
     "distance_colour",
     "has_screen",
     "picture_anatomy",

@@ -39,6 +39,8 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
         "right": (-1.0, 0.0, 0.0),
         "left front": (0.7, -0.7, 0.1),
         "behind": (0.35, 0.9, 0.1),
+        "above": (0.0, 0.0, 1.0),
+        "below": (0.0, 0.0, -1.0),
     }
 )
 MARGIN = 1.04
@@ -259,10 +261,15 @@ def _toward(direction: str) -> Floats:
     return unit
 
 
+def _upright(direction: str) -> tuple[float, float, float]:
+    """What is up in a view: the front, where the camera looks along the head."""
+    return (0.0, -1.0, 0.0) if direction in ("above", "below") else (0.0, 0.0, 1.0)
+
+
 def _half_height(view: View, corners: Floats, width: float, height: float) -> float:
     """Half the height, in mm, that a view needs to show the whole box."""
     toward = _toward(view.direction)
-    across = np.cross(toward, (0.0, 0.0, 1.0))
+    across = np.cross(toward, _upright(view.direction))
     across = across / np.linalg.norm(across)
     box = np.array([[corners[i >> a & 1, a] for a in range(3)] for i in range(8)])
     box -= corners.mean(axis=0)
@@ -283,7 +290,7 @@ def _place_camera(plotter: Any, view: View, corners: Floats, half_height: float)
     camera = plotter.camera
     camera.focal_point = tuple(middle)
     camera.position = tuple(middle + distance * _toward(view.direction))
-    camera.up = (0.0, 0.0, 1.0)
+    camera.up = _upright(view.direction)
     camera.parallel_scale = half_height
     # A camera that was set by hand must not be put back when the first mesh comes.
     plotter.camera_set = True

@@ -1,4 +1,4 @@
-"""Errors (as in Figure 10 of Kim et al. 2010) and the band of a prediction painted on the skin."""
+"""Errors (as in Figure 10 of Kim et al. 2010), the band of a prediction, and contacts of teeth."""
 
 import os
 from collections.abc import Mapping
@@ -30,6 +30,19 @@ CELL = (440, 370)
 GRID_LEGEND = (
     "blue: prediction behind the skin after the operation, red: in front, grey: not evaluated"
 )
+# Of the contacts of tooth rows: ends of the colour bar, mm.
+GAP_LIMIT = 2.0
+# Of the bone about the crowns that is shown, mm.
+ROW_AROUND = 5.0
+# Room beside the rows, mm.
+ROW_BESIDE = 8.0
+ROWS_SIZE = (1500, 800)
+ROW_VIEWS = (
+    View("below", "upper teeth from below, the patient's left on the right"),
+    View("above", "lower teeth from above, the patient's left on the left"),
+)
+
+Gaps = np.ma.MaskedArray[Any, np.dtype[np.float64]]
 
 
 def picture_distances(
@@ -77,7 +90,7 @@ def picture_distances(
     def paint(plotter: Any, view: View) -> None:
         surface = polydata(vertices, skin.triangles)
         surface["distance"] = np.where(shown, values, np.nan)
-        _add_skin(plotter, trimmed(surface, ends), limit)
+        distance_mesh(plotter, trimmed(surface, ends), limit)
         if view.direction == "left":
             add_scale_bar(plotter, (0.84, 0.27), 5, "%+.1f")
 
@@ -137,7 +150,7 @@ def picture_distance_grid(
     def paint(plotter: Any, view: View) -> None:
         panel = panels[view.caption]
         if panel is not None:
-            _add_skin(plotter, trimmed(*panel), limit)
+            distance_mesh(plotter, trimmed(*panel), limit)
         if view.caption == last:
             add_scale_bar(plotter, (0.87, 0.3), 5, "%+.1f")
 
@@ -164,8 +177,8 @@ def _centred(skin: SurfaceData, distances: ArrayLike) -> tuple[Any, SkinEnds, Fl
     return surface, skin_ends(moved), 0.5 * (high - low), float(np.abs(values[shown]).mean())
 
 
-def _add_skin(plotter: Any, surface: Any, limit: float) -> None:
-    """Adds a skin coloured by its "distance"."""
+def distance_mesh(plotter: Any, surface: Any, limit: float) -> None:
+    """Adds a surface coloured by its "distance"."""
     table = np.array([_rgb(x, limit) for x in np.linspace(-limit, limit, STEPS)], dtype=np.uint8)
     plotter.add_mesh(
         surface,
@@ -277,3 +290,53 @@ def picture_half_width(
 
     views = tuple(View(name, f"{name}   {words}") for name in ("right", "front", "left"))
     draw(path, views, corners, size, paint, legend=legend)
+
+
+def contacts_picture(upper: tuple[SurfaceData, Gaps], lower: tuple[SurfaceData, Gaps]) -> Picture:
+    """The picture of both tooth rows, to be drawn later.
+
+    Each row is its surface with the signed distance of its vertices from the other row, mm:
+    negative where they overlap, masked beyond the crowns.
+    """
+    return partial(picture_contacts, upper=_cropped(*upper), lower=_cropped(*lower))
+
+
+def picture_contacts(
+    path: str | os.PathLike[str],
+    *,
+    upper: tuple[SurfaceData, Gaps],
+    lower: tuple[SurfaceData, Gaps],
+) -> None:
+    """Writes a picture of the contacts: the upper row from below, the lower row from above."""
+    corners = bounds([upper[0].vertices, lower[0].vertices])
+    # Room for the scale.
+    corners[:, 0] += [-ROW_BESIDE, ROW_BESIDE]
+
+    def paint(plotter: Any, view: View) -> None:
+        surface, gaps = upper if view.direction == "below" else lower
+        shape = polydata(surface.vertices, surface.triangles)
+        shape["distance"] = np.ma.filled(-gaps, np.nan)
+        distance_mesh(plotter, shape, GAP_LIMIT)
+        if view.direction == "above":
+            add_scale_bar(plotter, (0.89, 0.3), 5, "%+.1f")
+
+    words = ("Red: overlap; white: contact; blue: gap (the scale counts overlaps positive).",)
+    draw(
+        path,
+        ROW_VIEWS,
+        corners,
+        ROWS_SIZE,
+        paint,
+        words=words,
+        legend=[("no crown", NOT_EVALUATED)],
+    )
+
+
+def _cropped(surface: SurfaceData, gaps: Gaps) -> tuple[SurfaceData, Gaps]:
+    """The part of a row's surface about its crowns."""
+    crowns = surface.vertices[~np.ma.getmaskarray(gaps)]
+    low, high = crowns.min(axis=0) - ROW_AROUND, crowns.max(axis=0) + ROW_AROUND
+    near = ((surface.vertices >= low) & (surface.vertices <= high)).all(axis=1)
+    triangles = surface.triangles[near[surface.triangles].all(axis=1)]
+    used, corners = np.unique(triangles, return_inverse=True)
+    return SurfaceData(surface.vertices[used], corners.reshape(-1, 3)), gaps[used]

@@ -40,6 +40,7 @@ PICTURES: Mapping[str, str] = {
     "case has data.",
     "plan": "The plan: bone segments in their planned positions, with outlines of their "
     "original positions.",
+    "contacts": "Contacts of the planned tooth rows: signed distance of the crowns, mm.",
     "muscles": "The muscles of the template, fitted to the skull by landmarks.",
 }
 
@@ -104,7 +105,7 @@ def case_document(
         *_note_section(entry),
         _plan_section(entry, pictures),
         _prediction_section(predictions, entry, pictures, view),
-        *clinical_sections(entry),
+        *clinical_sections(entry, _picture("contacts", pictures)),
         *_band_sections(entry, pictures),
         *_evaluation_sections(evaluation, figures),
         _finding_section(findings_of(predictions, evaluation)),

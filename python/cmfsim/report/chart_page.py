@@ -156,12 +156,14 @@ def draw_chart_page(
     y = max([y, *ends]) + APART
     ends = []
     for kind, x, room in (("cephalometry", MARGIN, LEFT), ("face", COLUMN, RIGHT)):
-        end = page.heading(x, y, TITLES[kind], room)
-        rows = [row[:5] for row in measure_rows(found, kind)]
+        kinds = [kind, "occlusion"] if kind == "cephalometry" else [kind]
+        end = page.heading(x, y, ", ".join(TITLES[name] for name in kinds), room)
+        rows = [row[:5] for name in kinds for row in measure_rows(found, name)]
         rows.insert(0, ("", "before", "planned", "change", "norm"))
         end = page.table(x, end, rows, [share * room for share in SHARES[kind]])
-        text = [f"Not available: {text}" for text in [absent_text(found, kind)] if text]
-        ends.append(page.paragraph((x, end), text, FINE, ABSENT_LINES, room))
+        absent = "; ".join(filter(None, (absent_text(found, name) for name in kinds)))
+        texts = [f"Not available: {absent}"] if absent else []
+        ends.append(page.paragraph((x, end), texts, FINE, ABSENT_LINES, room))
     y = max(ends) + APART
     y = max(_sites(page, y, found), _band(page, y, prediction.get("band"))) + APART
     y = page.heading(MARGIN, y, "Warnings")
@@ -173,7 +175,8 @@ def draw_chart_page(
 
 def _height_below(found: Values) -> float:
     """The largest height of all between the pictures and the foot of the page."""
-    measures = max(len(measure_rows(found, kind)) for kind in TITLES)
+    rows = {kind: len(measure_rows(found, kind)) for kind in TITLES}
+    measures = max(rows["cephalometry"] + rows["occlusion"], rows["face"])
     sites = max(sum(row[0] in SITES for row in site_rows(found)), BAND_ROWS + 2)
     texts = LEADING * (ABSENT_LINES * FINE + WARNING_LINES * SMALL)
     return 3 * HEADING + (measures + sites + 2) * ROW + texts + 2 * APART

@@ -1,14 +1,15 @@
 """The measures of the face and the movement of landmarks, as tables of a report."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cmfsim.report.document import NOTHING, Note, Section, Table
+from cmfsim.report.document import NOTHING, Figure, Note, Section, Table
 
 Values = Mapping[str, Any]
 # A site that moves by less, mm, stays: half of the last digit of the tables.
 STAYS = 0.05
 TITLES: Mapping[str, str] = {
+    "occlusion": "Occlusion",
     "cephalometry": "Cephalometry (midsagittal projection)",
     "face": "Measures of the soft tissue",
 }
@@ -21,21 +22,27 @@ NORMS = (
 )
 
 
-def clinical_sections(prediction: Values) -> list[Section]:
+def clinical_sections(prediction: Values, contacts: Sequence[Figure] = ()) -> list[Section]:
     """The sections on measures and landmarks of `prediction.json`; none in that of older versions.
 
     Parameters
     ----------
     prediction : mapping
+    contacts : sequence of Figure
+        The picture of the tooth rows' contacts, if there is one.
     """
     found = prediction.get("clinical")
     if found is None:
         return []
     columns = ("measure", "before", "planned", "change", "norm", "norm from")
-    blocks: list[Note | Table] = []
+    blocks: list[Note | Table | Figure] = []
     for kind, title in TITLES.items():
+        if kind not in found:
+            continue  # of an earlier version
         blocks.append(Table(columns, tuple(measure_rows(found, kind)), f"{title}."))
         blocks += [Note(f"Not available: {text}.") for text in [absent_text(found, kind)] if text]
+        if kind == "occlusion":
+            blocks += [*_contact_notes(found), *contacts]
     blocks.append(Note(NORMS))
     columns = ("landmark", "moves with", *WAYS, "distance")
     caption = "Movement of each landmark, mm; negative is backwards, down, to the right."
@@ -45,10 +52,27 @@ def clinical_sections(prediction: Values) -> list[Section]:
     return [Section("Measures", tuple(blocks)), Section("Landmarks", (table, *notes))]
 
 
+def _contact_notes(found: Values) -> list[Note]:
+    """How the planned tooth rows touch, in words."""
+    contacts = found.get("contacts")
+    if contacts is None:
+        return []  # of an earlier version
+    if "absent" in contacts:
+        return [Note(f"Contacts of the teeth are not available: {contacts['absent']}.")]
+    overlap = contacts["greatest_overlap_mm"]
+    if overlap > 0.0:
+        text = f"they overlap by {_text(overlap)} mm at most"
+    else:
+        text = f"they are {_text(contacts['least_gap_mm'])} mm apart at least"
+    count = contacts["n_contacts"]
+    places = "no place" if not count else "1 place" if count == 1 else f"{count} places"
+    return [Note(f"As planned, the tooth rows touch at {places}; {text}.")]
+
+
 def measure_rows(found: Values, kind: str) -> list[tuple[str, ...]]:
     """Label, value before and as planned, change, norm and its source of each known measure."""
     rows = []
-    for entry in found[kind]:
+    for entry in found.get(kind, ()):
         values = [entry["before"], entry["planned"]]
         if values != [None, None]:
             change = NOTHING if None in values else _text(values[1] - values[0], "+")
@@ -61,7 +85,7 @@ def measure_rows(found: Values, kind: str) -> list[tuple[str, ...]]:
 def absent_text(found: Values, kind: str) -> str:
     """The measures without a value, by the reason; empty if there are none."""
     reasons: dict[str, list[str]] = {}
-    for entry in found[kind]:
+    for entry in found.get(kind, ()):
         if entry["before"] is None and entry["planned"] is None:
             reasons.setdefault(entry["absent"], []).append(f"{entry['label']}, {entry['unit']}")
     return "; ".join(f"{' and '.join(names)} ({why})" for why, names in reasons.items())

@@ -8,6 +8,9 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, Frozen, as_number, as_point, check_one_of
 
 JAWS = ("upper", "lower")
+# Segments that may bear the upper and the lower teeth, the smallest first.
+UPPER_BEARERS = ("maxilla", "midface", "cranium", "skull")
+LOWER_BEARERS = ("mandible_body", "mandible")
 # Half the width, and the length, of the smallest arch, mm: less is landmarks exchanged or in cm.
 LEAST_ARCH = 2.0
 # How far a node that slides lies from its contact sheet at most, mm: what lies deeper behind is on

@@ -314,6 +314,25 @@ def is_for_measures(label: str) -> bool:
     return any(entry.short[0] == short and not entry.site for entry in CEPHALOMETRY)
 
 
+def tooth_of(label: str) -> tuple[str, str, str] | None:
+    """The site (such as "U6"), side and cusp ("O" or "MB") of a tooth's label; None for others."""
+    return _tooth_labels().get(label_key(label))
+
+
+@cache
+def _tooth_labels() -> Mapping[str, tuple[str, str, str]]:
+    """What each label of a tooth with a side stands for."""
+    found = {}
+    for entry in CEPHALOMETRY:
+        site, *others = entry.short
+        for label in others:
+            if label[1] in "LR" and label.endswith(("O", "MB")):
+                found[label_key(label)] = (site, label[1], label[3:])
+                for side in _SIDES:
+                    found |= {label_key(s): (site, side[1], "O") for s in _sided(site, side)}
+    return MappingProxyType(found)
+
+
 @cache
 def _short_labels() -> Mapping[str, str]:
     """The first abbreviation of each label of the skull, with a side or without."""

@@ -50,6 +50,7 @@ def test_the_others_are_evaluated_and_the_failed_one_is_named(unsettled, capsys)
     (out / "report.html").unlink()
     assert main(["report", str(out), "-q", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
+    assert set(answer.pop("clinical")) == {"H"}
     assert answer == {"output": str(out), "report": "report.html"}
     assert (out / "report.html").stat().st_size > 0
 

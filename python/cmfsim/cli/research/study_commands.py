@@ -17,6 +17,7 @@ from cmfsim.cli.patients.case_commands import case_of, checked
 from cmfsim.cli.terminal import Notices, StageProgress, escaped
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
+from cmfsim.io.results.predictions import predictions_of
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs.results import (
     REPORT_STAGE,
@@ -325,7 +326,8 @@ def report(options: argparse.Namespace) -> int:
     if name is None:
         return FAILED
     if options.json:
-        print(json.dumps({"output": str(folder), "report": name, **pages}))
+        clinical = {e["model"]: e.get("clinical") for e in predictions_of(folder).values()}
+        print(json.dumps({"output": str(folder), "report": name, **pages, "clinical": clinical}))
     else:
         for written in (name, *pages.values()):
             _print_report(folder, written)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cmfsim.doctor.evidence import place_text
 from cmfsim.values.checks import Floats
+from cmfsim.values.dental_arch import LOWER_BEARERS, UPPER_BEARERS
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
@@ -26,9 +27,6 @@ AROUND_JOINT = 20.0
 # a plan that brings it there; and how far behind it lies at most under one that moves it back. On
 # the average head it lies 3.4 mm behind. Less than the last, the plan does not decide on the bite.
 REVERSED, FAR_BEHIND, GOOD_BITE, DECIDES = 2.0, 9.4, (0.4, 6.4), 3.0
-# The bones that bear the teeth: the first that there is.
-UPPER_BEARERS = ("maxilla", "midface", "cranium", "skull")
-LOWER_BEARERS = ("mandible_body", "mandible")
 # Share of a bone's points, deeper than this in mm, from which on it lies within the other.
 WITHIN, TOUCHES = 0.05, 0.5
 # Matrices whose entries differ by less, mm, are one motion.
@@ -268,7 +266,7 @@ def _joints(parts: Sequence[BonePart]) -> list[_Joint]:
     far = np.linalg.norm(after - before, axis=1)
     return [
         _Joint(before[head], float(far[head]), lower[owner[head]])
-        for head in _heads(before)
+        for head in joint_heads(before)
         if _in_joint(before[head], skull)
     ]
 
@@ -286,7 +284,7 @@ def _check_joints(joints: Sequence[_Joint]) -> Iterator[Finding]:
     )
 
 
-def _heads(points: Floats) -> Iterator[int]:
+def joint_heads(points: Floats) -> Iterator[int]:
     """The point furthest up and back on each side, LPS: that of the joint head of a whole jaw."""
     middle = 0.5 * (points[:, 0].min() + points[:, 0].max())
     height = points[:, 1] + points[:, 2]

@@ -42,7 +42,7 @@ from cmfsim.values.surface_data import SurfaceData
 
 PREDICTION_FILES = re.compile(
     r"prediction\.(vtp|stl|vtu|npz|png|json|mrb)|face\.(vtp|stl)|face_before\.vtp|(bones|muscles)\.vtp"
-    r"|(plan|muscles|band)\.png|timings\.json"
+    r"|(plan|muscles|band|contacts)\.png|timings\.json"
 )
 PREDICTION_FILE = "prediction.json"
 TIMINGS_FILE = "timings.json"
@@ -157,7 +157,18 @@ PREDICTION = {
     "parts": {frozenset({"bones", "muscles"}): [str]},
     "files": [PREDICTION_FILES],
     "left_out?": [str],
-    "clinical?": {"cephalometry": [_MEASURE], "face": [_MEASURE], "sites": [_SITE]},
+    "clinical?": {
+        "occlusion?": [_MEASURE],
+        "cephalometry": [_MEASURE],
+        "face": [_MEASURE],
+        "sites": [_SITE],
+        "contacts?": {
+            "absent?": str,
+            "n_contacts?": COUNT,
+            "greatest_overlap_mm?": _SIZE,
+            "least_gap_mm?": _PLACE,
+        },
+    },
     "achieved?": {"segments": {str: _FIT}},
     "muscles?": {
         "volumes?": {str: _LARGE},

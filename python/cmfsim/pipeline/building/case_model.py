@@ -200,22 +200,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     """The model of a case, as `build_model` makes it."""
     kinds = kind_options_of(case)
     stages = Stages(options)
-    if options.check:
-        stages.begin("checking the case")
-        stages.add(_checked(case))
-    landmarks, noticed = read_case_landmarks(case)
-    stages.add(noticed)
-    anatomy = options.anatomy
-    if anatomy is None:
-        anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
-        stages.add(noticed)
-    check_bones_of_sites(case, landmarks.get("skull", {}), anatomy, by_hand=True)
-    if is_to_be_found(case, landmarks):
-        is_read = options.anatomy is None
-        head = found_landmarks(case, anatomy, stages, landmarks, is_read=is_read)
-        check_bones_of_sites(case, head.skull, head.anatomy, by_hand=bool(landmarks))
-    else:
-        head = Head(case, landmarks, anatomy)
+    head = _head(case, stages, options)
     stages.add(check_skin(head.anatomy, head.skull))
     if case.photo is not None:
         # A case without a photo loads nothing of it.
@@ -244,6 +229,33 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         patient, mesh = _without_muscles(head, stages, kinds, options, tissue, show=show)
         stages.begin("placing and sampling the muscles")
         return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
+
+
+def planned_head(case: Case, options: BuildOptions) -> tuple[Head, PlannedBones]:
+    """The head of a case and its bones with their motions, as `model_of` has them: no tissue."""
+    stages = Stages(options)
+    head = _head(case, stages, options)
+    return head, _bones(head, stages, options.after)[0]
+
+
+def _head(case: Case, stages: Stages, options: BuildOptions) -> Head:
+    """What was read of a case, with the landmarks that were found."""
+    if options.check:
+        stages.begin("checking the case")
+        stages.add(_checked(case))
+    landmarks, noticed = read_case_landmarks(case)
+    stages.add(noticed)
+    anatomy = options.anatomy
+    if anatomy is None:
+        anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
+        stages.add(noticed)
+    check_bones_of_sites(case, landmarks.get("skull", {}), anatomy, by_hand=True)
+    if is_to_be_found(case, landmarks):
+        is_read = options.anatomy is None
+        head = found_landmarks(case, anatomy, stages, landmarks, is_read=is_read)
+        check_bones_of_sites(case, head.skull, head.anatomy, by_hand=bool(landmarks))
+        return head
+    return Head(case, landmarks, anatomy)
 
 
 def _without_muscles(

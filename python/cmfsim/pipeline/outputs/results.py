@@ -46,6 +46,7 @@ from cmfsim.pictures import (
     Picture,
     band_picture,
     chart_errors,
+    contacts_picture,
     picture_distances,
     picture_muscles,
     plan_picture,
@@ -60,6 +61,7 @@ from cmfsim.pipeline.face_regions import face_motion
 from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, page_state
 from cmfsim.planning.face_measures import clinical_figures
 from cmfsim.planning.face_view import face_view
+from cmfsim.planning.occlusion import ContactMap, planned_contacts
 from cmfsim.report import Document, Figure, case_document, findings_of, render_page
 from cmfsim.report.chart_page import A4, draw_chart_page
 from cmfsim.values.anatomy import BoneSegment
@@ -74,7 +76,7 @@ _log = logging.getLogger(__name__)
 Predictions = Iterable[Prediction] | Callable[[OnMuscles], Iterable[Prediction]]
 
 # Pictures of a case's report, in the folder of its prediction and in its own.
-PREDICTION_PICTURES = ("prediction", "band", "plan", "muscles")
+PREDICTION_PICTURES = ("prediction", "band", "plan", "contacts", "muscles")
 MUSCLES = "muscles.png"
 REPORT_STAGE = "writing the report"
 BOXES_CAPTION = (
@@ -166,13 +168,15 @@ class _Drawing:
             picture = _muscles_picture(muscles, segments)
             self._early[model] = self._painter.begin(picture, folder / MUSCLES)
 
-    def begin(self, prediction: Prediction) -> dict[str, "Future[None]"]:
+    def begin(
+        self, prediction: Prediction, contacts: ContactMap | None
+    ) -> dict[str, "Future[None]"]:
         """The pictures of a prediction by name, with the one that was begun early."""
         model = prediction.model
         if not self._wanted(model):
             return {}
         begun = {}
-        for name, picture in _pictures_of(prediction):
+        for name, picture in _pictures_of(prediction, contacts):
             if name == MUSCLES and model in self._early:
                 begun[name] = self._early[model]
             else:
@@ -263,16 +267,26 @@ def _fill_model(
     """The files of one prediction in its folder, with the pictures that are wanted."""
     summary = prediction.summary
     skin = {**summary["skin"], **face_motion(prediction)}
-    figures = {"skin": skin, "clinical": clinical_figures(prediction)}
+    clinical, contacts = clinical_figures(prediction), _contacts(prediction)
+    clinical["contacts"] = contacts if isinstance(contacts, dict) else contacts.as_dict()
+    figures = {"skin": skin, "clinical": clinical}
     prediction = replace(prediction, summary={**summary, **figures})
     place = drawing.place(prediction.model)
     (fresh / place).mkdir(exist_ok=True)
-    begun = drawing.begin(prediction)
+    begun = drawing.begin(prediction, None if isinstance(contacts, dict) else contacts)
     more = partial(_more_files, prediction, begun, clock, slicer=slicer)
     clock.begin(place, prediction.summary["timings"])
     with clock.timed("writing the files"):
         names = fill_prediction(fresh / place, prediction, more)
     return WrittenPrediction(place, names, prediction.summary)
+
+
+def _contacts(prediction: Prediction) -> ContactMap | dict[str, Any]:
+    """The contacts of the planned tooth rows, or why they are not known."""
+    try:
+        return planned_contacts(prediction)
+    except CmfsimError as error:
+        return {"absent": str(error)}
 
 
 def _older(output: Path, places: Iterable[str]) -> list[str]:
@@ -340,11 +354,16 @@ def _drawn(begun: Mapping[str, "Future[None]"]) -> list[str]:
     return names
 
 
-def _pictures_of(prediction: Prediction) -> Iterator[tuple[str, Picture]]:
+def _pictures_of(
+    prediction: Prediction, contacts: ContactMap | None
+) -> Iterator[tuple[str, Picture]]:
     if prediction.muscles is not None:
         yield MUSCLES, _muscles_picture(prediction.muscles, prediction.patient.segments)
     yield "plan.png", plan_picture(prediction)
     yield "prediction.png", prediction_picture(prediction)
+    if contacts is not None:
+        upper = contacts.upper.surface, contacts.upper_gaps
+        yield "contacts.png", contacts_picture(upper, (contacts.lower.surface, contacts.lower_gaps))
     if prediction.band is not None:
         yield "band.png", band_picture(prediction)
 

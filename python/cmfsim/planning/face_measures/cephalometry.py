@@ -5,9 +5,10 @@ abbreviations (`cmfsim.values.landmark_sites.CEPHALOMETRY`). Lengths are not enl
 radiograph are.
 
 The occlusal plane runs through the middle of the edges of upper and lower incisors and the middle
-of the first molars, where these sites are given; otherwise it is estimated from the edges of the
-bone, `supradentale` and `infradentale`, `supra_m2` and `sub_m2`. The Frankfort plane runs through
-porion and orbitale; without porion it is that of the average head, registered to the cranium.
+of the first molars, where these sites are given; otherwise through the cusps that the bones show,
+or it is estimated from their edges, `supradentale` and `infradentale`, `supra_m2` and `sub_m2`. The
+Frankfort plane runs through porion and orbitale; without porion it is that of the average head,
+registered to the cranium.
 """
 
 import contextlib
@@ -25,7 +26,11 @@ from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, profil
 # Sites that are constructed: points of the Frankfort plane and of the occlusal plane.
 FRANKFORT, OCCLUSAL = ("FH-back", "FH-front"), ("OP-back", "OP-front")
 # The pairs of sites in whose middle the points of the occlusal plane lie, the best first.
-BITES = ((("U6", "L6"), ("U1", "L1")), (("supra_m2", "sub_m2"), ("Pr", "Id")))
+BITES = (
+    (("U6", "L6"), ("U1", "L1")),
+    (("U-back", "L-back"), ("U-front", "L-front")),
+    (("supra_m2", "sub_m2"), ("Pr", "Id")),
+)
 
 
 def _turn(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
@@ -46,7 +51,7 @@ def _across(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
 
 
 # Of points (forwards, up), (2,) mm, with what they give in words.
-_FORMULAS: Mapping[str, tuple[Callable[[Floats, Floats, Floats, Floats], float], str]] = {
+FORMULAS: Mapping[str, tuple[Callable[[Floats, Floats, Floats, Floats], float], str]] = {
     "turn": (_turn, "angle from {}–{} to {}–{}"),
     "along": (_along, "along {}–{}, {} in front of {}"),
     "across": (_across, "across {0}–{1}, from {3} to {2}; positive in front or above"),
@@ -56,7 +61,7 @@ _STEINER, _DOWNS, _JACOBSON = "Steiner 1953", "Downs 1948", "Jacobson 1975"
 _WITS = "men −1.2 ± 1.9, women −0.1 ± 1.8"
 CEPHALOMETRIC_MEASURES = tuple(
     Measure(key, label, unit, formula, tuple(sites.split()),
-            _FORMULAS[formula][1].format(*sites.split()), norm, source)
+            FORMULAS[formula][1].format(*sites.split()), norm, source)
     for key, label, unit, formula, sites, norm, source in (
         ("sna", "SNA", "°", "turn", "N S N A", "82", _STEINER),
         ("snb", "SNB", "°", "turn", "N S N B", "80", _STEINER),
@@ -77,8 +82,6 @@ CEPHALOMETRIC_MEASURES = tuple(
         ("l1_mp", "L1 to mandibular plane", "°", "turn", "L1R L1 Me Go", "91.4 ± 3.8", _DOWNS),
         ("interincisal", "Interincisal angle", "°", "turn", "U1 U1R L1 L1R",
          "135.4 ± 5.8", _DOWNS),
-        ("overjet", "Overjet", "mm", "along", "OP-back OP-front U1 L1", "", ""),
-        ("overbite", "Overbite", "mm", "across", "OP-back OP-front L1 U1", "", ""),
     )
 )  # fmt: skip
 
@@ -108,18 +111,18 @@ def cephalometry(
     >>> round(cmfsim.cephalometry(sites)["anb"], 2)
     3.88
     """
-    places = _projected(landmarks, before)
+    places = projected(landmarks, before)
     found: dict[str, float | None] = {}
     for measure in CEPHALOMETRIC_MEASURES:
         sites = [places[name] for name in measure.sites if name in places]
         whole = len(sites) == len(measure.sites)
-        found[measure.key] = _FORMULAS[measure.formula][0](*sites) if whole else None
+        found[measure.key] = FORMULAS[measure.formula][0](*sites) if whole else None
     return found
 
 
 def missing_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, str]:
     """The sites that each measure lacks, by its key, in words; empty if it lacks none."""
-    places = _projected(landmarks)
+    places = projected(landmarks)
     missing = {
         m.key: [name for name in dict.fromkeys(m.sites) if name not in places]
         for m in CEPHALOMETRIC_MEASURES
@@ -130,7 +133,7 @@ def missing_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, str]:
     }
 
 
-def _head_axes(landmarks: Mapping[str, ArrayLike]) -> Floats:
+def head_axes(landmarks: Mapping[str, ArrayLike]) -> Floats:
     """The directions forwards and up of a head, (2, 3), in its midsagittal plane.
 
     The plane is normal to the mean direction between the two sides of the cranium, and forwards
@@ -154,12 +157,12 @@ def _head_axes(landmarks: Mapping[str, ArrayLike]) -> Floats:
     return np.stack([forwards, np.cross(forwards, across)])
 
 
-def _projected(
+def projected(
     landmarks: Mapping[str, ArrayLike], before: Mapping[str, ArrayLike] | None = None
 ) -> dict[str, Floats]:
     """The sites in the midsagittal plane, (forwards, up), with those that are constructed."""
     at_rest = landmarks if before is None else before
-    plane = _head_axes(at_rest)
+    plane = head_axes(at_rest)
     rest, places = (
         {name: plane @ place for name, place in profile_sites(sites).items()}
         for sites in (at_rest, landmarks)

@@ -1,25 +1,35 @@
 """The clinical figures of a prediction: its measures before and as planned, and how sites move."""
 
+import itertools
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from cmfsim.errors import LandmarkInputError
+from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_measures import sites as face
 from cmfsim.planning.face_measures.cephalometry import (
+    BITES,
     CEPHALOMETRIC_MEASURES,
     cephalometry,
     missing_sites,
 )
 from cmfsim.planning.face_measures.definitions import MEASURES, Measure, measure_sites
+from cmfsim.planning.face_measures.occlusion import (
+    OCCLUSAL_MEASURES,
+    missing_for_occlusion,
+    occlusion,
+)
+from cmfsim.planning.occlusion import bite_sites, tooth_rows
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.landmark_sites import profile_sites
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 
 Values = Mapping[str, float | None]
+# Sites that only locate the occlusal plane.
+BITE = frozenset(itertools.chain(*BITES[1]))
 
 
 def clinical_figures(prediction: Prediction) -> dict[str, Any]:
@@ -30,9 +40,10 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
     Returns
     -------
     dict
-        "cephalometry" and "face": measures, each with `label`, `unit`, `norm`, `source`, `before`
-        and `planned`, and where these are None why, as `absent`. "sites": landmarks with `name`,
-        `moves_with` (a segment, or "skin"), `forwards_mm`, `up_mm` and `left_mm`.
+        "occlusion", "cephalometry" and "face": measures, each with `label`, `unit`, `norm`,
+        `source`, `before` and `planned`, and where these are None why, as `absent`. "sites":
+        landmarks with `name`, `moves_with` (a segment, or "skin"), `forwards_mm`, `up_mm` and
+        `left_mm`.
 
     Examples
     --------
@@ -48,10 +59,18 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
     at_rest = {**sites.skin, **{name: site.place for name, site in sites.bone.items()}}
     skin = {**patient.landmarks.get("skin", {}), **sites.skin}
     moved = prediction.carried(np.array([*skin.values()])) if skin else np.zeros((0, 3))
-    shifts = [(name, bone[name].segment, after[name] - before[name]) for name in after]
+    shifts = [
+        (name, bone[name].segment, after[name] - before[name]) for name in after if name not in BITE
+    ]
     shifts += [(f"{name} (skin)", "skin", m) for name, m in zip(skin, moved, strict=True)]
     ways = ("forwards_mm", "up_mm", "left_mm")
     return {
+        "occlusion": _rows(
+            OCCLUSAL_MEASURES,
+            occlusion(before),
+            occlusion(after, before),
+            missing_for_occlusion(before),
+        ),
         "cephalometry": _rows(
             CEPHALOMETRIC_MEASURES,
             cephalometry(before),
@@ -73,7 +92,7 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
 
 
 def _bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
-    """The sites of the skull on their segments, and the edges of incisors that the bone shows."""
+    """The sites of the skull on their segments, and the cusps that the bone shows."""
     skull = patient.landmarks.get("skull", {}) if patient.segments else {}
     sites = {}
     for name, place in skull.items():
@@ -83,13 +102,12 @@ def _bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
             return float(np.linalg.norm(closest - place))
 
         sites[name] = face.BoneSite(place, min(patient.segments, key=away).name)
-    for name, root, bearers in (
-        ("U1", "supradentale", face.UPPER_BEARERS),
-        ("L1", "infradentale", face.LOWER_BEARERS),
-    ):
-        if name not in profile_sites(skull):
-            with suppress(LandmarkInputError):
-                sites[name] = face.incisor_edge(patient, root, bearers)
+    with suppress(CaseInputError):
+        rows = tooth_rows(patient.anatomy, patient.segments, skull)
+        given = profile_sites(skull)
+        for name, (place, segment) in bite_sites(*rows).items():
+            if name not in given:
+                sites[name] = face.BoneSite(place, segment)
     return sites
 
 

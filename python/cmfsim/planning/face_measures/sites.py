@@ -15,6 +15,7 @@ from cmfsim.planning.face_measures.definitions import MEASURES, measure_sites
 from cmfsim.planning.face_measures.profile import midline_profile
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
+from cmfsim.values.dental_arch import UPPER_BEARERS
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
@@ -22,9 +23,6 @@ from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import MovedSurface
 
 UPPER_INCISOR = "upper_incisor"
-# Segments that may bear the upper and the lower teeth, the smallest first.
-UPPER_BEARERS = ("maxilla", "midface", "cranium", "skull")
-LOWER_BEARERS = ("mandible_body", "mandible")
 # Height of the glabella above the nasion, mm.
 GLABELLA = (8.0, 35.0)
 # Largest distance of menton behind pogonion, mm; range below it in which the throat is found, mm.

@@ -15,12 +15,10 @@ from cmfsim.errors import CaseInputError
 from cmfsim.meshing.node_kinds import dental_arches
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
-from cmfsim.values.dental_arch import DentalArch
+from cmfsim.values.dental_arch import LOWER_BEARERS, UPPER_BEARERS, DentalArch
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.patient_model import PatientModel
 
-UPPER_BEARERS = ("maxilla", "midface", "cranium")
-LOWER_BEARERS = ("mandible_body", "mandible")
 # The lower row: its bone within these of the arch, to the side, behind the molars, before the
 # front teeth, and towards the roots, mm.
 SIDE, BEHIND, AHEAD, ROOTS = 12.0, 8.0, 12.0, 4.0

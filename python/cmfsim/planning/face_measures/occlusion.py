@@ -1,0 +1,151 @@
+"""Occlusion: how the teeth of both jaws meet, and where they stand in the face.
+
+Overjet, overbite and the relation of the first molars are taken along and across the occlusal plane
+in the lateral view, midlines from the midsagittal plane of the cranium, and the cant in the view
+from the front. The midsagittal plane runs through the sites of the cranium that no tooth belongs
+to, in their middle.
+"""
+
+import itertools
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim.planning.face_measures.cephalometry import FORMULAS, head_axes, projected
+from cmfsim.planning.face_measures.definitions import Measure
+from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, tooth_of
+
+# Between the central incisors, and at the molars, on the bone: where the teeth are not given.
+UPPER_MIDLINE, LOWER_MIDLINE, MOLARS = "supradentale", "infradentale", "supra_m2"
+# Sites of the cranium in the midline, and those in pairs that follow the upper jaw.
+OF_JAW = (MOLARS, "inferior_malar")
+MIDLINE = ("supraglabella", "glabella", "nasion", "rhinion")
+# How far the upper first molar lies in front of the lower one in class I, mm, between mesiobuccal
+# cusps and between the middles of the crowns: the cusp of the upper one meets the groove behind
+# that of the lower one.
+CLASS_I = {"MB": -2.0, "O": -1.0}
+OCCLUSAL_MEASURES = (
+    Measure("overjet", "Overjet", "mm", "along", ("OP-back", "OP-front", "U1", "L1"),
+            "along the occlusal plane, from L1 to U1; positive in front"),
+    Measure("overbite", "Overbite", "mm", "across", ("OP-back", "OP-front", "L1", "U1"),
+            "across the occlusal plane, from U1 up to L1"),
+    Measure("upper_midline", "Upper midline", "mm", "left", ("U1",),
+            "upper dental midline to the left of the midsagittal plane", "0"),
+    Measure("lower_midline", "Lower midline", "mm", "left", ("L1",),
+            "lower dental midline to the left of the midsagittal plane", "0"),
+    Measure("cant", "Cant of the upper molars", "°", "cant", ("U6",),
+            "line between the upper molars in the view from the front; positive: left side up",
+            "0"),
+    *(Measure(f"molar_{side}", f"Molar relation, {side}", "mm", "molar", ("U6", "L6"),
+              "upper first molar in front of where it lies in class I, along the occlusal plane",
+              "0 ± 2: class I; above: II, below: III", "Angle 1899")
+      for side in ("left", "right")),
+)  # fmt: skip
+
+
+def occlusion(
+    landmarks: Mapping[str, ArrayLike], before: Mapping[str, ArrayLike] | None = None
+) -> dict[str, float | None]:
+    """The value of each of `OCCLUSAL_MEASURES`; None if one of its sites is missing.
+
+    Parameters
+    ----------
+    landmarks : mapping of str to (3,) float64, mm, LPS
+        As for `cephalometry`. Midlines take the middle of both central incisors ("U1_L" and
+        "U1_R"), else "supradentale" and "infradentale"; the cant takes "U6_L" and "U6_R", else
+        "supra_m2". Molar relations take the mesiobuccal cusps of a side ("UL6MB" and "LL6MB"), else
+        the middles of the crowns ("U6_L" and "L6_L").
+    before : mapping of str to (3,) float64, mm, LPS, optional
+        Those before the operation, which determine the midsagittal plane and the horizontal.
+
+    Returns
+    -------
+    dict of str to float or None
+        By `Measure.key`, mm or degrees.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> sites = {"nasion": (0, -90, 30), "supradentale": (1.5, -93, -32)}
+    >>> cmfsim.occlusion(sites)["upper_midline"]
+    1.5
+    """
+    at_rest = landmarks if before is None else before
+    plane, flat = head_axes(at_rest), projected(landmarks, before)
+    left = np.cross(plane[1], plane[0])
+    found: dict[str, float | None] = {measure.key: None for measure in OCCLUSAL_MEASURES}
+    for measure in OCCLUSAL_MEASURES[:2]:
+        if all(name in flat for name in measure.sites):
+            sites = [flat[name] for name in measure.sites]
+            found[measure.key] = FORMULAS[measure.formula][0](*sites)
+    places = {name: np.asarray(place, dtype=np.float64) for name, place in landmarks.items()}
+    teeth = {known: places[name] for name in places if (known := tooth_of(name)) is not None}
+    middle = _middle(at_rest, left)
+    for key, tooth, bone in (
+        ("upper_midline", "U1", UPPER_MIDLINE),
+        ("lower_midline", "L1", LOWER_MIDLINE),
+    ):
+        pair = _sides(teeth, tooth)
+        site = places.get(bone) if pair is None else 0.5 * (pair[0] + pair[1])
+        if site is not None and middle is not None:
+            found[key] = float(site @ left) - middle
+    on_bone = {
+        ("U6", side, "O"): places[f"{MOLARS}_{side}"]
+        for side in "LR"
+        if f"{MOLARS}_{side}" in places
+    }
+    ends = _sides(teeth, "U6") or _sides(on_bone, "U6")
+    if ends is not None:
+        across = ends[0] - ends[1]
+        found["cant"] = float(np.degrees(np.arctan2(across @ plane[1], across @ left)))
+    for side, (cusp, offset) in itertools.product(("left", "right"), CLASS_I.items()):
+        upper, lower = (teeth.get((name, side[0].upper(), cusp)) for name in ("U6", "L6"))
+        if upper is None or lower is None or "OP-front" not in flat:
+            continue
+        if found[f"molar_{side}"] is None:
+            along = flat["OP-front"] - flat["OP-back"]
+            ahead = float(along @ (plane @ (upper - lower)) / np.hypot(*along))
+            found[f"molar_{side}"] = ahead - offset
+    return found
+
+
+def missing_for_occlusion(landmarks: Mapping[str, ArrayLike]) -> dict[str, str]:
+    """Why each of `OCCLUSAL_MEASURES` has no value, by its key; empty if it has one."""
+    edges = "edges of upper and lower incisors, or the occlusal plane: not given or found"
+    middle = "central incisors of both sides, the bone between them, or sites of the cranium"
+    reasons = {
+        **dict.fromkeys(("overjet", "overbite"), edges),
+        **dict.fromkeys(("upper_midline", "lower_midline"), f"{middle}: not given or found"),
+        "cant": "upper molars of both sides: not given or found",
+        **dict.fromkeys(("molar_left", "molar_right"), "U6 and L6 of the side: not given"),
+    }
+    values = occlusion(landmarks)
+    return {key: "" if values[key] is not None else why for key, why in reasons.items()}
+
+
+def _sides(
+    teeth: Mapping[tuple[str, str, str], Floats], tooth: str
+) -> tuple[Floats, Floats] | None:
+    """The places of a tooth on both sides, by the same cusp; None if they are not given."""
+    for cusp in ("O", "MB"):
+        one, other = (teeth.get((tooth, side, cusp)) for side in "LR")
+        if one is not None and other is not None:
+            return one, other
+    return None
+
+
+def _middle(landmarks: Mapping[str, ArrayLike], left: Floats) -> float | None:
+    """Where the midsagittal plane of a cranium cuts the direction to the left, mm."""
+    own = {
+        name: float(np.asarray(place, dtype=np.float64) @ left)
+        for name, place in landmarks.items()
+        if name in REFERENCE_PLACES["skull"]
+        and not is_lower_site(name)
+        and not name.startswith(OF_JAW)
+    }
+    pairs = [n[:-2] for n in own if n.endswith("_L") and f"{n[:-2]}_R" in own]
+    found = [0.5 * (own[f"{name}_L"] + own[f"{name}_R"]) for name in pairs]
+    found += [own[name] for name in MIDLINE if name in own]
+    return float(np.mean(found)) if found else None

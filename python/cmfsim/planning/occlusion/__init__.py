@@ -1,0 +1,18 @@
+"""Occlusion: how the tooth rows meet before and after the operation, and splints between them."""
+
+from cmfsim.planning.occlusion.contacts import ContactMap, contact_map, planned_contacts
+from cmfsim.planning.occlusion.rows import ToothRow, bite_sites, rigid_of, tooth_rows
+from cmfsim.planning.occlusion.splint import THICKNESS, Splint, splint_between
+
+__all__ = [
+    "THICKNESS",
+    "ContactMap",
+    "Splint",
+    "ToothRow",
+    "bite_sites",
+    "contact_map",
+    "planned_contacts",
+    "rigid_of",
+    "splint_between",
+    "tooth_rows",
+]

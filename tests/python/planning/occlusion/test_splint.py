@@ -1,0 +1,173 @@
+"""Splints against VTK's measurements: closed, thick enough, and teeth seat in them."""
+
+import numpy as np
+import pytest
+from tooth_row_heads import HINGE, closed_rows, rows_of
+
+import cmfsim
+import real_heads
+
+pv = pytest.importorskip("pyvista")
+modeling = pytest.importorskip("vtkmodules.vtkFiltersModeling")
+
+
+def shape_of(surface):
+    return pv.PolyData.from_regular_faces(np.asarray(surface.vertices), surface.triangles)
+
+
+def distance(points, surface):
+    """Signed distance of points from a closed surface by VTK, negative inside."""
+    cloud, shape = pv.PolyData(np.asarray(points)), shape_of(surface)
+    size = np.abs(cloud.compute_implicit_distance(shape)["implicit_distance"])
+    # The signs of that filter are wrong at some vertices: rays tell what lies inside.
+    enclosed = modeling.vtkSelectEnclosedPoints()
+    enclosed.SetInputData(cloud)
+    enclosed.SetSurfaceData(shape)
+    enclosed.Update()
+    inside = np.asarray(pv.wrap(enclosed.GetOutput())["SelectedPoints"], dtype=bool)
+    return np.where(inside, -size, size)
+
+
+@pytest.fixture(scope="module")
+def final():
+    """The splint of the closed bite of the synthetic head, opened as its refusal advises."""
+    upper, lower = closed_rows()
+    with pytest.raises(cmfsim.CaseError, match="splint-bite-closed") as refused:
+        cmfsim.splint_between(upper, lower, HINGE)
+    degrees = float(str(refused.value).split("--open ")[1].rstrip(")"))
+    assert 0.1 <= degrees < 3.0
+    return cmfsim.splint_between(upper, lower, HINGE, opening=degrees)
+
+
+@pytest.fixture(scope="module")
+def atlas():
+    """The splint of a real skull whose upper jaw is moved by 4 mm, in its own coordinates."""
+    names = {"upper": "cranium", "lower": "mandible"}
+    bones = {name: real_heads.read_ply("atlas_head", name) for name in names.values()}
+    sites = real_heads.landmarks("atlas_head")
+    level = cmfsim.ImageData(np.zeros((2, 2, 2), dtype=np.float32), (1, 1, 1))
+    anatomy = cmfsim.Anatomy(level, dict.fromkeys(names.values(), level), surfaces=bones)
+    segments = [cmfsim.BoneSegment(name, level, bone) for name, bone in bones.items()]
+    upper, lower = cmfsim.tooth_rows(anatomy, segments, sites)
+    moved = upper.moved(cmfsim.rigid_motion((0.0, -4.0, 1.0), 2.0, (1, 0, 0), upper.arch.tip))
+    heads = ((40.2, -100.4, 1513.2), (-39.6, -100.3, 1513.2))
+    return cmfsim.splint_between(moved, lower, heads, thickness=1.5, opening=3.0)
+
+
+@pytest.fixture(params=["final", "atlas"])
+def splint(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_a_splint_is_one_closed_surface_also_as_stl(splint, tmp_path):
+    """Checked on the file, whose numbers have single precision, by VTK as well."""
+    cmfsim.write_surface(tmp_path / "splint.stl", splint.surface)
+    shape = pv.read(tmp_path / "splint.stl").clean(tolerance=0.0)
+    assert shape.n_open_edges == 0
+    assert shape.is_manifold
+    assert len(np.unique(np.asarray(shape.connectivity()["RegionId"]))) == 1
+    assert shape.volume > 5000.0
+
+
+def test_teeth_seat_within_a_tenth_of_a_millimetre(splint):
+    """No crown lies deeper in the splint, and cusps touch the ground of their imprints."""
+    for row in (splint.upper, splint.lower):
+        crowns = row.surface.vertices[row.crowns]
+        assert -distance(crowns, splint.surface).min() <= 0.1
+        cusps = row.surface.vertices[[*row.cusps.values()]]
+        inside = np.abs(distance(cusps, splint.surface))
+        assert np.median(inside) < 0.1
+        assert (inside < 0.1).mean() > 0.8
+
+
+def test_no_undercut_holds_a_splint(splint):
+    """Pulled off either row along its axis, the splint never meets a crown more deeply."""
+    for row, way in ((splint.upper, -1.0), (splint.lower, 1.0)):
+        crowns = row.surface.vertices[row.crowns]
+        for far in (0.3, 1.0, 2.0):
+            # The row moves the other way.
+            found = distance(crowns - way * far * splint.axis, splint.surface)
+            assert -found.min() <= 0.15
+
+
+def test_walls_are_as_thick_as_asked_for(splint):
+    """By VTK: between the imprints, and from either imprint to the outside of the splint."""
+    least = 1.5
+    surface = splint.surface
+    assert splint.thickness >= least
+    vertices = surface.vertices
+    centres = vertices[surface.triangles].mean(axis=1)
+    up = np.abs(distance(centres, splint.upper.surface))
+    low = np.abs(distance(centres, splint.lower.surface))
+    in_upper, in_lower = centres[up < 0.1], centres[low < 0.1]
+    assert min(len(in_upper), len(in_lower)) > 1000
+    # The points of one imprint from the other row.
+    assert distance(in_upper, splint.lower.surface).min() >= least - 0.1
+    assert distance(in_lower, splint.upper.surface).min() >= least - 0.1
+
+
+def test_what_cannot_be_made_is_refused_with_its_remedy():
+    upper, lower = closed_rows()
+    for thickness in (1.4, 6.5):
+        with pytest.raises(cmfsim.CaseError, match=r"splint-thickness.*1\.5 to 6 mm"):
+            cmfsim.splint_between(upper, lower, HINGE, thickness=thickness)
+    with pytest.raises(cmfsim.CaseError, match=r"splint-opening.*0 to 15"):
+        cmfsim.splint_between(upper, lower, HINGE, opening=-1.0)
+    deep = lower.moved(cmfsim.rigid_motion((0.0, 0.0, 7.0)))
+    with pytest.raises(cmfsim.CaseError, match="splint-rows-overlap"):
+        cmfsim.splint_between(upper, deep, HINGE)
+
+
+def test_a_label_stands_out_of_the_front_alone(final):
+    matplotlib = pytest.importorskip("matplotlib")
+    assert matplotlib
+    hinge = (HINGE[0], HINGE[1])
+    made = cmfsim.splint_between(final.upper, final.lower, hinge, label="AB$1")
+    away = distance(made.surface.vertices, final.surface)
+    raised = made.surface.vertices[away > 0.1]
+    # In front of the arch, about the midline, and by the height of the letters.
+    assert len(raised) > 200
+    assert away.max() < 0.7
+    assert raised[:, 1].max() < final.upper.arch.tip[1] + 8.0
+    assert np.abs(raised[:, 0]).max() < 14.0
+    assert shape_of(made.surface).is_manifold
+    with pytest.raises(cmfsim.CaseError, match="splint-label"):
+        cmfsim.splint_between(final.upper, final.lower, hinge, label="a name that is too long")
+
+
+def test_a_jaw_without_teeth_has_no_row():
+    head = cmfsim.make_head()
+    upper, _ = rows_of(head, upper=("cranium",))
+    with pytest.raises(cmfsim.CaseError, match=r"upper jaw shows no tooth row \(splint-no-teeth\)"):
+        cmfsim.splint_between(upper, closed_rows()[1], HINGE)
+    empty = cmfsim.Anatomy(cmfsim.ImageData(np.zeros((2, 2, 2), dtype=np.float32), (1, 1, 1)), {})
+    with pytest.raises(cmfsim.CaseError, match="no tooth rows"):
+        cmfsim.tooth_rows(empty, [], {})
+
+
+def test_a_splint_follows_the_pose_of_the_head(final):
+    """The grid is that of the bite: a turned head has the same splint, but for rounding."""
+    motion = cmfsim.rigid_motion((50, -20, 1500), 20, (1, 1, 0))
+    rows = [row.moved(motion) for row in (final.upper, final.lower)]
+    hinge = np.asarray(HINGE) @ motion[:3, :3].T + motion[:3, 3]
+    turned = cmfsim.splint_between(*rows, (hinge[0], hinge[1]))
+    assert turned.thickness == pytest.approx(final.thickness, abs=1e-3)
+    np.testing.assert_allclose(turned.axis, motion[:3, :3] @ final.axis, atol=1e-6)
+    back = final.surface.vertices @ motion[:3, :3].T + motion[:3, 3]
+    assert np.abs(distance(back[::50], turned.surface)).max() < 0.05
+
+
+def test_teeth_on_two_pieces_are_refused():
+    """A split upper jaw has no one motion: its splint would hold teeth where they are not."""
+    upper, _ = closed_rows()
+    level = cmfsim.ImageData(np.zeros((2, 2, 2), dtype=np.float32), (1, 1, 1))
+    box = pv.Cube(
+        center=upper.arch.left + [2, 0, 0], x_length=4, y_length=4, z_length=4
+    ).triangulate()
+    piece = cmfsim.SurfaceData(np.asarray(box.points), box.regular_faces)
+    bones = {"cranium": upper.surface, "mandible": closed_rows()[1].surface}
+    anatomy = cmfsim.Anatomy(level, dict.fromkeys(bones, level), surfaces=bones)
+    segments = [cmfsim.BoneSegment(name, level, bone) for name, bone in bones.items()]
+    segments.append(cmfsim.BoneSegment("piece_left", level, piece))
+    with pytest.raises(cmfsim.CaseError, match=r"several segments \(splint-pieces\).*piece_left"):
+        cmfsim.tooth_rows(anatomy, segments, cmfsim.make_head().skull_landmarks)

@@ -1,0 +1,38 @@
+"""Tooth rows of a synthetic head, from the levels of its bones about the teeth."""
+
+import functools
+
+import numpy as np
+
+import cmfsim
+from cmfsim.surfaces.levels import surface_of_level
+
+# Voxels of the levels, mm, and the box about the teeth.
+SPACING = 0.8
+LOWEST, HIGHEST = np.array([-46.0, -104.0, -62.0]), np.array([46.0, -28.0, -24.0])
+# The joint heads of the synthetic head, left and right.
+HINGE = ((49.0, -11.0, -3.0), (-49.0, -11.0, -3.0))
+
+
+def level(head, *names):
+    """The level of bones together, mm near their surface."""
+    shape = np.ceil((HIGHEST - LOWEST) / SPACING).astype(int) + 1
+    grid = np.stack(np.indices(shape), axis=-1).reshape(-1, 3) * SPACING + LOWEST
+    values = np.max([head.bone_level(name, grid) for name in names], axis=0)
+    return cmfsim.ImageData(np.float32(values).reshape(shape), [SPACING] * 3, LOWEST)
+
+
+def rows_of(head, upper=("cranium", "upper_teeth"), lower=("mandible", "lower_teeth")):
+    """The rows of a head whose bones are made of these parts."""
+    levels = {"cranium": level(head, *upper), "mandible": level(head, *lower)}
+    anatomy = cmfsim.Anatomy(levels["cranium"], levels)
+    segments = [
+        cmfsim.BoneSegment(n, bone, surface_of_level(n, bone)) for n, bone in levels.items()
+    ]
+    return cmfsim.tooth_rows(anatomy, segments, head.skull_landmarks)
+
+
+@functools.cache
+def closed_rows():
+    """The upper and the lower row of the ordinary head, whose teeth are 1 mm apart."""
+    return rows_of(cmfsim.make_head())
