@@ -21,14 +21,9 @@ DEPTH = 110.0
 class MidlineProfile:
     """A polyline whose points lie on edges of a surface and move with it.
 
-    Attributes
-    ----------
-    ends : (n, 2) uint32
-        Vertices of the edge on which each point lies.
-    share : (n,) float64
-        Position along the edge, from 0 at its first vertex to 1.
-    points : (n, 3) float64, mm
-        From top to bottom.
+    ends: (n, 2) uint32. Vertices of the edge on which each point lies.
+    share: (n,). Position along the edge, from 0 at its first vertex to 1.
+    points: (n, 3), mm, from top to bottom.
     """
 
     ends: NDArray[np.uint32]
@@ -42,17 +37,9 @@ def midline_profile(surface: SurfaceData, landmarks: Mapping[str, ArrayLike]) ->
     The plane contains the direction P and the line that fits the landmarks best from above: a head
     that is tilted to the side has a tilted plane.
 
-    Parameters
-    ----------
-    surface : SurfaceData
-        The skin.
-    landmarks : mapping of str to (3,) float64, mm
-        On the skin; two or more of `MIDLINE`.
-
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) Fewer midline landmarks, or a plane that does not cut the skin there.
+    surface: The skin.
+    landmarks: mapping of str to (3,), mm, on the skin; two or more of `MIDLINE`.
+    Raises `LandmarkError`: Fewer midline landmarks, or a plane that does not cut the skin there.
     """
     known = [np.asarray(landmarks[name], dtype=np.float64) for name in MIDLINE if name in landmarks]
     if len(known) < LEAST_MIDLINE:

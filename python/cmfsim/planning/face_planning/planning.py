@@ -49,14 +49,10 @@ OPEN, OPEN_SHARE = 1e3, 0.25
 class Minimum:
     """The result of a search.
 
-    Attributes
-    ----------
-    x : (n,) float64
-    residuals : (m,) float64
-    jacobian : (m, n) float64
-    steps : int
-    converged : bool
-        Whether the next step is too small to matter, before the steps ran out.
+    x: (n,).
+    residuals: (m,).
+    jacobian: (m, n).
+    converged: Whether the next step is too small to matter, before the steps ran out.
     """
 
     x: Floats
@@ -71,13 +67,9 @@ def bounded_least_squares(
 ) -> Minimum:
     """The minimum of a sum of squares within bounds, found from a starting point.
 
-    Parameters
-    ----------
-    residuals : callable
-        Maps (n,) numbers to (m,) residuals.
-    start, low, high : (n,) float64
-    steps : int
-        Maximum number of steps.
+    residuals: Maps (n,) numbers to (m,) residuals.
+    start, low, high: (n,).
+    steps: Maximum number of steps.
     """
     x = np.clip(start, low, high)
     r = residuals(x)
@@ -240,10 +232,6 @@ def plan_for_face(
     search : FaceSearch, optional
     exact : bool
         Whether to solve the plan that was found exactly, with contact.
-
-    Returns
-    -------
-    FacePlan
 
     Raises
     ------

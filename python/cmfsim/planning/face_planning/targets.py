@@ -160,12 +160,8 @@ Target: TypeAlias = PointTarget | MeasureTarget | SurfaceTarget
 class Wish:
     """A target ready for the search.
 
-    Attributes
-    ----------
-    points : (n, 3) float64, mm
-        Of the face before the operation; may be none.
-    rows : callable
-        Of their places (n, 3), mm, and the plan: the residuals in standard deviations.
+    points: (n, 3), mm, of the face before the operation; may be none.
+    rows: Of their places (n, 3), mm, and the plan: the residuals in standard deviations.
     """
 
     points: Floats
@@ -175,11 +171,8 @@ class Wish:
 def wish_of(planning: PlanningModel, target: Target) -> Wish:
     """A target with the points of a patient's face on which it depends.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A measure whose sites the face lacks; points away from the tissue that
-        is simulated; a surface without a partner for any point.
+    Raises `CaseError`: A measure whose sites the face lacks; points away from the tissue that is
+        simulated; a surface without a partner for any point.
     """
     if isinstance(target, PointTarget):
         return _points_wish(planning, target)

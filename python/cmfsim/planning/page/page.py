@@ -26,10 +26,6 @@ def page_text(
         Whether the page requests exact solutions from the program that serves it; otherwise it
         makes no connection.
 
-    Returns
-    -------
-    str
-
     Raises
     ------
     CaseError

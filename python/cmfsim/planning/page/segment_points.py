@@ -54,11 +54,7 @@ ARCHES = {
 class SegmentPoint:
     """A point at which a segment's movement is stated.
 
-    Attributes
-    ----------
-    label : str
-    place : (3,) float64, mm
-        Before the operation.
+    place: (3,), mm, before the operation.
     """
 
     label: str
@@ -70,13 +66,8 @@ def segment_points(
 ) -> tuple[SegmentPoint, ...]:
     """The points of a segment: first that of its clinical motion, last the middle of its surface.
 
-    Parameters
-    ----------
-    segment : str
-    landmarks : mapping of str to (3,) float64, mm
-        Skull landmarks.
-    vertices : (v, 3) float64, mm
-        Of the segment's surface, before.
+    landmarks: mapping of str to (3,), mm. Skull landmarks.
+    vertices: (v, 3), mm, of the segment's surface, before.
     """
     known = {**_canines(landmarks), **landmarks}
     stated = clinical_motion(segment, np.eye(4), landmarks=landmarks, vertices=vertices)

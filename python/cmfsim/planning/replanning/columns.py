@@ -26,17 +26,11 @@ AGREEMENT = 1e-6
 class PlanColumns:
     """A linear map from the rigid motions of segments to displacements.
 
-    Attributes
-    ----------
-    segments : tuple of str
-        In the order of the columns.
-    centres : (s, 3) float64, mm, LPS
-        The point of each segment to which its columns refer.
-    matrix : (k, 3, 12 s) float64
-        For each node and axis: nine columns per segment for R − I, row by row, mm, and three for
-        the displacement of its centre.
-    offset : (k, 3) float64, mm
-        Displacements if no segment moves: contact closes gaps that exist at rest.
+    segments: In the order of the columns.
+    centres: (s, 3), mm, LPS. The point of each segment to which its columns refer.
+    matrix: (k, 3, 12 s), for each node and axis: nine columns per segment for R − I, row by row,
+        mm, and three for the displacement of its centre.
+    offset: (k, 3), mm. Displacements if no segment moves: contact closes gaps that exist at rest.
     """
 
     segments: tuple[str, ...]
@@ -61,10 +55,7 @@ class PlanColumns:
 def plan_columns(operator: PlanOperator) -> PlanColumns:
     """The columns of an operator with their centres, checked against its displacements.
 
-    Raises
-    ------
-    SolverError
-        The columns do not reproduce the displacements of the operator.
+    Raises `SolverError`: The columns do not reproduce the displacements of the operator.
     """
     names = tuple(operator.segments)
     rest = {name: np.eye(4) for name in names}

@@ -40,16 +40,10 @@ SMALL_SINE = 1e-9
 class PlanNumbers:
     """The numbers of a plan that a correction depends on.
 
-    Attributes
-    ----------
-    segments : tuple of str
-        Those that count; the motion of others changes nothing.
-    backwards : (s, 4, 4) float64, mm
-        The inverse of each segment's motion under the reference plan.
-    middles : (s, 3) float64, mm
-        The middle of each segment, before.
-    arms : (s,) float64, mm
-        By which rotations, in radians, are multiplied.
+    segments: Those that count; the motion of others changes nothing.
+    backwards: (s, 4, 4), mm. The inverse of each segment's motion under the reference plan.
+    middles: (s, 3), mm. The middle of each segment, before.
+    arms: (s,), mm, by which rotations, in radians, are multiplied.
     """
 
     segments: tuple[str, ...]
@@ -144,21 +138,11 @@ def fitted_correction(
 ) -> tuple[PlanCorrection, bool]:
     """The correction that interpolates errors of the operator, and whether it pays.
 
-    Parameters
-    ----------
-    numbers : PlanNumbers
-    plans : (n, s, 6) float64, mm
-        Their values at plans that were solved exactly; at least two.
-    distances : (n,) float64, mm
-        Of these plans from the reference.
-    errors : (n, k, 3) float64, mm
-        Exact displacements minus the operator's.
-
-    Returns
-    -------
-    correction : PlanCorrection
-    pays : bool
-        Whether the largest error at plans that are left out falls to `PAYS`, RMS over the plans.
+    plans: (n, s, 6), mm. Their values at plans that were solved exactly; at least two.
+    distances: (n,), mm, of these plans from the reference.
+    errors: (n, k, 3), mm. Exact displacements minus the operator's.
+    Returns `pays`: Whether the largest error at plans that are left out falls to `PAYS`, RMS over
+        the plans.
     """
     count, nodes, _ = errors.shape
     rows = errors.reshape(count, -1)

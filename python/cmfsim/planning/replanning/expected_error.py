@@ -186,10 +186,6 @@ def expected_error(
     progress : callable or bool, optional
         Called with the name of each stage as it begins; True shows a bar (tqdm).
 
-    Returns
-    -------
-    ExpectedError
-
     Raises
     ------
     CaseError

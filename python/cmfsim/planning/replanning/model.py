@@ -150,10 +150,6 @@ def planning_model(
     reference : mapping of str to (4, 4) float64, mm, optional
         The plan about which contact is linearised; default: the patient's own.
 
-    Returns
-    -------
-    PlanningModel
-
     Raises
     ------
     CaseError

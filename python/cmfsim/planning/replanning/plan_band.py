@@ -110,10 +110,6 @@ def plan_band(planning: PlanningModel, reference: Prediction) -> PlanBand:
     reference : Prediction
         Of its reference plan, with a band: `predict_with_band`.
 
-    Returns
-    -------
-    PlanBand
-
     Raises
     ------
     CaseError
