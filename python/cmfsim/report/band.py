@@ -25,12 +25,8 @@ CALIBRATED = (
 def band_section(band: Values, figures: list[Figure]) -> Section:
     """The band of one prediction.
 
-    Parameters
-    ----------
-    band : mapping
-        `SkinBand.as_dict()`.
-    figures : list of Figure
-        Its picture, where there is one.
+    band: `SkinBand.as_dict()`.
+    figures: Its picture, where there is one.
     """
     missing = Note("Not covered by the sources: " + "; ".join(band["not_covered"]) + ".")
     notes = [Note(f"{text}.") for text in band["notes"]]

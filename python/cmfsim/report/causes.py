@@ -11,10 +11,7 @@ Values = Mapping[str, Any]
 def not_operated_blocks(evaluation: Values) -> list[Note | Table]:
     """The error where nothing was operated on; that it is not known, where it is not.
 
-    Parameters
-    ----------
-    evaluation : mapping
-        What `metrics.json` holds.
+    evaluation: What `metrics.json` holds.
     """
     if "not_operated" not in evaluation:
         return []  # of an earlier version
@@ -80,12 +77,7 @@ def summary_blocks(evaluation: Values) -> list[Note | Table]:
 def statistics_table(regions: Mapping[str, Values], caption: str, of: str = "region") -> Table:
     """Statistics of signed distances by region.
 
-    Parameters
-    ----------
-    regions : mapping of str to mapping
-        `DistanceStatistics.as_dict()` by region, or by what `of` calls it.
-    caption : str
-    of : str
+    regions: `DistanceStatistics.as_dict()` by region, or by what `of` calls it.
     """
     columns = (of, "mean", "SD", "median", "RMS", "90 %", "95 %", "max", "signed", "< 2 mm")
     keys = ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm")

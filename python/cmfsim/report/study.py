@@ -28,11 +28,7 @@ PAPER_MUSCLES_SLIDING = (1.21, 2.14, 1.58, 2.56)
 def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document:
     """The report of a study.
 
-    Parameters
-    ----------
-    study : mapping
-        `StudyReport.as_dict()`.
-    figures : sequence of Figure
+    study: `StudyReport.as_dict()`.
     """
     models = tuple(study["models"])
     done = [case for case in study["cases"] if case["status"] != "failed"]
@@ -57,12 +53,8 @@ def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document
 def table3_text(study: Values, table: ErrorTable) -> str:
     """Table 3 of Kim et al. (2010) for a study, in Markdown, with the means that the paper states.
 
-    Parameters
-    ----------
-    study : mapping
-        `StudyReport.as_dict()`.
-    table : ErrorTable
-        Of the same study.
+    study: `StudyReport.as_dict()`.
+    table: Of the same study.
     """
     models = tuple(study["models"])
     blocks = [f"# {plain_line(study['cohort'])}: errors by patient and model"]

@@ -134,10 +134,7 @@ def _failures(values: Values) -> list[tuple[str, str]]:
 def variants_document(values: Values) -> Document:
     """The report of a study of variants.
 
-    Parameters
-    ----------
-    values : mapping
-        `VariantsReport.as_dict()`.
+    values: `VariantsReport.as_dict()`.
     """
     alerts = [
         Alert("error", f"{where} failed", tuple(error.splitlines()))
@@ -175,10 +172,7 @@ def _variants_table(values: Values) -> Table:
 def variants_text(values: Values) -> str:
     """The tables of a study of variants as plain text; the short ones come last.
 
-    Parameters
-    ----------
-    values : mapping
-        `VariantsReport.as_dict()`.
+    values: `VariantsReport.as_dict()`.
     """
     blocks = [note for note in (values["note"], values["description"]) if note]
     regions, patients = _tables(values)
@@ -189,10 +183,7 @@ def variants_text(values: Values) -> str:
 def variants_markdown(values: Values) -> str:
     """The tables of a study of variants in Markdown.
 
-    Parameters
-    ----------
-    values : mapping
-        `VariantsReport.as_dict()`.
+    values: `VariantsReport.as_dict()`.
     """
     blocks = [f"# {plain_line(values['cohort'])}: variants"]
     blocks += [plain_line(note) for note in (values["note"], values["description"]) if note]
