@@ -119,10 +119,6 @@ def leave_one_out(
     names : sequence of str, optional
         Their names; numbers without.
 
-    Returns
-    -------
-    LandmarkAgreement
-
     Raises
     ------
     RegistrationError, LandmarkError
@@ -188,12 +184,9 @@ def leave_one_out(
 class CommonShift:
     """A translation that brings landmarks onto their surface.
 
-    Attributes
-    ----------
-    offset : (3,) float64, mm
-        How far the landmarks are off: subtract it to bring them onto the surface.
-    before, after : float, mm
-        Mean distance from the surface, at most 6 mm each, as they are and without the offset.
+    offset: (3,), mm. How far the landmarks are off: subtract it to bring them onto the surface.
+    before, after: mm. Mean distance from the surface, at most 6 mm each, as they are and without
+        the offset.
     """
 
     offset: Floats
@@ -272,17 +265,9 @@ def common_shift(
 ) -> CommonShift | None:
     """The translation by which all points lie off a surface, or None where there is no telling.
 
-    Parameters
-    ----------
-    points : (n, 3) float64, mm
-    distances : callable
-        The distance of each of (k, 3) points from the surface, mm.
-    found : (n,) float64, mm
-        That of the points as they are.
-
-    Returns
-    -------
-    CommonShift or None
+    points: (n, 3), mm.
+    distances: The distance of each of (k, 3) points from the surface, mm.
+    found: (n,), mm. That of the points as they are.
     """
     before = float(np.minimum(found, MOST_DISTANCE).mean())
     if len(points) < LEAST_POINTS or before < CLOSE:

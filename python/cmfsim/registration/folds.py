@@ -62,10 +62,6 @@ def fold_report(warp: ThinPlateSpline, points: ArrayLike) -> FoldReport:
     points : (k, 3) array_like, mm
         Before the warp, such as the vertices of the muscles to be mapped.
 
-    Returns
-    -------
-    FoldReport
-
     Raises
     ------
     RegistrationError

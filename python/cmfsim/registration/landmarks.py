@@ -74,10 +74,6 @@ def match_landmarks(
     strict : bool
         Whether a landmark that only one set has is an error rather than a finding.
 
-    Returns
-    -------
-    LandmarkMatch
-
     Raises
     ------
     LandmarkError

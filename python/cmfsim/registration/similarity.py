@@ -16,14 +16,9 @@ def robust_similarity(
     Unlike `rigid_fit`, it gives outliers little weight, and fits points in a line by any of the
     similarities that fit them alike.
 
-    Parameters
-    ----------
-    source, target : (n, 3) float64, mm
-    weight : (n,) float64
-        Of each pair where it fits.
-    half_distance : float, mm
-        The distance at which a pair counts half.
-    rounds : int
+    source, target: (n, 3), mm.
+    weight: (n,), of each pair where it fits.
+    half_distance: mm. The distance at which a pair counts half.
     """
     own = weight
     linear, offset, scale = np.eye(3), np.zeros(3), 1.0

@@ -45,12 +45,8 @@ ROW_SIDE, ROW_BACK = 50.0, 52.0
 class JawEvidence:
     """Evidence against the jaw of a head.
 
-    Attributes
-    ----------
-    impossible : str
-        Why it cannot be a lower jaw; empty where it can.
-    doubts : tuple of str
-        Why its sites, and those of the upper tooth row, may be wrong.
+    impossible: Why it cannot be a lower jaw; empty where it can.
+    doubts: Why its sites, and those of the upper tooth row, may be wrong.
     """
 
     impossible: str
@@ -67,16 +63,11 @@ def jaw_evidence(
 ) -> JawEvidence:
     """Evidence against a jaw.
 
-    Parameters
-    ----------
-    sites : mapping of str to (3,) float64
-        Of the skull, in the frame and size of the average head, with the edges of the incisors as
-        "_upper_edge" and "_lower_edge".
-    lower : SurfaceData
-        The mandible, mm.
-    pose : Pose
-    left_out : mapping of str to float
-        Sites of the jaw that do not fit the others, with how far they are off, average-head mm.
+    sites: mapping of str to (3,), of the skull, in the frame and size of the average head, with the
+        edges of the incisors as "_upper_edge" and "_lower_edge".
+    lower: The mandible, mm.
+    left_out: Sites of the jaw that do not fit the others, with how far they are off, average-head
+        mm.
     """
     volume = _volume(lower) / pose.size**3
     impossible = "; ".join(_impossible(sites, volume, pose.size))
@@ -177,13 +168,8 @@ def separation_points(
     the incisors put them. Where the incisors are not known, nothing of the jaws is trusted: teeth
     and chin are then those of the average head in the cranium's pose, which is rough.
 
-    Parameters
-    ----------
-    sites : mapping of str to ProposedSite
-        Of the skull.
-    pose : Pose
-    average : mapping of str to (3,) float64
-        Sites of the average head, in its frame.
+    sites: Of the skull.
+    average: mapping of str to (3,). Sites of the average head, in its frame.
     """
     points = {n: s.point for n, s in sites.items() if not n.startswith(BACK_SITES)}
     if not {"supradentale", "infradentale"} <= points.keys():

@@ -68,11 +68,8 @@ ABOVE_CHIN = ("subnasale", "labiale_superius", "labiale_inferius", "alare", "che
 class MissingSites:
     """Sites that were not found, with the reason.
 
-    Attributes
-    ----------
-    skull, skin : mapping of str to str
-    misfits : mapping of str to float, mm
-        Sites of the skull that were found, but where the others of no average head put them.
+    misfits: mm. Sites of the skull that were found, but where the others of no average head put
+        them.
     """
 
     skull: Mapping[str, str]

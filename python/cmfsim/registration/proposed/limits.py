@@ -20,14 +20,9 @@ ENDS = (("right", "left"), ("front", "back"), ("bottom", "top"))
 class CutPlane:
     """A plane across an axis at which a head is cut off.
 
-    Attributes
-    ----------
-    name : str
-        "right", "left", "front", "back", "bottom" or "top" border of the image.
-    axis : int
-    sign : float
-        1 where the head would go on towards higher coordinates.
-    place : float, mm
+    name: "right", "left", "front", "back", "bottom" or "top" border of the image.
+    sign: 1 where the head would go on towards higher coordinates.
+    place: mm.
     """
 
     name: str

@@ -35,16 +35,10 @@ Samples = tuple[Floats, Floats]
 class Pose:
     """How a head lies: p' = axes (p − origin), in mm, with x' to the left, y' back, z' up.
 
-    Attributes
-    ----------
-    origin : (3,) float64, mm
-        Where the middle between the ear canals would lie.
-    axes : (3, 3) float64
-        Its rows are the directions left, back and up.
-    size : float
-        Of the head, as a factor on the average head.
-    residual : float, mm
-        Root of the mean square distance of the kept points from the average head.
+    origin: (3,), mm, where the middle between the ear canals would lie.
+    axes: (3, 3). Its rows are the directions left, back and up.
+    size: Of the head, as a factor on the average head.
+    residual: mm. Root of the mean square distance of the kept points from the average head.
     """
 
     origin: Floats
@@ -96,14 +90,9 @@ def refined_pose(start: Pose, bones: SurfaceData, average: SurfaceData) -> Pose:
 
     What the bones do not show, such as a plane of symmetry of half a head, stays as it is.
 
-    Parameters
-    ----------
-    start : Pose
-        Of the model of shape, right to some degrees.
-    bones : SurfaceData
-        Cranium of the patient; parts may be missing.
-    average : SurfaceData
-        Cranium of a whole head in its own frame: x = 0 its plane of symmetry.
+    start: Of the model of shape, right to some degrees.
+    bones: Cranium of the patient; parts may be missing.
+    average: Cranium of a whole head in its own frame: x = 0 its plane of symmetry.
     """
     points, normals = surface_samples(bones, SAMPLES)
     pose = _even(start, bones, (points, normals))
@@ -193,11 +182,8 @@ def levelled(pose: Pose, found: Mapping[str, Floats], average: Mapping[str, Floa
 
     Skulls differ more in the vault than in how the face lies below it. The plane of symmetry stays.
 
-    Parameters
-    ----------
-    pose : Pose
-    found, average : mapping of str to (3,) float64
-        Sites as found in that pose, average-head mm, and those of the average head.
+    found, average: mapping of str to (3,). Sites as found in that pose, average-head mm, and those
+        of the average head.
     """
     names = [name for name in LEVEL_SITES if name in found and name in average]
     if len(names) < LEAST_LEVEL_SITES:
@@ -249,13 +235,10 @@ def distance_from(points: Floats, normals: Floats, template: SurfaceData) -> flo
 class _Similarity:
     """A similarity in the plane x = 0 as it is fitted.
 
-    Attributes
-    ----------
-    linear : (3, 3) float64
-    offset : (3,) float64, mm
-    distance : float, mm
-        Of the points from the surface in the last round, in the patient's size; infinite where
-        too few pairs are left.
+    linear: (3, 3).
+    offset: (3,), mm.
+    distance: mm, of the points from the surface in the last round, in the patient's size; infinite
+        where too few pairs are left.
     """
 
     linear: Floats

@@ -13,23 +13,13 @@ from cmfsim.values.surface_data import SurfaceData
 class TemplateHead(Frozen):
     """A head whose landmarks are known.
 
-    Attributes
-    ----------
-    name : str
-    bones : mapping of str to SurfaceData
-        "cranium" and "mandible", LPS mm; the mandible apart, as far as it is known.
-    skull : mapping of str to (3,) float64, mm
-        Its skull landmarks by label.
-    skin : SurfaceData or None
-    skin_landmarks : mapping of str to (3,) float64, mm
-    biases : tuple of two mappings of str to (3,) float64, mm, or None
-        How far the landmarks of skull and skin lie from where their definitions put them on this
-        head, in its own frame; None where that has to be measured.
-
-    Raises
-    ------
-    LandmarkError
-        (also `ValueError`) No cranium, or no skull landmarks.
+    bones: "cranium" and "mandible", LPS mm; the mandible apart, as far as it is known.
+    skull: mapping of str to (3,), mm. Its skull landmarks by label.
+    skin_landmarks: mapping of str to (3,), mm.
+    biases: tuple of two mappings of str to (3,), mm, or None. How far the landmarks of skull and
+        skin lie from where their definitions put them on this head, in its own frame; None where
+        that has to be measured.
+    Raises `LandmarkError`: No cranium, or no skull landmarks.
     """
 
     name: str

@@ -18,12 +18,9 @@ FILL = 3
 class DepthMap:
     """The first coordinate that a ray meets, over the two others.
 
-    Attributes
-    ----------
-    low : (2,) float64, mm
-        Centre of the first cell.
-    values : (n, k) float64, mm
-        Signed coordinate along the view, the nearest is the least; NaN where a ray meets nothing.
+    low: (2,), mm. Centre of the first cell.
+    values: (n, k), mm. Signed coordinate along the view, the nearest is the least; NaN where a ray
+        meets nothing.
     """
 
     low: Floats
@@ -79,15 +76,11 @@ def depth_map(
 ) -> DepthMap:
     """The depth map of points that lie densely on a surface.
 
-    Parameters
-    ----------
-    points : (n, 3) float64, mm
-    view : three of 0, 1, 2
-        The axes of the map's rows and columns, and the axis that is looked along.
-    sign : float
-        1 looks along the axis, −1 against it.
-    reach : four float, mm
-        First and last place of the rows, then of the columns.
+    points: (n, 3), mm.
+    view: three of 0, 1, 2. The axes of the map's rows and columns, and the axis that is looked
+        along.
+    sign: 1 looks along the axis, −1 against it.
+    reach: mm. First and last place of the rows, then of the columns.
     """
     low = np.array([reach[0], reach[2]])
     shape = (int((reach[1] - reach[0]) / STEP) + 1, int((reach[3] - reach[2]) / STEP) + 1)

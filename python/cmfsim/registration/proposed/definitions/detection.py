@@ -38,11 +38,7 @@ class Detected:
 class HeadSurfaces:
     """The surfaces of a head, with points that lie densely on each, (n, 3) mm, made once.
 
-    Attributes
-    ----------
-    upper : SurfaceData
-        The bones without the mandible.
-    lower, skin : SurfaceData or None
+    upper: The bones without the mandible.
     """
 
     upper: SurfaceData

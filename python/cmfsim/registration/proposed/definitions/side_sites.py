@@ -16,16 +16,10 @@ Sites = dict[str, Floats]
 class SideView:
     """One side of a skull, the right one mirrored: what is found has a positive x.
 
-    Attributes
-    ----------
-    letter : str
-        "L" or "R".
-    side : float
-        1 on the left, −1 on the right.
-    front, outer, jaw : DepthMap
-        The cranium from in front, not mirrored; cranium and mandible from this side.
-    mandible : (n, 3) float64
-        Points of the mandible, mirrored for the right side.
+    letter: "L" or "R".
+    side: 1 on the left, −1 on the right.
+    front, outer, jaw: The cranium from in front, not mirrored; cranium and mandible from this side.
+    mandible: (n, 3). Points of the mandible, mirrored for the right side.
     """
 
     letter: str

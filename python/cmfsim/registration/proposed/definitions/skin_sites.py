@@ -27,12 +27,8 @@ Sites = dict[str, Floats]
 def find_skin_sites(front: DepthMap, skull: Mapping[str, Floats]) -> Sites:
     """The sites of the skin that are found, (3,) each, average-head mm.
 
-    Parameters
-    ----------
-    front : DepthMap
-        Of the skin, over x and z: y.
-    skull : mapping of str to (3,) float64
-        What `find_skull_sites` found.
+    front: Of the skin, over x and z: y.
+    skull: mapping of str to (3,). What `find_skull_sites` found.
     """
     found: Sites = {}
     if "nasion" in skull:

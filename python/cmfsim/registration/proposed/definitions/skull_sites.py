@@ -25,15 +25,11 @@ from cmfsim.values.checks import Floats
 class SkullViews:
     """Depth maps of the bones in the frame of an average head: x left, y back, z up, mm.
 
-    Attributes
-    ----------
-    cranium_front, mandible_front : DepthMap
-        Over x and z, from in front: y.
-    cranium_sides, mandible_sides : tuple of DepthMap
-        Over y and z, from the left and from the right: the negative distance from the midline.
-    mandible : (n, 3) float64
-        Points of the mandible; empty where it is not known apart.
-    cranium : (n, 3) float64
+    cranium_front, mandible_front: Over x and z, from in front: y.
+    cranium_sides, mandible_sides: Over y and z, from the left and from the right: the negative
+        distance from the midline.
+    mandible: (n, 3). Points of the mandible; empty where it is not known apart.
+    cranium: (n, 3).
     """
 
     cranium_front: DepthMap

@@ -42,20 +42,14 @@ Known = Mapping[int, tuple[Floats, float]]
 class Evidence:
     """A round of the fit.
 
-    Attributes
-    ----------
-    state : State
-    precision : (7 + 6 + r, 7 + 6 + r) float64
-        Of a step of the pose (in lengths), of jaw and of shape; r modes as in `modes`.
-    modes : (r,) int
-        The modes that took part.
-    seen : (n,) bool
-        Points of the model that the image shows.
-    gaps : (n,) float64, mm
-        Distances of the model's points from the patient's surface along its normal, in the model's
-        size; NaN where that was not asked.
-    score : float, mm
-        Mean capped distance, both ways between patient and visible model, in the patient's size.
+    precision: (7 + 6 + r, 7 + 6 + r), of a step of the pose (in lengths), of jaw and of shape; r
+        modes as in `modes`.
+    modes: (r,) int. The modes that took part.
+    seen: (n,) bool. Points of the model that the image shows.
+    gaps: (n,), mm. Distances of the model's points from the patient's surface along its normal, in
+        the model's size; NaN where that was not asked.
+    score: mm. Mean capped distance, both ways between patient and visible model, in the patient's
+        size.
     """
 
     state: State
@@ -86,18 +80,11 @@ def refined(
 ) -> Evidence:
     """Pose, jaw and shape by steps to tangent planes in both directions.
 
-    Parameters
-    ----------
-    model : HeadModel
-    samples : HeadSamples
-    state : State
-        To begin with.
-    schedule : sequence of (float, int)
-        Of each round: the noise, mm, and how many of the modes take part, those that move most.
-    known : mapping, optional
-        Sites whose place is known.
-    still_jaw : bool
-        Whether the jaw stays where it is against the cranium.
+    state: To begin with.
+    schedule: Of each round: the noise, mm, and how many of the modes take part, those that move
+        most.
+    known: Sites whose place is known.
+    still_jaw: Whether the jaw stays where it is against the cranium.
     """
     evidence = None
     for noise, count in schedule:

@@ -39,15 +39,10 @@ class Cylinder:
 class HeadSamples:
     """Points of a head of unknown pose, LPS mm, with outward unit normals, (n, 3) each.
 
-    Attributes
-    ----------
-    bone, bone_normals : (n, 3) float64
-    skin, skin_normals : (k, 3) float64
-        None where there is no skin.
-    low, high : (3,) float64, mm
-        Between them the image shows the head; infinite where it does not end.
-    field : Cylinder or None
-        The round field of view that cuts the head.
+    bone, bone_normals: (n, 3).
+    skin, skin_normals: (k, 3). None where there is no skin.
+    low, high: (3,), mm, between them the image shows the head; infinite where it does not end.
+    field: The round field of view that cuts the head.
     """
 
     bone: Floats

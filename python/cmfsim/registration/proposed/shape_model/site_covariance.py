@@ -51,14 +51,9 @@ SiteKey = tuple[str, str]
 class SiteDistribution:
     """Where the landmarks of a head are expected, and how their errors depend on one another.
 
-    Attributes
-    ----------
-    names : tuple of (str, str)
-        Kind and label.
-    mean : (n, 3) float64, mm
-        The proposed points; of a missing site where the others place it.
-    covariance : (3 n, 3 n) float64, mm²
-        Of the errors of `mean`, by site and axis.
+    names: Kind and label.
+    mean: (n, 3), mm. The proposed points; of a missing site where the others place it.
+    covariance: (3 n, 3 n), mm², of the errors of `mean`, by site and axis.
     """
 
     names: tuple[SiteKey, ...]
@@ -70,11 +65,8 @@ class SiteDistribution:
     ) -> "SiteDistribution":
         """The distribution once some sites are known: the conditional mean and covariance.
 
-        Parameters
-        ----------
-        points : mapping of (kind, label) to (3,) float64, mm
-        stds : mapping of (kind, label) to float, mm
-            How far a point may be off along each axis; `PLACED_STD` for those that it lacks.
+        points: mapping of (kind, label) to (3,), mm.
+        stds: mm. How far a point may be off along each axis; `PLACED_STD` for those that it lacks.
         """
         stds = stds or {}
         known = [i for i, name in enumerate(self.names) if name in points]
@@ -97,13 +89,9 @@ class SiteDistribution:
 def site_covariance(proposal: ProposedLandmarks, bone: Floats) -> SiteDistribution:
     """The distribution of the landmarks of a head for which some were proposed.
 
-    Parameters
-    ----------
-    proposal : ProposedLandmarks
-        Sites with their expected errors. If there are fewer than three, the pose is a guess from
-        the extent of the bone, and uncertain.
-    bone : (n, 3) float64, mm
-        Vertices of the bones.
+    proposal: Sites with their expected errors. If there are fewer than three, the pose is a guess
+        from the extent of the bone, and uncertain.
+    bone: (n, 3), mm. Vertices of the bones.
 
     Notes
     -----

@@ -19,15 +19,10 @@ POSE_UNITS = np.array([80.0, 80.0, 80.0, 80.0, 1.0, 1.0, 1.0])
 class State:
     """A head of the model: its points are linear · (patient) + offset.
 
-    Attributes
-    ----------
-    linear : (3, 3) float64
-        From the patient's frame to the model's: a rotation times a scale.
-    offset : (3,) float64, mm
-    jaw : (6,) float64
-        Rigid motion of the mandible, in standard deviations.
-    shape : (r,) float64
-        Coefficients of the modes, in standard deviations.
+    linear: (3, 3), from the patient's frame to the model's: a rotation times a scale.
+    offset: (3,), mm.
+    jaw: (6,). Rigid motion of the mandible, in standard deviations.
+    shape: (r,). Coefficients of the modes, in standard deviations.
     """
 
     linear: Floats
@@ -80,12 +75,9 @@ def jaw_rotation(jaw: Floats) -> Floats:
 def moved_with_jaw(points: Floats, share: Floats, jaw: Floats) -> tuple[Floats, Floats]:
     """Points moved with the jaw, (n, 3), and their derivatives by its coefficients, (n, 3, 6).
 
-    Parameters
-    ----------
-    points : (n, 3) float64, mm
-    share : (n,) float64
-        How far each follows.
-    jaw : (6,) float64
+    points: (n, 3), mm.
+    share: (n,). How far each follows.
+    jaw: (6,).
     """
     about = points - HINGE
     turned = about @ jaw_rotation(jaw).T
