@@ -20,12 +20,8 @@ RIM = 2.0
 class RoundField:
     """A cylinder along z.
 
-    Attributes
-    ----------
-    middle : (2,) float64
-        Of its axis along x and y, voxels (or mm).
-    radii : (2,) float64
-        Its half widths along x and y, voxels (or mm).
+    middle: (2,), of its axis along x and y, voxels (or mm).
+    radii: (2,). Its half widths along x and y, voxels (or mm).
     """
 
     middle: NDArray[np.float64]

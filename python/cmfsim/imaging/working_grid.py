@@ -47,19 +47,14 @@ OPENING = 12.0
 class Working:
     """HU on the working grid.
 
-    Attributes
-    ----------
-    hu : (nx, ny, nz) float32
-        Fortran order.
-    spacing, origin : (3,) float64, mm
-    border : (2, 3) bool
-        Whether the first and the last layer along each axis is the image's own border.
-    native : (3,) float64, mm
-        Voxel size of the image.
-    saturation : float, HU
-        The value at which the image's brightest voxels were cut off; infinite where they were not.
-    field : RoundField or None, mm
-        The round field of view; None where the image shows a box.
+    hu: (nx, ny, nz) float32. Fortran order.
+    spacing, origin: (3,), mm.
+    border: (2, 3) bool. Whether the first and the last layer along each axis is the image's own
+        border.
+    native: (3,), mm. Voxel size of the image.
+    saturation: HU. The value at which the image's brightest voxels were cut off; infinite where
+        they were not.
+    field: mm. The round field of view; None where the image shows a box.
     """
 
     hu: Volume

@@ -66,19 +66,13 @@ SEAL_PART = 0.6
 class Bone:
     """Bone on the working grid.
 
-    Attributes
-    ----------
-    hu : (nx, ny, nz) float32
-        What bone was found in: streaks of metal are taken out.
-    surface : (nx, ny, nz) float32
-        HU whose surface of bone lies at the threshold: see `at_half_height`.
-    mask : (nx, ny, nz) bool
-        Bone and the hollows in it.
-    solid : (nx, ny, nz) bool
-        Bone alone.
-    cavity : (nx, ny, nz) bool or None
-        Where the brain is; None where no skull encloses it in the image.
-    findings : tuple of Finding
+    hu: (nx, ny, nz) float32. What bone was found in: streaks of metal are taken out.
+    surface: (nx, ny, nz) float32. HU whose surface of bone lies at the threshold: see
+        `at_half_height`.
+    mask: (nx, ny, nz) bool. Bone and the hollows in it.
+    solid: (nx, ny, nz) bool. Bone alone.
+    cavity: (nx, ny, nz) bool or None, where the brain is; None where no skull encloses it in the
+        image.
     """
 
     hu: Volume

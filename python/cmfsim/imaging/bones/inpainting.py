@@ -48,16 +48,11 @@ TOGETHER = 16
 class Projector:
     """The rays of slices of one size.
 
-    Attributes
-    ----------
-    shares : (rays, pixels) sparse float32
-        By linear interpolation between neighbouring rays; those of one direction follow each other.
-    rays : int
-        In each direction.
-    area : float, mm²
-        Of a pixel.
-    step : float, mm
-        Between rays.
+    shares: (rays, pixels) sparse float32, by linear interpolation between neighbouring rays; those
+        of one direction follow each other.
+    rays: In each direction.
+    area: mm², of a pixel.
+    step: mm, between rays.
     """
 
     shares: Any

@@ -59,14 +59,10 @@ BONE_WIDTHS = (1.4, 3.0, 1.5)
 class Metal:
     """Metal in an image.
 
-    Attributes
-    ----------
-    mask : (nx, ny, nz) bool or None
-    layers : slice
-        The slices with streaks.
-    hu : (nx, ny, nz) float32
-        The image with streaks reduced in those slices; itself where there are none.
-    findings : tuple of Finding
+    mask: (nx, ny, nz) bool or None.
+    layers: The slices with streaks.
+    hu: (nx, ny, nz) float32. The image with streaks reduced in those slices; itself where there are
+        none.
     """
 
     mask: Mask | None

@@ -179,12 +179,8 @@ def _stated(sample: NDArray[np.float64], slope: float, intercept: float) -> Cali
 def saturation_of(values: NDArray[Any], voxel: float, scale: Calibration) -> float:
     """The value at which the brightest voxels were cut off, HU; infinite where they were not.
 
-    Parameters
-    ----------
-    values : array
-        Of the image as read: averages would hide a common value.
-    voxel : float, mm³
-    scale : Calibration
+    values: Of the image as read: averages would hide a common value.
+    voxel: mm³.
     """
     top = values.max()
     count = int(np.count_nonzero(values == top))
@@ -300,11 +296,8 @@ def weak_bone(hu: Volume, threshold: float) -> tuple[Finding, ...]:
 def check_is_ct(hu: Volume, spacing: NDArray[np.float64]) -> None:
     """Refuses an MR image: bright below the skin rather than deeper, and dark where bone is.
 
-    Parameters
-    ----------
-    hu : (nx, ny, nz) float32
-        As calibrated, on voxels of some 2 mm.
-    spacing : (3,) float64, mm
+    hu: (nx, ny, nz) float32. As calibrated, on voxels of some 2 mm.
+    spacing: (3,), mm.
     """
     tissue: Mask = np.asfortranarray(hu > 0.5 * (AIR + SOFT))
     thick = opened(tissue, OPENING, spacing)

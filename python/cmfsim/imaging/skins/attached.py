@@ -73,10 +73,8 @@ SAMPLES = 4000
 class _Head:
     """The inside of the head in voxels of about `STEP`.
 
-    Attributes
-    ----------
-    mask : (nx, ny, nz) bool
-    spacing, origin : (3,) float64, mm
+    mask: (nx, ny, nz) bool.
+    spacing, origin: (3,), mm.
     """
 
     mask: Mask
@@ -103,12 +101,8 @@ class _Head:
 class _Thing:
     """What is on the face.
 
-    Attributes
-    ----------
-    middle, size : (3,) float64, mm
-    volume : float, mm³
-        Not known of what lies flat: 0.
-    kind : str
+    middle, size: (3,), mm.
+    volume: mm³. Not known of what lies flat: 0.
     """
 
     middle: NDArray[np.float64]

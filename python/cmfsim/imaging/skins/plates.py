@@ -60,12 +60,10 @@ BORDER = 2.0
 class _Skin:
     """The voxels just inside the surface of the face, on a part of the grid.
 
-    Attributes
-    ----------
-    level : (nx, ny, nz) float32
-    shell, cut_off : (nx, ny, nz) bool
-        Those that are looked at, and those beyond, where the face ends.
-    spacing : (3,) float64, mm
+    level: (nx, ny, nz) float32.
+    shell, cut_off: (nx, ny, nz) bool. Those that are looked at, and those beyond, where the face
+        ends.
+    spacing: (3,), mm.
     """
 
     level: Volume
@@ -100,13 +98,9 @@ class _Skin:
 def find_plates(level: Volume, spacing: NDArray[np.float64], behind: int) -> list[NDArray[np.intp]]:
     """The voxels, (n, 3) each, of pieces of the skin that stand out within a step.
 
-    Parameters
-    ----------
-    level : (nx, ny, nz) float32
-        The skin's, positive inside; on voxels of about `STEP`.
-    spacing : (3,) float64, mm
-    behind : int
-        Layers along y from this on are not of the face.
+    level: (nx, ny, nz) float32. The skin's, positive inside; on voxels of about `STEP`.
+    spacing: (3,), mm.
+    behind: Layers along y from this on are not of the face.
     """
     rows = np.flatnonzero((level > 0.0).any(axis=(0, 2)))
     if not len(rows) or rows[0] >= behind:

@@ -82,16 +82,11 @@ HEAD_HEIGHT = 220.0
 class Skin:
     """The head's inside, hollows included, on the block of the working grid that holds it.
 
-    Attributes
-    ----------
-    box : tuple of slice
-        The block; outside it nothing is head.
-    level_to_come : future of (nx, ny, nz) float32
-        Computed while other things are found by the mask.
-    mask : (nx, ny, nz) bool
-    hollow : (nx, ny, nz) bool
-        Inside and below the skin's threshold.
-    findings : tuple of Finding
+    box: The block; outside it nothing is head.
+    level_to_come: future of (nx, ny, nz) float32. Computed while other things are found by the
+        mask.
+    mask: (nx, ny, nz) bool.
+    hollow: (nx, ny, nz) bool. Inside and below the skin's threshold.
     """
 
     box: Block
@@ -157,12 +152,9 @@ def weak_tissue(hu: Volume, spacing: NDArray[np.float64], threshold: float) -> V
     Where the fixed level loses tissue by that, the skin lies half-way between air and the densest
     tissue around; everywhere else nothing is added.
 
-    Parameters
-    ----------
-    hu : (nx, ny, nz) float32
-        On voxels of some 2.5 mm.
-    spacing : (3,) float64, mm
-    threshold : float, HU
+    hu: (nx, ny, nz) float32, on voxels of some 2.5 mm.
+    spacing: (3,), mm.
+    threshold: HU.
     """
     tissue = hu > threshold
     if not tissue.any():

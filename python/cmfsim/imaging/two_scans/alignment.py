@@ -323,10 +323,6 @@ def register_volumes(
         Rigid motion to start from; by default the positions stated in the files.
     options : AlignmentOptions, optional
 
-    Returns
-    -------
-    VolumeAlignment
-
     Raises
     ------
     RegistrationError
