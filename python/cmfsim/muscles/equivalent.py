@@ -48,11 +48,8 @@ Muscles = HasMuscles | Sequence[MuscleSurface | SurfaceData | Surface]
 class PreparedMuscles:
     """Muscles with what is found on them before a mesh is known.
 
-    Attributes
-    ----------
-    named : mapping of str to MuscleSurface, SurfaceData or Surface
-    ready : sequence of (Surface, MuscleFibres)
-        Of each, in the same order.
+    named: SurfaceData or Surface.
+    ready: Of each, in the same order.
     """
 
     named: Mapping[str, MuscleSurface | SurfaceData | Surface]
@@ -62,14 +59,8 @@ class PreparedMuscles:
 def prepared_muscles(muscles: Muscles) -> PreparedMuscles:
     """The muscles with their search trees and fibres, to be sampled in a mesh later.
 
-    Parameters
-    ----------
-    muscles : Musculature, morphed template, or sequence of MuscleSurface, SurfaceData or Surface
-
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) As `equivalent_material`.
+    muscles: morphed template, or sequence of MuscleSurface, SurfaceData or Surface.
+    Raises `MeshError`: As `equivalent_material`.
     """
     named = _named(muscles)
     with ThreadPoolExecutor() as pool:  # most of the work is the core's, without the GIL
@@ -157,10 +148,6 @@ class Mixture:
     def muscle_fraction(self, name: str) -> Floats:
         """The volume fraction of one muscle in each tet, (m,) float64, overlaps shared.
 
-        Parameters
-        ----------
-        name : str
-
         Raises
         ------
         KeyError
@@ -218,10 +205,6 @@ def equivalent_material(
         away (the paper), which is correct for closed surfaces that do not overlap themselves.
     moduli : TissueModuli, optional
         Moduli (MPa) of fat, of all muscles or of single ones instead of the preset's.
-
-    Returns
-    -------
-    Mixture
 
     Raises
     ------

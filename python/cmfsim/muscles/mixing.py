@@ -23,19 +23,9 @@ def mixed_tissue(
     E = E_fat (1 − p) + Σ p_i E_i along and across the mean fibre, and ν likewise; "stiffness" mixes
     C = C_fat (1 − p) + Σ p_i C_i(a_i). Both are the rules of the presets where all E_i are equal.
 
-    Parameters
-    ----------
-    shares : MuscleShares
-    names : sequence of str
-        Of the muscles, in the order of the shares.
-    moduli : TissueModuli
-        Without gaps.
-    mixing : str
-
-    Returns
-    -------
-    tuple of Tissue and TissueData or None
-        None for "stiffness", whose arrays are those of the tissue.
+    names: Of the muscles, in the order of the shares.
+    moduli: Without gaps.
+    Returns: None for "stiffness", whose arrays are those of the tissue.
     """
     rows = [moduli.muscles.get(name, moduli.muscle) for name in names]
     table = np.array([row.constants() for row in rows], dtype=np.float64).reshape(-1, 3)
@@ -74,16 +64,8 @@ def _by_stiffness(shares: MuscleShares, table: Floats, fat: Tissue) -> Tissue:
 def check_muscle_names(moduli: TissueModuli, names: Sequence[str]) -> None:
     """Raises an error if moduli are given for a muscle that is not there.
 
-    Parameters
-    ----------
-    moduli : TissueModuli
-    names : sequence of str
-        Of the muscles.
-
-    Raises
-    ------
-    MaterialError
-        (also `ValueError`) With the nearest name, and all of them.
+    names: Of the muscles.
+    Raises `MaterialError`: With the nearest name, and all of them.
     """
     for name in moduli.muscles:
         if name not in names:
@@ -97,12 +79,7 @@ def check_muscle_names(moduli: TissueModuli, names: Sequence[str]) -> None:
 def moduli_findings(moduli: TissueModuli, preset: str, where: str = "") -> Iterator[Finding]:
     """A note of moduli that are not the preset's; a warning of those that no muscle has.
 
-    Parameters
-    ----------
-    moduli : TissueModuli
-    preset : str
-    where : str
-        Of what states them.
+    where: Of what states them.
     """
     if moduli.is_preset(preset):
         return

@@ -23,13 +23,10 @@ def sparse(name: str = "scipy.sparse") -> Any:
 class Lattice:
     """The positions of the coefficients of a displacement: only those that influence a muscle.
 
-    Attributes
-    ----------
-    origin : (3,) float64, mm
-    spacing : float, mm
-    shape : (3,) int
-    number : (nx, ny, nz) int
-        The index of each coefficient; −1 where there is none.
+    origin: (3,), mm.
+    spacing: mm.
+    shape: (3,) int.
+    number: (nx, ny, nz) int. The index of each coefficient; −1 where there is none.
     """
 
     origin: Floats
@@ -41,10 +38,8 @@ class Lattice:
     def round(cls, points: Floats, spacing: float) -> "Lattice":
         """The lattice that determines the displacement at the given points.
 
-        Parameters
-        ----------
-        points : (n, 3) float64, mm
-        spacing : float, mm
+        points: (n, 3), mm.
+        spacing: mm.
         """
         low, high = points.min(axis=0), points.max(axis=0)
         cells = np.ceil((high - low) / spacing).astype(np.intp) + 1
@@ -69,15 +64,9 @@ class Lattice:
     def basis(self, points: Floats, derivative: int | None = None) -> Any:
         """The matrix from coefficients to the displacement at points, or to its derivative.
 
-        Parameters
-        ----------
-        points : (n, 3) float64, mm
-        derivative : int, optional
-            The axis along which to differentiate; by default, the displacement itself.
-
-        Returns
-        -------
-        (n, size) scipy.sparse.csr_matrix
+        points: (n, 3), mm.
+        derivative: The axis along which to differentiate; by default, the displacement itself.
+        Returns: (n, size) scipy.sparse.csr_matrix.
         """
         at = (points - self.origin) / self.spacing
         first = np.floor(at).astype(np.intp)
@@ -101,10 +90,8 @@ class Lattice:
     def differences(self) -> tuple[Any, Any]:
         """First and second differences of neighbouring coefficients, in mm per mm and per mm².
 
-        Returns
-        -------
-        first, second : (…, size) scipy.sparse.csr_matrix
-            Rows are weighted by a cell's volume, so the sum of squares is an integral over space.
+        Returns: second : (…, size) scipy.sparse.csr_matrix. Rows are weighted by a cell's volume,
+            so the sum of squares is an integral over space.
         """
         root = self.spacing**1.5
         first = [self._stencil([((0, 0, 0), -1.0), (e, 1.0)]) for e in _UNITS]

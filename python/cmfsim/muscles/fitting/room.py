@@ -26,14 +26,9 @@ CUT_SHARE = 0.3
 class Room:
     """Signed distances on one grid, mm, positive where a muscle can be.
 
-    Attributes
-    ----------
-    tissue : ImageData
-        To the nearest place in bone, in air or outside the skin.
-    bone : ImageData
-        To bone alone.
-    low, high : (3,) float64, mm
-        The head is known between these; beyond, its outermost slice goes on.
+    tissue: To the nearest place in bone, in air or outside the skin.
+    bone: To bone alone.
+    low, high: (3,), mm. The head is known between these; beyond, its outermost slice goes on.
     """
 
     tissue: ImageData
@@ -45,10 +40,7 @@ class Room:
     def of(cls, anatomy: Anatomy, points: Floats) -> "Room":
         """The room round some points of a head.
 
-        Parameters
-        ----------
-        anatomy : Anatomy
-        points : (n, 3) float64, mm
+        points: (n, 3), mm.
         """
         low, high = known_part(anatomy.skin)
         begin = points.min(axis=0) - MARGIN
@@ -78,10 +70,7 @@ class Room:
 def known_part(skin: ImageData) -> tuple[Floats, Floats]:
     """The corners of the box that holds the head, less a voxel where a plane cut it off.
 
-    Returns
-    -------
-    low, high : (3,) float64, mm
-        Infinite where the head was not cut off along an axis.
+    Returns: high : (3,), mm. Infinite where the head was not cut off along an axis.
     """
     inside = skin.values > 0.0
     low, high = np.full(3, -np.inf), np.full(3, np.inf)

@@ -41,13 +41,8 @@ MOST_CG_STEPS = 400
 class Volumes:
     """Surfaces whose vertices are numbered consecutively, surface after surface.
 
-    Attributes
-    ----------
-    triangles : tuple of (t, 3) int
-        Of each surface.
-    is_closed : tuple of bool
-    begins : tuple of int
-        The first vertex of each surface, then the number of all vertices.
+    triangles: tuple of (t, 3) int, of each surface.
+    begins: The first vertex of each surface, then the number of all vertices.
     """
 
     triangles: tuple[NDArray[np.intp], ...]
@@ -102,17 +97,11 @@ def _is_closed(triangles: NDArray[np.intp]) -> bool:
 class Targets:
     """Vertices spread over the surfaces of muscles, and where they should be.
 
-    Attributes
-    ----------
-    vertices : (n,) int
-    area : (n,) float64, mm²
-        Area of the surface that each vertex represents.
-    outward : (n, 3) float64
-        Unit vectors away from the template's bone next to it.
-    attached : (n,) bool
-        Whether it lies on that bone.
-    depth : (n,) float64, mm
-        How deep in bone it lies in the template; 0 outside.
+    vertices: (n,) int.
+    area: (n,), mm². Area of the surface that each vertex represents.
+    outward: (n, 3). Unit vectors away from the template's bone next to it.
+    attached: (n,) bool. Whether it lies on that bone.
+    depth: (n,), mm. How deep in bone it lies in the template; 0 outside.
     """
 
     vertices: NDArray[np.intp]
@@ -126,12 +115,9 @@ class Targets:
 class Problem:
     """Muscles as placed by landmarks, the room available to them, and the displacement allowed.
 
-    Attributes
-    ----------
-    vertices : (v, 3) float64, mm
-        Of all muscles.
-    basis : (v, size) sparse matrix
-        From the coefficients of the lattice to displacements of the vertices.
+    vertices: (v, 3), mm, of all muscles.
+    basis: (v, size) sparse matrix, from the coefficients of the lattice to displacements of the
+        vertices.
     """
 
     vertices: Floats
@@ -148,14 +134,8 @@ class Problem:
         from their bone, along the gradient of that distance; of the change of each muscle's volume;
         and of strain and bending of space.
 
-        Parameters
-        ----------
-        stiffness : float
-            A factor on the energy of strain and bending.
-
-        Returns
-        -------
-        (size, 3) float64, mm
+        stiffness: A factor on the energy of strain and bending.
+        Returns: (size, 3), mm.
         """
         lattice, targets = self.lattice, self.targets
         basis = self.basis[targets.vertices]

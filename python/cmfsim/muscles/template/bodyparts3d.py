@@ -116,10 +116,6 @@ def import_bodyparts3d(
     progress : callable, optional
         Called with the name of each file that is read.
 
-    Returns
-    -------
-    MuscleTemplate
-
     Raises
     ------
     FileNotFoundError
@@ -285,17 +281,9 @@ def _renamed(findings: tuple[Finding, ...], name: str) -> list[Finding]:
 def atlas_course(name: str, side: str, surface: SurfaceData) -> tuple[Floats, ...]:
     """The fibre lines of a muscle of the atlas, from origin to insertion; none where boxes do.
 
-    Parameters
-    ----------
-    name : str
-        Without side.
-    side : str
-        "L" or "R".
-    surface : SurfaceData
-
-    Returns
-    -------
-    tuple of (n, 3) float64, mm
+    name: Without side.
+    side: "L" or "R".
+    Returns: tuple of (n, 3), mm.
     """
     vertices = surface.vertices
     mirror = np.array([-1.0 if side == "R" else 1.0, 1.0, 1.0])

@@ -28,12 +28,8 @@ def template_path(folder_or_name: str | os.PathLike[str]) -> Path:
 
     A text that is the name of a built-in template means that one; `./default` means a folder.
 
-    Raises
-    ------
-    FileNotFoundError
-        Neither a name nor a folder or archive.
-    CaseError
-        (also `ValueError`) A name that no file can have.
+    Raises `FileNotFoundError`: Neither a name nor a folder or archive.
+    Raises `CaseError`: A name that no file can have.
     """
     if isinstance(folder_or_name, str) and folder_or_name in BUILT_IN:
         return Path(__file__).with_name(BUILT_IN[folder_or_name])

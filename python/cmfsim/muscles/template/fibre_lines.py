@@ -29,24 +29,10 @@ def fan_lines(
 ) -> tuple[Floats, ...]:
     """Lines from a broad origin that meet at a tip, such as those of temporalis at the coronoid.
 
-    Parameters
-    ----------
-    surface : SurfaceData
-    tip : (3,) float64, mm
-        Where the fibres meet.
-    normal : (3,) float64
-        Direction that the fan is looked at along.
-    lines : int
-
-    Returns
-    -------
-    tuple of (n, 3) float64, mm
-        From origin to tip, in the middle of the muscle.
-
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) Less than two lines meet the muscle.
+    tip: (3,), mm, where the fibres meet.
+    normal: (3,). Direction that the fan is looked at along.
+    Returns: tuple of (n, 3), mm, from origin to tip, in the middle of the muscle.
+    Raises `MeshError`: Less than two lines meet the muscle.
     """
     view = _View(surface, normal)
     centre = view.flat(np.asarray(tip, dtype=np.float64)[None])[0]
@@ -71,24 +57,10 @@ def lane_lines(
 ) -> tuple[Floats, ...]:
     """Parallel lines along a sheet, such as those of buccinator from behind to the mouth.
 
-    Parameters
-    ----------
-    surface : SurfaceData
-    along : (3,) float64
-        From origin to insertion.
-    normal : (3,) float64
-        Direction that the sheet is looked at along.
-    lines : int
-
-    Returns
-    -------
-    tuple of (n, 3) float64, mm
-        From origin to insertion, in the middle of the muscle.
-
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) Less than two lines meet the muscle.
+    along: (3,), from origin to insertion.
+    normal: (3,). Direction that the sheet is looked at along.
+    Returns: tuple of (n, 3), mm, from origin to insertion, in the middle of the muscle.
+    Raises `MeshError`: Less than two lines meet the muscle.
     """
     view = _View(surface, normal)
     ahead = view.axes @ np.asarray(along, dtype=np.float64)

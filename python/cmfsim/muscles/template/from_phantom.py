@@ -29,18 +29,9 @@ def phantom_template(
     It takes about a minute. In a symmetric head the right muscles are the exact mirror images of
     the left ones.
 
-    Parameters
-    ----------
-    head : PhantomHead, optional
-        Default: the ordinary head.
-    name : str
-    progress : callable, optional
-        Is told what is made.
-
-    Raises
-    ------
-    ImportError
-        scikit-image is not installed.
+    head: Default: the ordinary head.
+    progress: Is told what is made.
+    Raises `ImportError`: scikit-image is not installed.
 
     Examples
     --------

@@ -247,12 +247,7 @@ def missing_landmarks(
 ) -> tuple[Finding, ...]:
     """A warning that names the template's landmarks that a patient lacks; none if there are all.
 
-    Parameters
-    ----------
-    template : TemplateData
-    used : collection of str
-        The template's names of the landmarks that the patient has.
-    where : str
+    used: The template's names of the landmarks that the patient has.
     """
     missing = [name for name in template.landmarks if name not in used]
     if not missing:

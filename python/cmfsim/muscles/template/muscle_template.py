@@ -62,10 +62,6 @@ class MuscleTemplate(TemplateData):
         folder_or_name : path or str
             "default" is the built-in one; `./default` would be a folder.
 
-        Returns
-        -------
-        MuscleTemplate
-
         Raises
         ------
         FileNotFoundError
@@ -127,10 +123,6 @@ class MuscleTemplate(TemplateData):
         smoothing : float, mm
             0 matches every landmark exactly; larger values give a smoother map that misses the
             landmarks by more.
-
-        Returns
-        -------
-        MorphedMusculature
 
         Raises
         ------
