@@ -10,11 +10,8 @@ from cmfsim.values.checks import Floats
 def barycentric(corners: Floats, points: Floats) -> Floats:
     """The weights of each triangle's corners at a point in its plane, (k, 3).
 
-    Parameters
-    ----------
-    corners : (k, 3, 3) float64
-        Triangle, corner, coordinate.
-    points : (k, 3) float64
+    corners: (k, 3, 3). Triangle, corner, coordinate.
+    points: (k, 3).
     """
     a, b, c = (corners[:, i] for i in range(3))
     normal = np.cross(b - a, c - a)
@@ -27,12 +24,8 @@ def barycentric(corners: Floats, points: Floats) -> Floats:
 def at_closest(surface: Surface, values: ArrayLike, points: ArrayLike) -> Floats:
     """A field of a surface's vertices at the points of it that are closest to others, (k,).
 
-    Parameters
-    ----------
-    surface : Surface
-    values : (v,) float64
-        Of its vertices.
-    points : (k, 3) float64, mm
+    values: (v,), of its vertices.
+    points: (k, 3), mm.
     """
     closest, _, triangles = surface.closest(points)
     vertices, corners = surface.vertices, surface.triangles[triangles]

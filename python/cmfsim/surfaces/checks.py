@@ -29,13 +29,9 @@ SLIVER_HEIGHT = 0.01
 class BorderLoop:
     """One closed border of a surface.
 
-    Attributes
-    ----------
-    vertices : (k,) int64
-        In the direction of the triangles along the border.
-    length : float, mm
-    centre : (3,) float64, mm
-        Mean of the vertices.
+    vertices: (k,) int64, in the direction of the triangles along the border.
+    length: mm.
+    centre: (3,), mm. Mean of the vertices.
     """
 
     vertices: NDArray[np.int64]
@@ -47,14 +43,10 @@ class BorderLoop:
 class Component:
     """One connected piece of a surface, by shared edges.
 
-    Attributes
-    ----------
-    n_triangles : int
-    area : float, mm²
-    volume : float, mm³
-        Signed, with the triangles oriented as they are; meaningful only if the piece is closed.
-    centre : (3,) float64, mm
-    is_closed : bool
+    area: mm².
+    volume: mm³. Signed, with the triangles oriented as they are; meaningful only if the piece is
+        closed.
+    centre: (3,), mm.
     """
 
     n_triangles: int
@@ -123,10 +115,7 @@ class SurfaceReport:
 def check_extent(vertices: Floats) -> None:
     """Raises an error for coordinates so large that areas and volumes would overflow.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A coordinate above 1e90 mm; the message names its vertex.
+    Raises `CaseError`: A coordinate above 1e90 mm; the message names its vertex.
     """
     far = np.argwhere(np.abs(vertices) > MAX_COORDINATE)
     if len(far):
@@ -147,10 +136,6 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
         file has a border of its own.
     crossings : bool
         Whether to check for triangles that intersect, which is the most expensive check.
-
-    Returns
-    -------
-    SurfaceReport
 
     Raises
     ------

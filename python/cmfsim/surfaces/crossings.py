@@ -28,16 +28,9 @@ MAX_CELLS = 2**20
 def crossing_pairs(vertices: Floats, triangles: Integers) -> Integers | None:
     """The pairs of triangles that cut through each other, or None if too many lie in one place.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64
-    triangles : (t, 3) int64
-        None without area.
-
-    Returns
-    -------
-    (k, 2) int64 or None
-        The lower number first, in order.
+    vertices: (v, 3).
+    triangles: (t, 3) int64. None without area.
+    Returns: (k, 2) int64 or None. The lower number first, in order.
     """
     if len(triangles) < 2:
         return np.zeros((0, 2), dtype=np.int64)

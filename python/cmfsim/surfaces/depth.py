@@ -18,15 +18,8 @@ MOST_DEPTH = 30.0
 def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
     """The distance of each point of the skin from the closest bone, (k,) mm, 30 mm at most.
 
-    Parameters
-    ----------
-    points : (k, 3) float64, mm
-    bones : iterable of SurfaceData
-
-    Raises
-    ------
-    MeshError
-        (also `ValueError`) No bone is given.
+    points: (k, 3), mm.
+    Raises `MeshError`: No bone is given.
     """
     places = as_rows("points", points, 3)
     depth = np.full(len(places), np.inf)
@@ -44,12 +37,9 @@ def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
 def moved_outward(skin: Surface, vertices: Floats, outward: Floats) -> Floats:
     """The vertices of a moved skin, each shifted outward along its normal.
 
-    Parameters
-    ----------
-    skin : Surface
-        Gives the triangles.
-    vertices : (v, 3) float64, mm
-    outward : (v,) float64, mm
+    skin: Gives the triangles.
+    vertices: (v, 3), mm.
+    outward: (v,), mm.
     """
     normals = skin.moved(vertices).vertex_normals
     shifted: Floats = vertices + outward[:, None] * normals

@@ -361,17 +361,10 @@ def _outward(vertices: Floats, triangles: Integers) -> tuple[Integers, int]:
 def cap_loop(vertices: Floats, loop: Integers) -> tuple[Integers, float]:
     """The triangles of a cap and the largest distance of its border from the plane that fits best.
 
-    Parameters
-    ----------
-    vertices : (v, 3) float64, mm
-    loop : (k,) int64
-        Vertices in the order in which the triangles at the border run.
-
-    Returns
-    -------
-    (k − 2, 3) int64
-        They run through the border the other way, so that the closed surface is consistent.
-    float, mm
+    vertices: (v, 3), mm.
+    loop: (k,) int64. Vertices in the order in which the triangles at the border run.
+    Returns: (k − 2, 3) int64. They run through the border the other way, so that the closed surface
+        is consistent.
 
     Notes
     -----

@@ -17,20 +17,13 @@ MOST_CUBED = 1 << 21
 class Edges:
     """The edges of a surface and the triangles at them.
 
-    Attributes
-    ----------
-    ends : (e, 2) int64
-        Vertices of each edge, the lower first.
-    counts : (e,) int64
-        Number of triangles at each edge.
-    pairs : (p, 2) int64
-        Triangles on the two sides of each edge that has exactly two.
-    opposed : (p,) bool
-        Whether they run through that edge in opposite directions, as in a consistent surface.
-    border : (b, 2) int64
-        Edges with a single triangle, in its direction.
-    border_triangles : (b,) int64
-        That triangle.
+    ends: (e, 2) int64. Vertices of each edge, the lower first.
+    counts: (e,) int64. Number of triangles at each edge.
+    pairs: (p, 2) int64. Triangles on the two sides of each edge that has exactly two.
+    opposed: (p,) bool. Whether they run through that edge in opposite directions, as in a
+        consistent surface.
+    border: (b, 2) int64. Edges with a single triangle, in its direction.
+    border_triangles: (b,) int64. That triangle.
     """
 
     ends: Integers
