@@ -23,19 +23,11 @@ KIND_COLOURS: Mapping[str, str] = MappingProxyType(
 )
 # Their nodes that are not attached.
 LIP_COLOURS: Mapping[str, str] = MappingProxyType({"upper": "#8e3b9e", "lower": "#2a9d5c"})
-SEGMENT_COLOURS: Mapping[str, str] = MappingProxyType(
-    {
-        "cranium": "#e6dcc3",
-        "skull": "#e6dcc3",
-        "midface": "#f2a33a",
-        "maxilla": "#f2a33a",
-        "mandible": "#5aa469",
-        "mandible_body": "#5aa469",
-        "ramus_left": "#4e79a7",
-        "ramus_right": "#a678b8",
-        "chin": "#d9534f",
-    }
-)
+SEGMENT_COLOURS: Mapping[str, str] = MappingProxyType({
+    "cranium": "#e6dcc3", "skull": "#e6dcc3", "midface": "#f2a33a", "maxilla": "#f2a33a",
+    "mandible": "#5aa469", "mandible_body": "#5aa469", "ramus_left": "#4e79a7",
+    "ramus_right": "#a678b8", "chin": "#d9534f",
+})  # fmt: skip
 # For segments of other names, in their order.
 OTHER_COLOURS = ("#76b7b2", "#b6992d", "#d37295", "#79706e", "#86bcb6", "#9d7660")
 

@@ -15,12 +15,8 @@ from cmfsim.values.checks import as_floats
 
 # By model, in the order of the paper; told apart in grey too.
 MODEL_COLOURS = {
-    "no change": "#c9c5bd",
-    "H": "#f0c987",
-    "M": "#d98a4b",
-    "H+S": "#b5d3e8",
-    "M+S": "#5b9bc9",
-}
+    "no change": "#c9c5bd", "H": "#f0c987", "M": "#d98a4b", "H+S": "#b5d3e8", "M+S": "#5b9bc9",
+}  # fmt: skip
 OTHER_COLOURS = ("#8fae7a", "#b58db6", "#d9798b", "#6f6f6f")
 SUFFIXES = (".png", ".svg", ".pdf")
 # Error that is called acceptable in most of the literature, mm.

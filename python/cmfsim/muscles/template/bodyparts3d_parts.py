@@ -79,35 +79,11 @@ BONES = (
     "FMA54738",  # left inferior nasal concha
 )
 TEETH = (
-    "FMA55680",
-    "FMA55681",
-    "FMA55682",
-    "FMA55683",
-    "FMA55686",
-    "FMA55687",
-    "FMA55688",
-    "FMA55689",
-    "FMA55690",
-    "FMA55691",
-    "FMA55692",
-    "FMA55693",
-    "FMA55694",
-    "FMA55695",
-    "FMA55697",
-    "FMA55698",
-    "FMA55699",
-    "FMA55700",
-    "FMA55703",
-    "FMA55704",
-    "FMA55705",
-    "FMA55706",
-    "FMA55798",
-    "FMA55799",
-    "FMA57140",
-    "FMA57141",
-    "FMA57142",
-    "FMA57143",
-)
+    "FMA55680", "FMA55681", "FMA55682", "FMA55683", "FMA55686", "FMA55687", "FMA55688", "FMA55689",
+    "FMA55690", "FMA55691", "FMA55692", "FMA55693", "FMA55694", "FMA55695", "FMA55697", "FMA55698",
+    "FMA55699", "FMA55700", "FMA55703", "FMA55704", "FMA55705", "FMA55706", "FMA55798", "FMA55799",
+    "FMA57140", "FMA57141", "FMA57142", "FMA57143",
+)  # fmt: skip
 # SHA-256 of the OBJ files, 99 % reduced, as they lie in the repository that the importer names.
 HASHES: Mapping[str, str] = MappingProxyType(
     {

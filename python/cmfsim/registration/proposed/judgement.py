@@ -15,23 +15,11 @@ from cmfsim.values.proposed_landmarks import ProposedSite
 
 # Expected error of a site on a head unlike any template, mm: what docs/landmarks.md reports of two
 # real heads, rounded up; sites not named, and heads like a template.
-_ERRORS: Mapping[str, float] = MappingProxyType(
-    {
-        "frontal_eminence": 6.0,
-        "lateral_orbit": 5.0,
-        "inferior_malar": 4.0,
-        "supra_m2": 3.5,
-        "sub_m2": 3.0,
-        "supraglabella": 3.5,
-        "glabella": 3.0,
-        "supraorbital": 3.0,
-        "subnasale": 2.5,
-        "alare": 2.5,
-        "exocanthion": 3.0,
-        "endocanthion": 2.5,
-        "rhinion": 2.5,
-    }
-)
+_ERRORS: Mapping[str, float] = MappingProxyType({
+    "frontal_eminence": 6.0, "lateral_orbit": 5.0, "inferior_malar": 4.0, "supra_m2": 3.5,
+    "sub_m2": 3.0, "supraglabella": 3.5, "glabella": 3.0, "supraorbital": 3.0, "subnasale": 2.5,
+    "alare": 2.5, "exocanthion": 3.0, "endocanthion": 2.5, "rhinion": 2.5,
+})  # fmt: skip
 USUAL_ERROR, ALIKE_ERROR = 2.0, 1.0
 # How the reason of a site begins that the image does not show.
 IMAGE_ENDS = "the image ends there"
