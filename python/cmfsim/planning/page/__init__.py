@@ -1,7 +1,6 @@
 """The planning page: one HTML file in which bones are moved and the face follows."""
 
-from cmfsim.planning.page.content import PageContent, page_content
-from cmfsim.planning.page.page import page_text
-from cmfsim.planning.page.tooth_rows import tooth_rows
-
-__all__ = ["PageContent", "page_content", "page_text", "tooth_rows"]
+from cmfsim.planning.page.content import PageContent as PageContent
+from cmfsim.planning.page.content import page_content as page_content
+from cmfsim.planning.page.page import page_text as page_text
+from cmfsim.planning.page.tooth_rows import tooth_rows as tooth_rows
