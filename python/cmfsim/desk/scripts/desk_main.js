@@ -11,7 +11,7 @@ import { connectKeys, connectPointing } from "./pointing.js";
 import { questionStep } from "./questions.js";
 import { STAYS } from "./rigid.js";
 import { unpack } from "./unpacking.js";
-import { addViews, slider } from "./view_buttons.js";
+import { addViews, slider } from "./view_panel.js";
 
 const BACKGROUND = [0.933, 0.945, 0.961];
 // The bone that stays, then a colour for each piece.
