@@ -40,6 +40,8 @@ UNEVEN, LEAST_SECTORS = 5.0, 8
 HALF_TOOTH = 8.0
 # Height of crowns, mm: that of a molar is 6 to 7 mm, of an upper incisor 9 to 10 mm.
 CROWN = 6.0
+# How much higher than the cusp found in a sector another one may be, mm: more is the ramus.
+HIGHER = 1.5
 # Length of the front teeth beyond the edge of the bone below which there are none, mm.
 LEAST_CROWN = 3.0
 # Surfaces of levels are not made coarser than this.
@@ -77,8 +79,11 @@ class ToothRow:
         return ToothRow(self.segment, SurfaceData(vertices, self.surface.triangles), arch)
 
     @cached_property
-    def _sectors(self) -> tuple[NDArray[np.intp], Floats, NDArray[np.intp]]:
-        """Vertices about the arch, how far each lies towards the bite, mm, and its sector."""
+    def _sectors(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, NDArray[np.intp]]:
+        """Vertices about the arch, those of them that are no ramus, and of each vertex two numbers.
+
+        These are how far it lies towards the bite, mm, and its sector.
+        """
         arch, axes = self.arch, self.arch.axes()
         across, ahead, out = ((self.surface.vertices - arch.middle) @ axes.T).T
         front = float((arch.tip - arch.middle) @ axes[1])
@@ -92,11 +97,11 @@ class ToothRow:
         sector = ((turn + LAST_SECTOR) // SECTOR).astype(np.intp)
         # The ramus rises beside the last molars, further to the side than teeth ahead of them.
         before_molars = np.flatnonzero(near & (np.abs(turn) < FRONT_SECTORS))
+        inner = near
         if len(before_molars):
             tops = _tops(before_molars, -out, sector)
-            near &= np.abs(across) <= np.abs(across[[*tops.values()]]).max() + WIDER
-        chosen = np.flatnonzero(near)
-        return chosen, -out, sector
+            inner = near & (np.abs(across) <= np.abs(across[[*tops.values()]]).max() + WIDER)
+        return np.flatnonzero(near), np.flatnonzero(inner), -out, sector
 
     @cached_property
     def cusps(self) -> Mapping[int, int]:
@@ -107,8 +112,8 @@ class ToothRow:
         CaseError
             (also `ValueError`) The bone has no teeth there.
         """
-        near, height, sector = self._sectors
-        tops = _tops(near, height, sector)
+        _, inner, height, sector = self._sectors
+        tops = _tops(inner, height, sector)
         usual = float(np.median(height[[*tops.values()]])) if tops else 0.0
         found = {n: i for n, i in tops.items() if abs(height[i] - usual) <= UNEVEN}
         tip = float((self.arch.tip - self.arch.middle) @ -self.arch.axes()[2])
@@ -127,11 +132,13 @@ class ToothRow:
     @cached_property
     def crowns(self) -> NDArray[np.bool_]:
         """Which vertices lie on crowns, (v,)."""
-        near, height, sector = self._sectors
+        near, _, height, sector = self._sectors
         edge = np.full(int(2 * LAST_SECTOR / SECTOR) + 1, np.inf)
         for number, vertex in self.cusps.items():
             edge[number] = height[vertex]
-        high = near[height[near] >= edge[sector[near]] - CROWN]
+        # The flank of the ramus beside a molar counts up to the molar's height, its front does not.
+        above = height[near] - edge[sector[near]]
+        high = near[(above >= -CROWN) & (above <= HIGHER)]
         across = (self.surface.vertices - self.arch.middle) @ self.arch.axes()[:2].T
         crowns = np.zeros(len(across), dtype=bool)
         line = across[[*self.cusps.values()]]

@@ -84,3 +84,13 @@ def test_crowns_are_teeth_and_neither_palate_nor_ramus(rows):
         on_teeth = np.abs(head.bone_level(name, places)) < 0.5
         assert on_teeth.mean() > 0.9
         assert len(row.cusps) >= 16
+
+
+def test_crowns_of_molars_are_whole(rows):
+    """They are 10 mm wide and lie one behind the other in a row that widens by another 4 mm."""
+    for row in rows:
+        places = (row.surface.vertices[row.crowns] - row.arch.middle) @ row.arch.axes().T
+        turn = np.degrees(np.arctan2(places[:, 0], places[:, 1]))
+        for side in (-1.0, 1.0):
+            molars = places[(side * turn > 65.0) & (side * turn < 95.0), 0]
+            assert 10.0 < np.ptp(molars) < 14.5
