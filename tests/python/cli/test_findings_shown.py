@@ -82,7 +82,7 @@ def test_nothing_doubtful_prints_nothing(capsys):
 @pytest.fixture
 def noticed(tmp_path, monkeypatch):
     """A case with a warning of the doctor, one of building and one of solving."""
-    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda _: iter(()))
+    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
     build, solve = (cmfsim.pipeline.predicting.model_of, cmfsim.pipeline.predicting.predict_patient)
     solved = Finding("of-solving", "solving is doubtful", severity="warning")
 

@@ -123,7 +123,7 @@ def test_the_plan_of_a_wished_face_is_found_and_saved(case, answer):
 
 def test_predict_takes_the_plan_of_a_page(case, answer, wished, capsys, monkeypatch):
     # Pictures are tested elsewhere, and take longer than the rest.
-    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda _: iter(()))
+    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
     file = case.parent / "out/towards.toml"
     # Beside the results, which predict replaces.
     plan = case.parent / "saved.toml"

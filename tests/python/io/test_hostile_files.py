@@ -394,7 +394,7 @@ def test_a_plan_reads_nothing_outside_its_folder(scene, tmp_path):
     for name in [*names, str(tmp_path / "bone.ply"), "a\\u0000b"]:
         plan.write_text(f'[plan.bone]\nsurface = "here.ply"\nmoved_surface = "{name}"\n')
         refused(
-            lambda: cmfsim.read_plan(plan, given), "a file in the folder of the scene is needed"
+            lambda: cmfsim.read_plan(plan, given), "a file in the same folder or below is needed"
         )
     plan.write_text('[plan.bone]\nsurface = "here.ply"\nmoved_surface = "here.ply"\n')
     cmfsim.read_plan(plan, given)

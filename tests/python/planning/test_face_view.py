@@ -30,7 +30,9 @@ def parts():
 def page(browser, parts, tmp_path_factory):
     path = tmp_path_factory.mktemp("view") / "report.html"
     view = View(*face_view(parts), "caption")
-    path.write_text(render_page(Document("t", "s", sections=[Section("Face", (view,))])))
+    path.write_text(
+        render_page(Document("t", "s", sections=[Section("Face", (view,))])), encoding="utf-8"
+    )
     yield from open_page(browser, path)
 
 
@@ -70,7 +72,9 @@ def test_the_skin_has_the_colours_of_a_photo(browser, parts, tmp_path):
     colours = np.full((len(parts["skin"]["skin"][0].vertices), 3), (20, 220, 60), np.uint8)
     path = tmp_path / "report.html"
     view = View(*face_view(parts, colours), "caption")
-    path.write_text(render_page(Document("t", "s", sections=[Section("Face", (view,))])))
+    path.write_text(
+        render_page(Document("t", "s", sections=[Section("Face", (view,))])), encoding="utf-8"
+    )
     for page in open_page(browser, path):
         _drawn(page)
         red, green, blue, _ = page.evaluate(

@@ -158,8 +158,8 @@ def test_surfaces_of_repeated_vertices_are_welded(tmp_path):
     [
         ("version = 1", "version = 2", "version is 2"),
         ("cmfsim-scene", "other", "format is 'other'"),
-        ('"tissue.vtu"', '"../tissue.vtu"', "folder of the scene"),
-        ('"tissue.vtu"', '"/etc/passwd"', "folder of the scene"),
+        ('"tissue.vtu"', '"../tissue.vtu"', "in the same folder or below"),
+        ('"tissue.vtu"', '"/etc/passwd"', "in the same folder or below"),
         ('"floor.ply"', '"scene.toml"', "cannot be read as a mesh"),
         ("poisson = 0.4", "", "lacks 'poisson'"),
         ("poisson = 0.4", "poisson = 0.4\nyoung = 1.0", "remove one"),

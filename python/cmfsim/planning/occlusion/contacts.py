@@ -91,6 +91,14 @@ def contact_map(upper: ToothRow, lower: ToothRow) -> ContactMap:
     ------
     CaseError
         (also `ValueError`) A jaw has no teeth.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> upper, lower = cmfsim.tooth_rows(anatomy, segments, landmarks)
+    >>> contacts = cmfsim.contact_map(upper.moved(cmfsim.rigid_motion((0, 0, 9))), lower)
+    >>> contacts.n_contacts, contacts.greatest_overlap
+    (0, 0.0)
     """
     return ContactMap(upper, lower, _gaps(upper, lower), _gaps(lower, upper))
 

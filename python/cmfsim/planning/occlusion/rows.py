@@ -194,6 +194,13 @@ def tooth_rows(
     ------
     CaseError
         (also `ValueError`) No landmarks or teeth locate the rows, or no segment bears them.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> upper, lower = cmfsim.tooth_rows(anatomy, segments, landmarks)
+    >>> upper.segment, lower.segment
+    ('maxilla', 'mandible_body')
     """
     if not segments:
         raise CaseInputError("no tooth rows: the case has no bone segments")

@@ -101,6 +101,14 @@ def splint_between(
     CaseError
         (also `ValueError`) A jaw has no teeth; a label that is too long; rows that overlap, or that
         are so close that the splint would be thinner: with the opening that makes room.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> upper, lower = cmfsim.tooth_rows(anatomy, segments, landmarks)
+    >>> heads = (49.0, -11.0, -3.0), (-49.0, -11.0, -3.0)
+    >>> splint = cmfsim.splint_between(upper, lower, heads, opening=6.0)  # doctest: +SKIP
+    >>> splint.surface, splint.thickness  # doctest: +SKIP
     """
     _check_range("thickness", thickness, "mm", LEAST_THICKNESS, MOST_THICKNESS)
     _check_range("opening", opening, "°", 0.0, MOST_OPENING)

@@ -37,7 +37,7 @@ def test_the_demo_reports_every_model(folder):
         assert summary["model"] == model
         # Contact ends at its tolerance in mm; linear systems are solved to rounding.
         assert summary["solution"]["residual"] < (1e-5 if "S" in model else 1e-12)
-    drawn = len(re.findall(r'<img src="data:image/png', page))
+    drawn = len(re.findall(r'<img src="data:image/(png|webp);', page))
     # Prediction, plan, muscles; errors of every model, and their chart.
     assert drawn == 7 or "This report has no pictures" in page
 

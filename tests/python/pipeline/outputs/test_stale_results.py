@@ -64,7 +64,7 @@ def replanned(prediction):
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     """They take most of the time."""
-    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda _: iter(()))
+    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
     for name in ("picture_distances", "chart_errors"):
         monkeypatch.setattr(
             f"cmfsim.pipeline.outputs.results.{name}", lambda path, *_, **__: draw(path)

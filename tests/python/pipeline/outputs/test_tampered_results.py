@@ -22,7 +22,7 @@ HIDDEN = "of the reader alone"
 def originals(prediction, evaluation, tmp_path_factory):  # noqa: F811
     """A folder of results with two models and a comparison, and its two summaries."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda _: iter(()))
+        patch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
         for name in ("picture_distances", "chart_errors"):
             patch.setattr(
                 f"cmfsim.pipeline.outputs.results.{name}",
