@@ -165,8 +165,8 @@ def folder(tmp_path):
     cmfsim.init_case(tmp_path)
     case = tmp_path / "case.toml"
     # Coarser than what init would do.
-    text = case.read_text().replace("[image]", "[image]\nworking_spacing = 3.0")
-    case.write_text(f"{text}\n[mesh]  # coarse\nedge_length = 14.0\n")
+    text = case.read_text(encoding="utf-8").replace("[image]", "[image]\nworking_spacing = 3.0")
+    case.write_text(f"{text}\n[mesh]  # coarse\nedge_length = 14.0\n", encoding="utf-8")
     return tmp_path
 
 
@@ -185,7 +185,7 @@ def test_a_ct_becomes_a_saved_plan_and_a_printed_page_by_clicks(browser, folder)
         ]
         assert person.count <= MOST_CLICKS
     check_saved(folder, digits)
-    assert "# coarse" in (folder / "case.toml").read_text()
+    assert "# coarse" in (folder / "case.toml").read_text(encoding="utf-8")
     # The page draws neither the mouth from inside nor the cut through the neck, and keeps what was
     # lifted off the bone for the first moves.
     predicted = cmfsim.read_surface(folder / "out/prediction.stl").vertices

@@ -29,8 +29,9 @@ CALLS = ("answer", "cuts", "compute", "save-landmarks", "save-plan", "report", "
 @pytest.fixture
 def folder(tmp_path):
     case = head_case.HeadCase().write(tmp_path)
-    text = case.read_text().replace("edge_length = 4.0", "edge_length = 12.0")
-    case.write_text(text.partition("[plan.mandible]")[0] + "[tissue]  # mine\npreset = 'kim2010'\n")
+    text = case.read_text(encoding="utf-8").replace("edge_length = 4.0", "edge_length = 12.0")
+    text = text.partition("[plan.mandible]")[0] + "[tissue]  # mine\npreset = 'kim2010'\n"
+    case.write_text(text, encoding="utf-8")
     return tmp_path
 
 
@@ -152,7 +153,7 @@ def test_cuts_and_first_moves_go_into_the_case_file(post, state, session, folder
         ("bsso", {"setback": 3.0})
     ]
     assert case.plan["mandible_body"].matrix[:3, 3].tolist() == [0.0, 3.0, 0.5]
-    assert "[tissue]  # mine" in (folder / "case.toml").read_text()
+    assert "[tissue]  # mine" in (folder / "case.toml").read_text(encoding="utf-8")
     # Without its cut, a segment cannot move.
     status, _ = post("compute", seen=state()["seen"], cuts={"genioplasty": {}}, moves={})
     assert status == 200
@@ -180,7 +181,7 @@ def test_moves_and_cuts_that_make_no_plan_are_refused(post, state, folder):
 
 def test_of_two_tabs_the_second_does_not_overwrite_what_it_has_not_seen(post, state, folder):
     first = second = state()["seen"]
-    markups = (folder / "skull.mrk.json").read_text()
+    markups = (folder / "skull.mrk.json").read_text(encoding="utf-8")
     status, after = post("save-landmarks", seen=first, skull=markups)
     assert status == 200
     assert cmfsim.Case.load(folder).landmarks.skull.name == "skull_landmarks.mrk.json"

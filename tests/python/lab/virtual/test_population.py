@@ -173,7 +173,7 @@ def test_the_truth_is_the_plan_with_its_departures(made):
         )
         assert np.abs(start @ matrix[:3, :3].T + matrix[:3, 3] - end).max() < 1e-3
         assert np.linalg.norm(off - np.eye(4)) > 0.1
-    assert "departures" not in (place / "case.toml").read_text()
+    assert "departures" not in (place / "case.toml").read_text(encoding="utf-8")
 
 
 def test_the_operation_as_carried_out_is_a_case_of_its_own(made):
@@ -182,7 +182,7 @@ def test_the_operation_as_carried_out_is_a_case_of_its_own(made):
     cohort = cmfsim.Cohort.load(folder / "executed.toml")
     assert list(cohort.cases) == ["D001"]
     done, case = (cmfsim.Case.load(p) for p in (cohort.cases["D001"], folder / "D001"))
-    record = json.loads((folder / "D001/truth/truth.json").read_text())
+    record = json.loads((folder / "D001/truth/truth.json").read_text(encoding="utf-8"))
     assert set(done.plan) == set(case.plan)
     for name, motion in done.plan.items():
         np.testing.assert_allclose(motion.matrix, record["motions"][name], atol=1e-12)
@@ -261,7 +261,7 @@ def test_a_failure_is_recorded_and_not_tried_again(tmp_path, monkeypatch):
     assert calls == ["D004"]
     population_folder.make_patient(**{**job, "edge_length": 8.0})
     assert calls == ["D004", "D004"]
-    record = json.loads((tmp_path / "D004" / "failed.json").read_text())
+    record = json.loads((tmp_path / "D004" / "failed.json").read_text(encoding="utf-8"))
     assert record["reason"] == "Newton's method stalls"
 
 

@@ -40,7 +40,7 @@ def moves(folder) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_twin_is_complete_and_says_what_it_is(twin):
     """Every file of the documented layout; settled, nothing inside out, labelled in silico."""
-    record = json.loads((twin / "truth/truth.json").read_text())
+    record = json.loads((twin / "truth/truth.json").read_text(encoding="utf-8"))
     assert record["what"].startswith("in silico")
     assert record["truth"]["residual"] <= OPTIONS.tolerance
     assert record["truth"]["volume_ratio"][0] > 0.0
@@ -110,7 +110,7 @@ def test_the_scan_is_noisy_as_stated(twin):
 def test_a_patient_made_with_the_same_settings_is_kept(twin, monkeypatch):
     """The second command finds the first one's patient; another seed would make a new one."""
     folder = twin.parent
-    record = json.loads((twin / "truth/truth.json").read_text())["settings"]
+    record = json.loads((twin / "truth/truth.json").read_text(encoding="utf-8"))["settings"]
     settings = {key: record[key] for key in ("seed", "edge_length", "spacing")}
 
     def refuse(*_, **__):
@@ -125,7 +125,7 @@ def test_a_patient_made_with_the_same_settings_is_kept(twin, monkeypatch):
 
 def test_the_cohort_lists_the_patients_who_are_complete(twin):
     """`cohort.toml` beside P1 loads, and names P1 alone though a broken P2 lies there."""
-    record = json.loads((twin / "truth/truth.json").read_text())["settings"]
+    record = json.loads((twin / "truth/truth.json").read_text(encoding="utf-8"))["settings"]
     (twin.parent / "P2").mkdir(exist_ok=True)
     virtual_patients(
         twin.parent, [1], **{key: record[key] for key in ("seed", "edge_length", "spacing")}

@@ -41,7 +41,7 @@ def test_page_and_animation_have_the_colours(folder, capsys, monkeypatch):
     red, green = (front[:, :, a] - front[:, :, 1 - a] > 60 for a in (0, 1))
     assert np.nonzero(red)[1].mean() > 280
     assert np.nonzero(green)[1].mean() < 200
-    page = (folder / "report.html").read_text()
+    page = (folder / "report.html").read_text(encoding="utf-8")
     values = json.loads(re.search('id="page-values">(.*?)</script>', page)[1])
     shapes = {entry["name"]: entry["shape"] for entry in values["arrays"]}
     assert shapes["skin_colours"] == shapes[f"part_{len(values['parts']) - 1}"][:1]
