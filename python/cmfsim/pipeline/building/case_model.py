@@ -231,11 +231,14 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
 
 
-def planned_head(case: Case, options: BuildOptions) -> tuple[Head, PlannedBones]:
+def planned_head(
+    case: Case, options: BuildOptions
+) -> tuple[Head, PlannedBones, tuple[Finding, ...]]:
     """The head of a case and its bones with their motions, as `model_of` has them: no tissue."""
     stages = Stages(options)
     head = _head(case, stages, options)
-    return head, _bones(head, stages, options.after)[0]
+    bones = _bones(head, stages, options.after)[0]
+    return head, bones, tuple(stages.findings)
 
 
 def _head(case: Case, stages: Stages, options: BuildOptions) -> Head:

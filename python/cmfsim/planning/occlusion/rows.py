@@ -5,7 +5,7 @@ show where a tooth ends and bone begins.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +19,7 @@ from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.dental_arch import JAWS, LOWER_BEARERS, UPPER_BEARERS, DentalArch
+from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
@@ -179,6 +180,15 @@ def bite_sites(*rows: ToothRow) -> dict[str, tuple[Floats, str]]:
                 place = row.surface.vertices[inside].mean(axis=0)
                 found[f"{letter}{name}"] = (place, row.segment)
     return found
+
+
+def refuse_doubtful_rows(findings: Iterable[Finding]) -> None:
+    """Raises `CaseError` where the jaws were separated doubtfully: bone would pass for crowns."""
+    doubt = next((f for f in findings if f.code == "jaw-doubtful"), None)
+    if doubt is not None:
+        raise CaseInputError(
+            f"the tooth rows are doubtful (splint-rows-doubtful), because {doubt.what}; {doubt.fix}"
+        )
 
 
 def tooth_rows(

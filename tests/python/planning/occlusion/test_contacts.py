@@ -5,7 +5,7 @@ import pytest
 from tooth_row_heads import closed_rows
 
 import cmfsim
-from cmfsim.planning.occlusion import rigid_of
+from cmfsim.planning.occlusion import refuse_doubtful_rows, rigid_of
 from cmfsim.planning.occlusion.contacts import signed_gaps
 
 pv = pytest.importorskip("pyvista")
@@ -94,3 +94,10 @@ def test_crowns_of_molars_are_whole(rows):
         for side in (-1.0, 1.0):
             molars = places[(side * turn > 65.0) & (side * turn < 95.0), 0]
             assert 10.0 < np.ptp(molars) < 14.5
+
+
+def test_rows_of_doubtful_jaws_are_refused():
+    """On a jaw without teeth, bone would pass for crowns."""
+    refuse_doubtful_rows([cmfsim.Finding("metal", "1 piece", severity="warning")])
+    with pytest.raises(cmfsim.CaseError, match=r"splint-rows-doubtful.*rows rise.*by hand"):
+        refuse_doubtful_rows([cmfsim.Finding("jaw-doubtful", "the rows rise by -23°")])
