@@ -1,6 +1,5 @@
 """The text of a case file as the desk changes it: tables are exchanged, everything else stays."""
 
-import json
 import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +8,7 @@ from typing import Any
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
-from cmfsim.io.cases.case_plans import BARE
+from cmfsim.io.cases.case_plans import matrix_rows, plan_head
 from cmfsim.io.files.reading_writing import toml_module
 from cmfsim.io.files.toml_lines import toml_lines
 from cmfsim.values.checks import Floats
@@ -165,11 +164,11 @@ def with_plan(
     text: str, is_replaced: Callable[[str], bool], plan: Mapping[str, Floats], made_by: str
 ) -> str:
     """The text with motions, (4, 4) mm LPS each, in place of those of some segments."""
-    tables = {}
-    for name, motion in plan.items():
-        key = name if BARE.fullmatch(name) else json.dumps(name)
-        rows = [f"  [{', '.join(repr(float(v) + 0.0) for v in row)}]," for row in motion]
-        tables[f"[plan.{key}]  # {made_by}"] = ['frame = "LPS"', "matrix = [", *rows, "]"]
+    # Adding 0 writes −0 as 0.
+    tables = {
+        f"{plan_head(name)}  # {made_by}": ['frame = "LPS"', *matrix_rows(motion + 0.0)]
+        for name, motion in plan.items()
+    }
     text = NO_PLAN.sub("", text) if plan else text
 
     def goes(path: Names, _: str) -> bool:

@@ -14,6 +14,7 @@ from cmfsim.io.cases.tables import Table
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.slicer.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
 from cmfsim.values.case_parts import DIRECTIONS, PROCEDURES, CaseMotion, CaseOsteotomy
+from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix, rigid_motion
 
 # A name that TOML takes as a key without quotes.
@@ -188,8 +189,17 @@ def write_plan(
         lines.append(f"# made for: {made_for}")
     for name, motion in plan.items():
         matrix = rigid_matrix(motion, f"motion of {name!r}")
-        key = name if BARE.fullmatch(name) else json.dumps(name)
-        rows = [f"  [{', '.join(repr(float(v)) for v in row)}]," for row in matrix]
-        lines += ["", f"[plan.{key}]", "matrix = [", *rows, "]"]
+        lines += ["", plan_head(name), *matrix_rows(matrix)]
     with replacing(Path(path)) as file:
         file.write(("\n".join(lines) + "\n").encode())
+
+
+def plan_head(segment: str) -> str:
+    """The head of the table with a segment's motion."""
+    return f"[plan.{segment if BARE.fullmatch(segment) else json.dumps(segment)}]"
+
+
+def matrix_rows(matrix: Floats) -> list[str]:
+    """The rows of TOML with a motion, (4, 4) mm."""
+    rows = [f"  [{', '.join(repr(float(v)) for v in row)}]," for row in matrix]
+    return ["matrix = [", *rows, "]"]

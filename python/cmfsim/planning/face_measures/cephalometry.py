@@ -112,12 +112,17 @@ def cephalometry(
     3.88
     """
     places = projected(landmarks, before)
-    found: dict[str, float | None] = {}
-    for measure in CEPHALOMETRIC_MEASURES:
-        sites = [places[name] for name in measure.sites if name in places]
-        whole = len(sites) == len(measure.sites)
-        found[measure.key] = FORMULAS[measure.formula][0](*sites) if whole else None
-    return found
+    return {measure.key: value_of(measure, places) for measure in CEPHALOMETRIC_MEASURES}
+
+
+def value_of(measure: Measure, places: Mapping[str, Floats]) -> float | None:
+    """The value of a measure by one of `FORMULAS`, mm or degrees; None if a site is missing.
+
+    places: (2,) mm each, by name, as `projected` has them.
+    """
+    sites = [places[name] for name in measure.sites if name in places]
+    whole = len(sites) == len(measure.sites)
+    return FORMULAS[measure.formula][0](*sites) if whole else None
 
 
 def missing_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, str]:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.planning.face_measures.cephalometry import FORMULAS, head_axes, projected
+from cmfsim.planning.face_measures.cephalometry import head_axes, projected, value_of
 from cmfsim.planning.face_measures.definitions import Measure
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, tooth_of
@@ -77,9 +77,7 @@ def occlusion(
     left = np.cross(plane[1], plane[0])
     found: dict[str, float | None] = {measure.key: None for measure in OCCLUSAL_MEASURES}
     for measure in OCCLUSAL_MEASURES[:2]:
-        if all(name in flat for name in measure.sites):
-            sites = [flat[name] for name in measure.sites]
-            found[measure.key] = FORMULAS[measure.formula][0](*sites)
+        found[measure.key] = value_of(measure, flat)
     places = {name: np.asarray(place, dtype=np.float64) for name, place in landmarks.items()}
     teeth = {known: places[name] for name in places if (known := tooth_of(name)) is not None}
     middle = _middle(at_rest, left)

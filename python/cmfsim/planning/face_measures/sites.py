@@ -131,7 +131,7 @@ def face_sites(patient: PatientModel) -> FaceSites:
                 absent[name] = str(error)
     found = [name for name in on_profile if name in skin]
     try:
-        bone[UPPER_INCISOR] = incisor_edge(patient, "supradentale", UPPER_BEARERS)
+        bone[UPPER_INCISOR] = incisor_edge(patient)
         found.append(UPPER_INCISOR)
     except LandmarkInputError as error:
         absent[UPPER_INCISOR] = str(error)
@@ -319,19 +319,18 @@ _FINDERS: Mapping[str, Callable[[Floats, Mapping[str, Floats]], Floats]] = {
 }
 
 
-def incisor_edge(patient: PatientModel, root: str, bearers: tuple[str, ...]) -> BoneSite:
-    """The edge of the central incisors: the furthest point of the bone along their crown.
+def incisor_edge(patient: PatientModel) -> BoneSite:
+    """The edge of the upper central incisors: the furthest point of the bone along their crown.
 
-    That begins at `root`, "supradentale" or "infradentale"; the bearers are `UPPER_BEARERS` or
-    `LOWER_BEARERS`. LandmarkError (also `ValueError`) if the case or the bone does not show it.
+    LandmarkError (also `ValueError`) if the case or the bone does not show it.
     """
+    root = "supradentale"
     skull = patient.landmarks.get("skull", {})
     if root not in skull:
         raise LandmarkInputError(f"the case has no skull landmark {root}")
-    upper = bearers == UPPER_BEARERS
-    bearer = _bearer(patient.segments, bearers)
+    bearer = _bearer(patient.segments)
     away = bearer.surface.vertices - skull[root]
-    along = -away[:, 2] if upper else away[:, 2]
+    along = -away[:, 2]
     near = (
         (np.abs(away[:, 0]) <= INCISOR_SIDE)
         & (np.abs(away[:, 1]) <= INCISOR_DEPTH)
@@ -339,18 +338,14 @@ def incisor_edge(patient: PatientModel, root: str, bearers: tuple[str, ...]) -> 
         & (along <= INCISOR_LENGTH)
     )
     if along[near].max(initial=0.0) < LEAST_CROWN:
-        raise LandmarkInputError(
-            f"the surface of {bearer.name} shows no incisor {'below' if upper else 'above'} {root}"
-        )
+        raise LandmarkInputError(f"the surface of {bearer.name} shows no incisor below {root}")
     edge = int(np.argmax(np.where(near, along, -np.inf)))
     return BoneSite(bearer.surface.vertices[edge], bearer.name)
 
 
-def _bearer(segments: tuple[BoneSegment, ...], bearers: tuple[str, ...]) -> BoneSegment:
+def _bearer(segments: tuple[BoneSegment, ...]) -> BoneSegment:
     by_name = {segment.name: segment for segment in segments}
-    for name in bearers:
+    for name in UPPER_BEARERS:
         if name in by_name:
             return by_name[name]
-    raise LandmarkInputError(
-        f"no segment carries the {'upper' if bearers == UPPER_BEARERS else 'lower'} teeth"
-    )
+    raise LandmarkInputError("no segment carries the upper teeth")
