@@ -2,7 +2,7 @@
 
 `diagnose` reads the files of a case and looks; it changes and writes nothing. `evidence` is what
 was read, `placement` asks whether it lies where it should, `surfaces` whether it is sound,
-`operation` whether cuts and plan can be meant and what is given after the operation belongs
+`operation` whether cuts and plan are plausible and what is given after the operation belongs
 together, `plan` whether motions have a bone's size, and states the plan in words, `moved_bones`
 whether a bone before and after is one bone, `muscles` whether these can be placed.
 """

@@ -1,4 +1,4 @@
-"""Whether bones given before and after can be meant as one bone that moved."""
+"""Whether bones given before and after can be one bone that moved."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Whether cuts and plan can be meant, and what is given after the operation belongs together."""
+"""Whether cuts and plan are plausible, and what is given after the operation belongs together."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress

@@ -71,7 +71,7 @@ def read_image(path: str | os.PathLike[str], *, series: str | None = None) -> Im
     ------
     ImageError
         (also `ValueError`) Damaged, empty, not three-dimensional, one slice, colours, MR, slices
-        missing or at one place, several series that may be meant, a header that contradicts itself
+        missing or at one place, several series to choose from, a header that contradicts itself
         or leads to files elsewhere.
     FileNotFoundError
 

@@ -23,7 +23,7 @@ MOST_FILES = 20_000
 MOST_DEPTH = 6
 # Bytes before the mark of DICOM.
 PREAMBLE = 128
-# A series of fewer slices is a scout or a sample, no second volume that might be meant.
+# A series of fewer slices is a scout or a sample, not a second volume to choose from.
 LEAST_VOLUME = 10
 # The largest series is meant where no other has more than this part of its slices.
 CLEARLY_LARGEST = 0.5
@@ -80,7 +80,7 @@ def read_dicom_folder(
     """The CT of a folder, its modality, and findings on how it lay there.
 
     series: UID or number of the series that is meant.
-    Raises `ImageError`: No CT, several that may be meant, slices that do not make a volume.
+    Raises `ImageError`: No CT, several to choose from, slices that do not make a volume.
     """
     headers, findings = _headers(folder, series)
     chosen, more = _chosen(folder, _series(headers), series)
