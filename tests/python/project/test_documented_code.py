@@ -250,6 +250,7 @@ WHOLE = (
     "docs/landmarks.md",
     "docs/planning-page.md",
     "docs/predicting.md",
+    "docs/python.md",
     "docs/templates.md",
     "docs/virtual_patients.md",
 )

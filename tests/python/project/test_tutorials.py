@@ -162,3 +162,19 @@ def test_the_reference_names_every_export_once():
     listed = (DOCS.parent / "mkdocs.yml").read_text("utf-8")
     for page in [*DOCS.glob("*.md"), *(DOCS / "reference").glob("*.md"), *TUTORIALS]:
         assert page.relative_to(DOCS).as_posix() in listed
+
+
+def test_a_guide_names_every_export():
+    """Readers find a name by its task; the page itself is typed by `test_documented_code`."""
+    code = re.findall(
+        r"```python\n.*?```|`[^`\n]+`", (DOCS / "python.md").read_text("utf-8"), re.DOTALL
+    )
+    named = set(re.findall(r"\w+", " ".join(code)))
+    assert set(cmfsim.__all__) - named == {"__version__"}
+
+
+def test_help_maps_tasks_to_names():
+    table = cmfsim.__doc__.partition("belongs to each):\n\n")[2].partition("\n\n")[0]
+    named = [name for row in table.splitlines() for name in row[12:].split(", ")]
+    assert len(named) > 50
+    assert set(named) <= set(cmfsim.__all__), set(named) - set(cmfsim.__all__)
