@@ -2,6 +2,7 @@
 
 import sys
 
+from cmfsim.io import landmark_files
 from cmfsim.io.cases.case_files import Case as Case
 from cmfsim.io.cases.case_files import CaseOrPath as CaseOrPath
 from cmfsim.io.cases.case_files import as_case as as_case
@@ -40,5 +41,6 @@ from cmfsim.io.surfaces import read_surface as read_surface
 from cmfsim.io.surfaces import read_surface_file as read_surface_file
 from cmfsim.io.surfaces import write_surface as write_surface
 
-# Scripts of others import this module under its former name.
+# Scripts of others import these modules under their former names.
 sys.modules[f"{__name__}.ply"] = ply
+sys.modules[f"{__name__}.landmarks"] = landmark_files
