@@ -1,5 +1,7 @@
 """CmfSim: choose a volume or models, move segments by transforms, and see the face follow.
 
+Two buttons: the face under the transforms, and the planning page, in which other plans are tried.
+
 A thin widget. What it does with what was chosen is in CmfSimLib, which knows no Slicer; the
 prediction itself runs in a process of its own.
 """
@@ -21,10 +23,11 @@ from slicer.ScriptedLoadableModule import (
 )
 
 from CmfSimLib.case_folder import BONES, MODELS, Choice, ChoiceError, Segment, face_of, write_case
-from CmfSimLib.running import Run, command, words_of
+from CmfSimLib.running import Run, page_command, predict_command, words_of
 
 ACTIVE = "displacement_length_mm"
 COLOURS = "vtkMRMLColorTableNodeFileViridis.txt"
+FACE_BUTTON, PAGE_BUTTON = "Predict the face", "Make the planning page"
 # How often a running prediction is asked for its progress, ms.
 INTERVAL = 300
 
@@ -98,8 +101,9 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
             "In HU; leave empty to use a skin model",
         )
         self.skin = self._chooser(form, "Skin model:", model, "Where no CT is chosen")
-        self.skull = self._chooser(form, "Skull landmarks:", points, "Needed for muscles and cuts")
-        self.marks = self._chooser(form, "Skin landmarks:", points, "Optional")
+        found = "Optional: found automatically where there are none"
+        self.skull = self._chooser(form, "Skull landmarks:", points, found)
+        self.marks = self._chooser(form, "Skin landmarks:", points, found)
 
     def _addSegments(self):
         form = self._section("Bones, and the transform that moves each")
@@ -138,9 +142,13 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
         self.edge.minimum, self.edge.maximum, self.edge.value = 1.0, 30.0, 6.0
         self.edge.suffix = " mm"
         form.addRow("Edge length:", self.edge)
-        self.button = qt.QPushButton("Predict the face")
+        self.button = qt.QPushButton(FACE_BUTTON)
         self.button.connect("clicked()", self.onButton)
         form.addRow(self.button)
+        self.pageButton = qt.QPushButton(PAGE_BUTTON)
+        self.pageButton.toolTip = "One file for the browser: move the bones, see the face follow"
+        self.pageButton.connect("clicked()", self.onPageButton)
+        form.addRow(self.pageButton)
         self.bar = qt.QProgressBar()
         self.bar.visible = False
         form.addRow(self.bar)
@@ -154,7 +162,14 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
             yield name.currentText.strip(), model.currentNode(), transform.currentNode()
 
     def onButton(self):
-        """Starts a prediction, or stops the running one."""
+        """Starts a prediction, or stops what runs."""
+        self._start(predict_command, self.showPrediction)
+
+    def onPageButton(self):
+        """Starts the making of a planning page, or stops what runs."""
+        self._start(page_command, self.showPage)
+
+    def _start(self, command, show):
         if self.run is not None:
             self.run.stop()
             return
@@ -171,14 +186,15 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
         except (ChoiceError, RuntimeError) as error:
             slicer.util.errorDisplay(str(error), windowTitle="CmfSim")
             return
+        self.show = show
         self.run = Run(command(self.case, chosen.model, python=self.logic.python()))
-        self.button.text = "Stop"
+        self.button.text = self.pageButton.text = "Stop"
         self.bar.visible = True
         self.bar.value = 0
         self.timer.start()
 
     def onTimer(self):
-        """Shows the progress of the prediction, and its face at the end."""
+        """Shows the progress of what runs, and its result at the end."""
         for line in self.run.poll():
             self.status.text = line.text
             if line.share is not None:
@@ -188,18 +204,28 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
             return
         self.timer.stop()
         run, self.run = self.run, None
-        self.button.text = "Predict the face"
+        self.button.text, self.pageButton.text = FACE_BUTTON, PAGE_BUTTON
         self.bar.visible = False
         answer = run.answer()
         run.close()
         if code == 0:
-            head = self.volume.currentNode() or self.skin.currentNode()
-            self.logic.showFace(Path(self.case).parent / "out" / "prediction.mrb", head)
-            self.status.text = "The face is coloured by its displacement in mm."
+            self.status.text = self.show(Path(self.case).parent / "out")
             return
         text = words_of(answer)
         self.status.text = text
         slicer.util.errorDisplay(text, windowTitle="CmfSim")
+
+    def showPrediction(self, out):
+        """Loads the face of a prediction, and states what is seen."""
+        head = self.volume.currentNode() or self.skin.currentNode()
+        self.logic.showFace(out / "prediction.mrb", head)
+        return "The face is coloured by its displacement in mm."
+
+    def showPage(self, out):
+        """Opens the planning page in the browser, and states where it is."""
+        page = out / "plan.html"
+        qt.QDesktopServices.openUrl(qt.QUrl.fromLocalFile(str(page)))
+        return f"The planning page is {page}."
 
 
 class CmfSimLogic(ScriptedLoadableModuleLogic):
@@ -210,19 +236,28 @@ class CmfSimLogic(ScriptedLoadableModuleLogic):
         self.folder = None
 
     def ensureCmfsim(self):
-        """Installs cmfsim into Slicer's Python when it is first needed, after asking."""
-        requirements = str(Path(__file__).parent / "Resources" / "requirements.txt")
+        """Installs cmfsim into Slicer's Python when it is first needed, after asking.
+
+        A wheel beside requirements.txt is installed if there is one: the package that belongs to
+        this copy of the module. Otherwise the registry of Python packages has it.
+        """
+        resources = Path(__file__).parent / "Resources"
+        wheels = sorted(resources.glob("cmfsim-*.whl"))
+        asked = (resources / "requirements.txt").read_text(encoding="utf-8").split()
+        if wheels:
+            extras = "".join(asked).removeprefix("cmfsim")
+            asked = [f"cmfsim{extras} @ {wheels[-1].as_uri()}"]
         try:
-            from slicer.packaging import load_requirements, pip_ensure
+            from slicer.packaging import pip_ensure
         except ImportError:
             # Slicer 5.10 and earlier.
             if importlib.util.find_spec("cmfsim") is None:
                 text = "CmfSim needs the Python package cmfsim. Install it?"
                 if not slicer.util.confirmOkCancelDisplay(text, windowTitle="CmfSim"):
                     raise RuntimeError("cmfsim is not installed.") from None
-                slicer.util.pip_install(f'-r "{requirements}"')
+                slicer.util.pip_install(asked)
             return
-        pip_ensure(load_requirements(requirements), requester="CmfSim")
+        pip_ensure(asked, requester="CmfSim")
 
     def python(self):
         """Slicer's own interpreter, which runs without its window."""

@@ -81,10 +81,6 @@ def check(choice):
         raise ChoiceError("Choose at least one model of a bone, such as the cranium.")
     if not any(is_moved(segment) for segment in choice.segments):
         raise ChoiceError("No segment moves: apply a linear transform to at least one.")
-    if choice.model.startswith("M") and choice.skull_landmarks is None:
-        raise ChoiceError(
-            "Muscles are placed from skull landmarks: choose a point list, or model H or H+S."
-        )
 
 
 def is_moved(segment):
@@ -127,7 +123,7 @@ def case_text(choice):
             rows = [f"  [{', '.join(repr(float(v)) for v in row)}]," for row in segment.matrix_ras]
             lines += ["", f"[plan.{segment.name}]", 'frame = "RAS"', "matrix = [", *rows, "]"]
     lines += ["", "[mesh]", f"edge_length = {choice.edge_length:g}"]
-    if choice.skull_landmarks is not None:
+    if choice.model.startswith("M"):
         lines += ["", "[muscles]"]
     return "\n".join([*lines, "", "[output]", 'folder = "out"', ""])
 

@@ -33,20 +33,19 @@ class Line:
     share: float | None = None
 
 
-def command(case, model, *, python=None):
+def predict_command(case, model, *, python=None):
     """The arguments that predict a case and write a bundle for Slicer."""
-    return [
-        python or sys.executable,
-        "-m",
-        "cmfsim",
-        "predict",
-        str(case),
-        "--model",
-        model,
-        "--slicer",
-        "--no-report",
-        "--json",
-    ]
+    return [*_command("predict", case, model, python), "--slicer", "--no-report"]
+
+
+def page_command(case, model, *, python=None):
+    """The arguments that write the planning page of a case, without opening it."""
+    return [*_command("plan", case, model, python), "--no-open"]
+
+
+def _command(name, case, model, python):
+    words = [python or sys.executable, "-m", "cmfsim", name, str(case), "--model", model]
+    return [*words, "--json"]
 
 
 def words_of(answer):

@@ -54,7 +54,7 @@ def ran(tmp_path_factory):
     """A case of the module, predicted in a process of its own: folder, lines, answer."""
     folder = tmp_path_factory.mktemp("chosen")
     path = case_folder.write_case(folder, chosen(folder))
-    run = running.Run(running.command(path, "H", python=sys.executable))
+    run = running.Run(running.predict_command(path, "H", python=sys.executable))
     lines = []
     while run.code is None:
         lines += run.poll()
@@ -98,7 +98,6 @@ def test_a_volume_is_cut_by_the_procedures_that_the_segments_need(tmp_path):
     [
         ({"skin": None}, "Choose a CT volume"),
         ({"segments": []}, "at least one model of a bone"),
-        ({"skull_landmarks": None, "model": "M+S"}, "skull landmarks"),
         ({"model": "X"}, "one of H, M"),
         (
             {"segments": [case_folder.Segment("a b", Path("a.vtp"), MOTION.tolist())]},
@@ -111,6 +110,28 @@ def test_a_volume_is_cut_by_the_procedures_that_the_segments_need(tmp_path):
 def test_a_choice_that_makes_no_case_is_refused_in_a_sentence(tmp_path, change, words):
     with pytest.raises(case_folder.ChoiceError, match=words):
         case_folder.case_text(chosen(tmp_path, **change))
+
+
+def test_muscles_need_no_landmarks_of_a_person(tmp_path):
+    """They are found automatically; the case says that it has muscles, for models with muscles."""
+    for model, expected in (("M+S", True), ("H", False)):
+        made = chosen(tmp_path, skull_landmarks=None, model=model)
+        case = cmfsim.Case.load(case_folder.write_case(tmp_path, made))
+        assert (case.muscles is not None) == expected
+        assert case.landmarks.skull is None
+
+
+def test_the_planning_page_of_what_was_chosen(ran):
+    """One file for the browser in the folder of the case."""
+    folder, _, _ = ran
+    words = running.page_command(folder / "case.toml", "H", python=sys.executable)
+    run = running.Run([*words, "--trials", "1", "--corrections", "0"])
+    while run.code is None:
+        time.sleep(0.05)
+    code, answer = run.code, run.answer()
+    run.close()
+    assert code == 0, answer
+    assert "mandible" in (folder / "out" / "plan.html").read_text(encoding="utf-8")
 
 
 def test_a_run_tells_its_progress_and_gives_the_face(ran, tmp_path):
@@ -130,7 +151,7 @@ def test_a_run_tells_its_progress_and_gives_the_face(ran, tmp_path):
 def test_a_failed_run_gives_the_words_of_the_doctor(tmp_path):
     """No bone: the case file itself is refused."""
     (tmp_path / "case.toml").write_text('format = "cmfsim-case"\nversion = 1\n', encoding="utf-8")
-    run = running.Run(running.command(tmp_path, "H", python=sys.executable))
+    run = running.Run(running.predict_command(tmp_path, "H", python=sys.executable))
     while run.code is None:
         time.sleep(0.05)
     code, answer = run.code, run.answer()
@@ -260,7 +281,7 @@ def test_the_panel_shows_progress_and_then_the_face(panel, monkeypatch):
     widget, slicer = panel
     run = MagicMock(code=None)
     run.poll.return_value = [running.Line("solving H", 0.65)]
-    widget.run, widget.case = run, Path("case.toml")
+    widget.run, widget.case, widget.show = run, Path("case.toml"), widget.showPrediction
     widget.onTimer()
     assert widget.bar.value == 65
     assert widget.run is run
@@ -275,6 +296,44 @@ def test_the_panel_shows_progress_and_then_the_face(panel, monkeypatch):
     run.answer.return_value = {"error": {"kind": "CaseError", "text": "no bone"}}
     widget.onTimer()
     assert slicer.util.errorDisplay.call_args[0][0] == "no bone"
+
+
+def test_the_panel_makes_a_planning_page_and_opens_it(panel, monkeypatch):
+    widget, _ = panel
+    qt = sys.modules["qt"]
+    started = MagicMock()
+    started.return_value.code = None
+    module = sys.modules["CmfSim"]
+    monkeypatch.setattr(module, "Run", started)
+    monkeypatch.setattr(module, "write_case", lambda folder, _: Path(folder) / "case.toml")
+    monkeypatch.setattr(widget.logic, "python", lambda: "python")
+    widget.onPageButton()
+    words = started.call_args[0][0]
+    assert words[3:5] == ["plan", str(widget.case)]
+    assert widget.button.text == widget.pageButton.text == "Stop"
+    started.return_value.poll.return_value = []
+    started.return_value.code = 0
+    widget.onTimer()
+    page = widget.case.parent / "out" / "plan.html"
+    qt.QUrl.fromLocalFile.assert_called_once_with(str(page))
+    assert str(page) in widget.status.text
+    assert widget.pageButton.text == "Make the planning page"
+
+
+def test_a_wheel_beside_the_requirements_is_installed(panel, monkeypatch, tmp_path):
+    """Without one, the package of the registry is asked for."""
+    widget, slicer = panel
+    widget.logic.ensureCmfsim()
+    assert slicer.packaging.pip_ensure.call_args[0][0] == ["cmfsim[imaging]"]
+    resources = tmp_path / "Resources"
+    resources.mkdir()
+    (resources / "requirements.txt").write_text("cmfsim[imaging]\n", encoding="utf-8")
+    wheel = resources / "cmfsim-0.1.0-cp310-abi3-linux_x86_64.whl"
+    wheel.write_bytes(b"")
+    monkeypatch.setattr(sys.modules["CmfSim"], "__file__", str(tmp_path / "CmfSim.py"))
+    widget.logic.ensureCmfsim()
+    asked = slicer.packaging.pip_ensure.call_args[0][0]
+    assert asked == [f"cmfsim[imaging] @ {wheel.as_uri()}"]
 
 
 def test_descriptions_agree():
