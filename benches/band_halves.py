@@ -16,8 +16,7 @@ import numpy as np
 import cmfsim
 from cmfsim.io.results.populations import PARTS
 from cmfsim.lab.benchmark.patients import far_from_models, patients_of
-from cmfsim.lab.benchmark.scores import COVERAGE, calibrated_band
-from cmfsim.lab.benchmark.tables import table
+from cmfsim.lab.benchmark.scores import COVERAGE, calibrated_band, table
 
 # Quantiles of the coverage over splits that are printed.
 ENDS = (0.05, 0.95)

@@ -33,7 +33,7 @@ EDGE_LENGTH = 6.0
 # ends, mm.
 TRIANGLES = 14_000
 BEHIND, ABOVE = 5.0, 60.0
-FILE = Path(__file__).parents[1] / "python" / "cmfsim" / "lab" / "virtual" / "demo" / "truth.npz"
+FILE = Path(__file__).parents[1] / "python" / "cmfsim" / "lab" / "virtual" / "demo_truth.npz"
 
 
 def main(path: Path) -> int:

@@ -36,7 +36,7 @@ from cmfsim.bones.achieved import AchievedMotion as AchievedMotion
 from cmfsim.bones.achieved import AchievedPlan as AchievedPlan
 from cmfsim.bones.achieved import achieved_plan as achieved_plan
 from cmfsim.bones.achieved import measure_motion as measure_motion
-from cmfsim.bones.pairs.matching import MatchOptions as MatchOptions
+from cmfsim.bones.pairs.coherent_motion import MatchOptions as MatchOptions
 from cmfsim.doctor import Examination as Examination
 from cmfsim.doctor import diagnose as diagnose
 from cmfsim.doctor import examine as examine
@@ -129,7 +129,7 @@ from cmfsim.lab.virtual import drawn_patient as drawn_patient
 from cmfsim.lab.virtual import virtual_patients as virtual_patients
 from cmfsim.lab.virtual import virtual_population as virtual_population
 from cmfsim.lab.virtual import write_virtual_patient as write_virtual_patient
-from cmfsim.lab.virtual.phantom_case import write_phantom_case as write_phantom_case
+from cmfsim.lab.virtual.demo import write_phantom_case as write_phantom_case
 from cmfsim.meshing import MeshOptions as MeshOptions
 from cmfsim.meshing import TissueMesh as TissueMesh
 from cmfsim.meshing import TissueRegion as TissueRegion
@@ -262,7 +262,6 @@ from cmfsim.values.dental_arch import DentalArch as DentalArch
 from cmfsim.values.finding import Finding as Finding
 from cmfsim.values.image_data import ImageData as ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS
-from cmfsim.values.lifted_tissue import LiftedTissue as LiftedTissue
 from cmfsim.values.mesh_report import MeshReport as MeshReport
 from cmfsim.values.moduli import FatModuli as FatModuli
 from cmfsim.values.moduli import MuscleModuli as MuscleModuli
@@ -274,6 +273,7 @@ from cmfsim.values.motion import rigid_motion as rigid_motion
 from cmfsim.values.musculature import MuscleSurface as MuscleSurface
 from cmfsim.values.musculature import Musculature as Musculature
 from cmfsim.values.node_kinds import NodeKinds as NodeKinds
+from cmfsim.values.patient_model import LiftedTissue as LiftedTissue
 from cmfsim.values.patient_model import PatientModel as PatientModel
 from cmfsim.values.prediction import MODELS as MODELS
 from cmfsim.values.prediction import Prediction as Prediction

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim._core import Surface, rigid_fit
 from cmfsim.bones.motion import RemovedBone, missing_patches
-from cmfsim.bones.pairs.coherent_motion import RigidPiece, coherent_motion
-from cmfsim.bones.pairs.matching import MatchOptions, lay_on
+from cmfsim.bones.pairs.coherent_motion import MatchOptions, RigidPiece, coherent_motion, lay_on
 from cmfsim.bones.pairs.paired_surfaces import StrayPatch, paired_shape, stray_patches
 from cmfsim.bones.pairs.shape_fit import ShapeFit
 from cmfsim.errors import RegistrationError, RegistrationInputError

@@ -7,14 +7,12 @@ from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
 from cmfsim.cli.options import add_band_options, file, number, switch, whole
 from cmfsim.cli.patients import (
     case_commands,
-    demo_command,
     landmarks_command,
     plan_command,
     scene_commands,
     template_commands,
-    view_command,
 )
-from cmfsim.cli.patients.splint_command import add_splint
+from cmfsim.cli.patients.plan_command import add_splint
 from cmfsim.cli.research import lab_commands, study_commands
 from cmfsim.cli.research.lab_commands import add_population_commands
 from cmfsim.io import result_suffixes
@@ -98,13 +96,13 @@ def _add_demo(commands: Any, common: argparse.ArgumentParser) -> None:
         demo,
         "folder",
         "FOLDER",
-        f"new, empty or from an earlier demo (default {demo_command.DEMO_FOLDER})",
+        f"new, empty or from an earlier demo (default {scene_commands.DEMO_FOLDER})",
         nargs="?",
-        default=demo_command.DEMO_FOLDER,
+        default=scene_commands.DEMO_FOLDER,
     )
     number(demo, "--edge-length", "H", "tet edges, mm (default 6)", default=6.0)
     switch(demo, "--no-open", "do not open the report")
-    demo.set_defaults(run=demo_command.demo, models=demo_command.DEMO_MODELS)
+    demo.set_defaults(run=scene_commands.demo, models=scene_commands.DEMO_MODELS)
 
 
 def _add_init(commands: Any, common: argparse.ArgumentParser) -> None:
@@ -176,7 +174,7 @@ def _add_view(commands: Any, common: argparse.ArgumentParser) -> None:
         help="which of several predictions (default: the last of H, M, H+S, M+S)",
     )
     file(view, "--screenshot", "PNG", "write a picture instead of opening a window")
-    view.set_defaults(run=view_command.view)
+    view.set_defaults(run=case_commands.view)
 
 
 def _add_phantom(commands: Any, common: argparse.ArgumentParser) -> None:

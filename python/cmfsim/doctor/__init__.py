@@ -15,7 +15,13 @@ from cmfsim.doctor.evidence import gather
 from cmfsim.doctor.report import findings_text as findings_text
 from cmfsim.doctor.sites.landmarks import check_automatic
 from cmfsim.doctor.sites.placement import check_placement
-from cmfsim.doctor.surfaces import check_image, check_mesh_size, check_surfaces
+from cmfsim.doctor.surfaces import (
+    check_ends,
+    check_image,
+    check_lips,
+    check_mesh_size,
+    check_surfaces,
+)
 from cmfsim.doctor.surgery.moved_bones import check_moved
 from cmfsim.doctor.surgery.operation import (
     check_after,
@@ -28,7 +34,6 @@ from cmfsim.doctor.surgery.operation import (
 from cmfsim.doctor.surgery.plan import SizedMotion as SizedMotion
 from cmfsim.doctor.surgery.plan import check_motion_size as check_motion_size
 from cmfsim.doctor.surgery.plan import state_plan
-from cmfsim.doctor.tissue_ends import check_ends, check_lips
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import SEVERITIES, Finding

@@ -7,7 +7,7 @@ from dataclasses import replace
 from cmfsim._core import PRESETS
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
-from cmfsim.muscles.mixing import moduli_findings
+from cmfsim.muscles.equivalent import moduli_findings
 from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.muscles.template.morphing import missing_landmarks, too_few
 from cmfsim.registration import match_landmarks

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from cmfsim.drafting.case_lines import Taken
+from cmfsim.drafting.choices import Taken
 from cmfsim.drafting.draft import CaseDraft, draft_case
 from cmfsim.drafting.finds import CASE_FILE, EXTRACTED
 from cmfsim.drafting.gathering import gather

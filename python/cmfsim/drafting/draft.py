@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.drafting.case_lines import Taken, Text, legible, quoted
-from cmfsim.drafting.choices import choose_images, choose_landmarks
+from cmfsim.drafting.choices import Taken, Text, choose_images, choose_landmarks, legible, quoted
 from cmfsim.drafting.finds import ImageFind, LandmarkFind
 from cmfsim.drafting.gathering import Gathered
 from cmfsim.drafting.motions import (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.drafting.case_lines import Taken, quoted
+from cmfsim.drafting.choices import Taken, quoted
 from cmfsim.drafting.finds import OtherFind, SurfaceFind, TransformFind
 from cmfsim.drafting.roles import MOVING, safe_key
 from cmfsim.drafting.scene_finds import LooseMotion

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.drafting.case_lines import Taken, Text, quoted
-from cmfsim.drafting.choices import Images, Marks
+from cmfsim.drafting.choices import Images, Marks, Taken, Text, quoted
 from cmfsim.drafting.finds import EXTRACTED, ImageFind, LandmarkFind, SurfaceFind
 from cmfsim.drafting.gathering import Gathered
 from cmfsim.drafting.motions import Plan

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.errors import CaseInputError, LandmarkError, LandmarkInputError, RegistrationInputError
-from cmfsim.evaluation.correspondence import Matches, Skin, match_skins
-from cmfsim.evaluation.regions import skin_regions
+from cmfsim.evaluation.regions import Matches, Skin, match_skins, skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
 from cmfsim.values.checks import Floats, as_indices, as_positive, as_rows, check_one_of, frozen

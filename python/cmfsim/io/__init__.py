@@ -26,11 +26,11 @@ from cmfsim.io.landmark_files import write_landmarks as write_landmarks
 from cmfsim.io.meshes import ply
 from cmfsim.io.meshes.mesh_files import read_tet_mesh as read_tet_mesh
 from cmfsim.io.results.metrics import write_metrics as write_metrics
-from cmfsim.io.results.models import write_model as write_model
 from cmfsim.io.results.predictions import read_parts as read_parts
 from cmfsim.io.results.predictions import write_prediction as write_prediction
 from cmfsim.io.results.result_files import read_result as read_result
 from cmfsim.io.results.result_files import result_suffixes as result_suffixes
+from cmfsim.io.results.result_files import write_model as write_model
 from cmfsim.io.results.result_files import write_result as write_result
 from cmfsim.io.slicer.output import write_slicer_bundle as write_slicer_bundle
 from cmfsim.io.slicer.transforms import read_transform as read_transform

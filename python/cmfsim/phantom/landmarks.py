@@ -7,9 +7,8 @@ from typing import Protocol
 import numpy as np
 
 from cmfsim.phantom.geometry.shapes import Level
-from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp
 from cmfsim.phantom.grid import Field, to_surface
-from cmfsim.phantom.parameters import HeadParameters
+from cmfsim.phantom.parameters import FaceWarp, HeadParameters, JawWarp
 from cmfsim.values.checks import Floats, frozen
 
 # Rays are sampled at this step before the crossing is halved down, mm.

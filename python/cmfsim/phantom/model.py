@@ -9,14 +9,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.phantom import scan
 from cmfsim.phantom.geometry.shapes import Level, Shape, Within, smooth_max
-from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp, JawWarped
-from cmfsim.phantom.grid import Field, level_grid, level_surface
+from cmfsim.phantom.grid import (
+    COUCH_FOAM,
+    COUCH_GAP,
+    COUCH_SHELL,
+    HOUNSFIELD,
+    Field,
+    add_couch,
+    add_metal,
+    level_grid,
+    level_surface,
+    mixed,
+    noisy,
+)
 from cmfsim.phantom.head import HEAD_BOX, skin_shape
 from cmfsim.phantom.landmarks import find_skin_landmarks, find_skull_landmarks
 from cmfsim.phantom.muscles import Muscle, make_muscles
-from cmfsim.phantom.parameters import HeadParameters
+from cmfsim.phantom.parameters import FaceWarp, HeadParameters, JawWarp, JawWarped
 from cmfsim.phantom.skull import (
     airway_shape,
     brain_shape,
@@ -396,12 +406,12 @@ class PhantomHead:
             raise CaseInputError(f"noise is {noise:g} HU: must be 0 or more")
         step, axes = self._grid(spacing)
         if couch:
-            more = scan.COUCH_GAP + scan.COUCH_FOAM + 2.0 * scan.COUCH_SHELL
+            more = COUCH_GAP + COUCH_FOAM + 2.0 * COUCH_SHELL
             beyond = axes[1][-1] + step[1] * np.arange(1.0, np.ceil(more / step[1]) + 1.0)
             axes = (axes[0], np.concatenate([axes[1], beyond]), axes[2])
         level = self._levels(axes, LEAN_DEPTH + 2.0, ("brain",))
         width = float(np.cbrt(np.prod(step)))
-        image = np.full(level["skin"].shape, scan.HOUNSFIELD["air"], dtype=np.float32)
+        image = np.full(level["skin"].shape, HOUNSFIELD["air"], dtype=np.float32)
         muscle = self._muscle_grid(axes, level["skin"], level["bone"])
         layers: tuple[tuple[str, Level], ...] = (
             ("skin", level["skin"]),
@@ -415,16 +425,16 @@ class PhantomHead:
             ("tooth", np.maximum(level["upper_teeth"], level["lower_teeth"])),
         )
         for tissue, inside in layers:
-            scan.mixed(image, scan.HOUNSFIELD[tissue], inside, width)
+            mixed(image, HOUNSFIELD[tissue], inside, width)
         grid = (axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :])
         if couch:
             rows = np.flatnonzero((level["skin"] > 0.0).any(axis=(0, 2)))
-            scan.add_couch(image, grid, float(axes[1][rows[-1]]))
+            add_couch(image, grid, float(axes[1][rows[-1]]))
         if metal:
             pieces = metal_pieces()
             pieces[:, :3] = self.warp.forward(pieces[:, :3])
-            scan.add_metal(image, grid, pieces, step, seed)
-        return ImageData(scan.noisy(image, noise, seed), step, [axis[0] for axis in axes])
+            add_metal(image, grid, pieces, step, seed)
+        return ImageData(noisy(image, noise, seed), step, [axis[0] for axis in axes])
 
 
 def _crop(

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from cmfsim.phantom.geometry.courses import COURSES, Course, Row
 from cmfsim.phantom.geometry.shapes import REACH, Box, Level, Tube, smooth_curve, smooth_max
-from cmfsim.phantom.geometry.warp import FaceWarp, JawWarp
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
+from cmfsim.phantom.parameters import FaceWarp, JawWarp
 from cmfsim.values.checks import Floats, as_rows, frozen
 
 # Muscle stays this far below the skin, mm.

@@ -4,27 +4,30 @@ Cameras look along the patient's axes (LPS) and depend on the bounds alone, so t
 plans lie on top of each other.
 """
 
+import base64
 import contextlib
 import os
+import pickle
 import struct
 import sys
 import textwrap
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseError, CaseInputError
-from cmfsim.processes.worker import SILENT, Worker
+from cmfsim.processes.worker import SILENT, Worker, WorkerEndedError
 from cmfsim.values.checks import Floats, as_positive
 
 # What draws a picture at a path: a function of this package with all else that it takes, which can
@@ -402,3 +405,75 @@ def pyvista_module() -> Any:
             f"pictures are drawn with PyVista, which cannot be imported ({error}): pip install "
             "'.[view]' in cmfsim's folder, and install libGL if it is missing (Debian: libgl1)"
         ) from error
+
+
+class Painter:
+    """A process that draws pictures one after another while the caller continues.
+
+    It starts with the first picture, or with `load`. Used in a `with` statement, it ends with that.
+    """
+
+    def __init__(self) -> None:
+        self._queue = ThreadPoolExecutor(1)
+        self._worker: Worker | None = None
+
+    def __enter__(self) -> "Painter":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._worker is not None:
+            self._worker.end()
+        self._queue.shutdown(cancel_futures=True)
+
+    def load(self) -> None:
+        """Starts the process, which loads its libraries: ahead of a picture that is to come."""
+        # Where this Python cannot start another, pictures are drawn in turn.
+        if self._worker is None and sys.executable:
+            self._worker = Worker(threads=1)
+            self._queue.submit(self._load, self._worker)
+
+    def begin(self, picture: Picture, path: Path) -> "Future[None]":
+        """The picture to come; its result raises what drawing it here would.
+
+        What the picture shows is taken now: it may not change afterwards.
+        """
+        self.load()
+        if self._worker is None:
+            return self._queue.submit(picture, path)
+        return self._queue.submit(self._draw, self._worker, picture, path)
+
+    @staticmethod
+    def _load(worker: Worker) -> None:
+        # What is wrong is raised for the first picture.
+        with contextlib.suppress(CaseError):
+            worker.ask("cmfsim.pictures.canvas:load", {})
+
+    @staticmethod
+    def _draw(worker: Worker, picture: Picture, path: Path) -> None:
+        packed = base64.b64encode(pickle.dumps(picture)).decode()
+        try:
+            worker.ask(
+                "cmfsim.pictures.canvas:draw_packed",
+                {"path": str(path.absolute()), "packed": packed},
+            )
+        except WorkerEndedError as error:
+            raise CaseInputError(
+                f"{path.name}: the picture cannot be drawn (OpenGL does not work); {NO_OPENGL}"
+            ) from error
+
+
+def load() -> None:
+    """Loads the libraries that draw."""
+    pyvista_module().Plotter  # noqa: B018 (loaded when it is first asked for)
+
+
+def draw_packed(path: str, packed: str) -> None:
+    """Draws a picture of `Painter`, in its process."""
+    picture: Picture = pickle.loads(base64.b64decode(packed))  # noqa: S301 (of the own parent)
+    with without_probe():
+        picture(Path(path))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, Picture, View, add_scale_bar, bounds, draw, polydata
-from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
+from cmfsim.pictures.faces import SkinEnds, skin_ends, trimmed
 from cmfsim.values.checks import Floats, as_floats, as_positive
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import SkinBand

@@ -1,10 +1,14 @@
-"""Pictures of a plan and of the face that it is predicted to give."""
+"""Pictures of a plan and of the face that it is predicted to give, also on its way there."""
 
 import base64
 import html
+import io
 import os
+import shutil
+import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,13 +16,69 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
-from cmfsim.pictures.canvas import SIZE, Picture, Shown, View, add_scale_bar, bounds, draw, polydata
-from cmfsim.pictures.skin_ends import SkinEnds, skin_ends, trimmed
+from cmfsim.pictures.canvas import (
+    SIZE,
+    Picture,
+    Shown,
+    View,
+    add_scale_bar,
+    bounds,
+    draw,
+    drawn,
+    polydata,
+    write_whole,
+)
+from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData
+
+# What is left off, in edges.
+RIM = 2.0
+# A skin's upper end is a cut, not a crown, where its topmost rim is wider than this share of it.
+CUT_WIDTH = 0.5
+
+
+@dataclass(frozen=True)
+class SkinEnds:
+    """How far back, down and up a skin is drawn, mm along P and S."""
+
+    back: float
+    below: float
+    above: float
+
+    def within(self, corners: Floats) -> Floats:
+        """The box between these ends, (2, 3)."""
+        box: Floats = np.array(corners)
+        box[1, 1] = min(box[1, 1], self.back)
+        box[0, 2], box[1, 2] = max(box[0, 2], self.below), min(box[1, 2], self.above)
+        return box
+
+
+def skin_ends(skin: SurfaceData) -> SkinEnds:
+    """The ends of a skin, short of its ragged rim; of one a few edges across nothing is cut."""
+    vertices, triangles = skin.vertices, skin.triangles
+    edge = float(np.median(np.linalg.norm(np.diff(vertices[triangles[:, :2]], axis=1), axis=2)))
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    if (high - low).max() < 20.0 * RIM * edge:
+        return SkinEnds(*(float(value) for value in (high[1], low[2], high[2])))
+    top = vertices[vertices[:, 2] > high[2] - RIM * edge]
+    is_cut = np.ptp(top[:, 0]) > CUT_WIDTH * (high[0] - low[0])
+    return SkinEnds(
+        back=float(high[1]) - RIM * edge,
+        below=float(low[2]) + RIM * edge,
+        above=float(high[2]) - (RIM * edge if is_cut else 0.0),
+    )
+
+
+def trimmed(shape: Any, ends: SkinEnds) -> Any:
+    """A skin as PyVista has it, cut off at its ends; values at its vertices are kept."""
+    shape = shape.clip("y", origin=(0, ends.back, 0))
+    shape = shape.clip("-z", origin=(0, 0, ends.below))
+    return shape.clip("z", origin=(0, 0, ends.above))
+
 
 # Of six views in two rows, pixels.
 TWO_ROWS = (1650, 1240)
@@ -198,3 +258,99 @@ def picture_motions(
     views = tuple(View(name, name) for name in ("right", "front", "left"))
     legend = [*colours.items(), ("before", GHOST_COLOUR)]
     draw(path, views, corners, size, paint, legend=legend, words=words)
+
+
+# Pixels, even as films need it; pictures of the way, and how long each and both ends are seen, ms.
+FILM_SIZE, STEPS, EACH, HELD = (960, 520), 12, 80, 1000
+# What moves by more than this, mm, decides what is seen, with so much of its size around it.
+MOVES, AROUND = 0.1, 0.15
+ENDINGS = (".gif", ".mp4")
+
+
+def animate_face(
+    path: str | os.PathLike[str],
+    before: SurfaceData,
+    after: Floats,
+    colours: NDArray[np.uint8] | None = None,
+) -> None:
+    """Writes an animation of a face, from the front and the left: before, after, and back.
+
+    path: Ends in `.gif`, or in `.mp4` where ffmpeg is installed.
+    after: Its vertices after the operation, mm.
+    Raises `CaseError`: As `Prediction.animate`.
+    """
+    path = Path(path)
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise CaseInputError(f"{path.name}: an animation is written as {' or '.join(ENDINGS)}")
+    if ending == ".mp4" and shutil.which("ffmpeg") is None:
+        raise CaseInputError(
+            f"{path.name}: films need ffmpeg, which is not installed: write a .gif"
+        )
+    shift = after - before.vertices
+    moving = np.linalg.norm(shift, axis=1) > MOVES
+    if not moving.any():
+        raise CaseInputError(f"{path.name}: no point of the face moves by more than {MOVES} mm")
+    corners = bounds([before.vertices[moving], after[moving]])
+    corners += AROUND * np.ptp(corners, axis=0) * np.array([[-1.0], [1.0]])
+    frame = partial(_frame, path.name, colours, corners)
+    frames = [
+        frame(share, polydata(before.vertices + share * shift, before.triangles))
+        # Slowly at both ends.
+        for share in 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, STEPS + 1))
+    ]
+    frames += frames[-2:0:-1]
+    times = [HELD if i % STEPS == 0 else EACH for i in range(len(frames))]
+    data = _gif(frames, times) if ending == ".gif" else _film(path.name, frames, times)
+    write_whole(path, data)
+
+
+def _frame(
+    name: str, colours: NDArray[np.uint8] | None, corners: Floats, share: float, shape: Any
+) -> NDArray[np.uint8]:
+    def paint(plotter: Any, view: View) -> None:
+        del view
+        add_skin(plotter, shape, colours)
+
+    way = {0.0: "before", 1.0: "after"}.get(round(share, 3), f"{share:.0%} of the way")
+    return drawn(
+        name,
+        (View("front", f"{way}, front"), View("left", f"{way}, left")),
+        corners,
+        FILM_SIZE,
+        paint,
+    )
+
+
+def _gif(frames: Sequence[NDArray[np.uint8]], times: Sequence[int]) -> bytes:
+    picture = third_party("PIL.Image", "animations are written", "report")
+    # The colours of one frame for all: others would flicker.
+    first = picture.fromarray(frames[STEPS // 2]).quantize(256)
+    rest = [picture.fromarray(frame).quantize(palette=first, dither=0) for frame in frames]
+    file = io.BytesIO()
+    rest[0].save(
+        file,
+        "GIF",
+        save_all=True,
+        append_images=rest[1:],
+        duration=[*times],
+        loop=0,
+        optimize=False,
+    )
+    return file.getvalue()
+
+
+def _film(name: str, frames: Sequence[NDArray[np.uint8]], times: Sequence[int]) -> bytes:
+    """The bytes of an MP4, which is streamed, so that it can be piped; held frames are repeated."""
+    repeated = [f.tobytes() for f, ms in zip(frames, times, strict=True) for _ in range(ms // EACH)]
+    width, height = FILM_SIZE
+    command = (
+        f"ffmpeg -v error -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {1000 / EACH} -i - "
+        "-pix_fmt yuv420p -movflags frag_keyframe+empty_moov -f mp4 -"
+    )
+    given = b"".join(repeated)
+    run = subprocess.run(command.split(), input=given, capture_output=True, check=False)  # noqa: S603
+    if run.returncode or not run.stdout:
+        reason = run.stderr.decode(errors="replace").strip()
+        raise CaseInputError(f"{name}: ffmpeg ended with code {run.returncode}: {reason[-200:]}")
+    return run.stdout

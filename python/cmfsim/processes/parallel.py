@@ -1,5 +1,6 @@
 """Jobs in processes of their own, with one thread each, or on a cluster."""
 
+import contextlib
 import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -7,9 +8,42 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor, as_completed
 from typing import Any, TypeVar
 
 from cmfsim import errors
-from cmfsim.errors import CaseError
-from cmfsim.processes.cluster import on_cluster
+from cmfsim.errors import CaseError, CaseInputError, third_party
 from cmfsim.processes.worker import Worker
+
+# How long a scheduler may take to answer, s.
+ANSWER_TIME = 10.0
+
+
+def on_cluster(
+    scheduler: str, function: Callable[..., Any], jobs: Sequence[Sequence[Any]]
+) -> Iterator[tuple[int, Any, Exception | None]]:
+    """What a function answers to each job, with the job's index, as they end.
+
+    A job whose machine is lost is given to another one, as Dask does it; only one that loses
+    several machines in a row is given up.
+
+    scheduler: Address of the cluster.
+    function: The machines import it by its name.
+    jobs: Arguments.
+    Yields: Index, and either the answer or what the function raised, or the cluster for it.
+    Raises `CaseError`: No Dask installed, or no cluster at the address.
+    """
+    distributed = third_party("distributed", "work is distributed over a cluster", "study")
+    try:
+        client = distributed.Client(scheduler, timeout=ANSWER_TIME)
+    except (OSError, ValueError) as error:
+        raise CaseInputError(f"no Dask scheduler answers at {scheduler!r}: {error}") from error
+    with client, contextlib.ExitStack() as stack:
+        futures = [client.submit(function, *job, pure=False) for job in jobs]
+        # Whoever stops listening wants no more of it.
+        stack.callback(client.cancel, futures)
+        index = {future.key: at for at, future in enumerate(futures)}
+        for future in distributed.as_completed(futures):
+            failure = future.exception()
+            answer = None if failure is not None else future.result()
+            yield index[future.key], answer, failure
+
 
 Job = TypeVar("Job")
 Made = TypeVar("Made")

@@ -5,8 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from cmfsim.errors import CaseInputError
-from cmfsim.report.band import band_section
-from cmfsim.report.causes import not_operated_blocks, statistics_table, thickness_blocks
+from cmfsim.report.band import band_section, not_operated_blocks, statistics_table, thickness_blocks
 from cmfsim.report.clinical import clinical_sections
 from cmfsim.report.document import (
     NOTHING,
@@ -19,7 +18,7 @@ from cmfsim.report.document import (
     View,
     number,
 )
-from cmfsim.report.labels import MEASURES, MESH, MUSCLES, labelled
+from cmfsim.report.page import MEASURES, MESH, MUSCLES, labelled
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, counted, grouped
 

@@ -15,7 +15,7 @@ from cmfsim.report.document import (
     number,
     plain_line,
 )
-from cmfsim.report.labels import MEASURES
+from cmfsim.report.page import MEASURES
 
 Values = Mapping[str, Any]
 

@@ -1,15 +1,18 @@
 """Many cases by several models, each in a process of its own and kept once done; their report."""
 
 import json
+import logging
 import os
 import re
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cmfsim.errors import CaseError, CaseInputError, CmfsimError
+from cmfsim.doctor import examine, findings_text
+from cmfsim.errors import CaseError, CaseInputError, CmfsimError, error_text
 from cmfsim.evaluation import NO_CHANGE, DistanceStatistics, ErrorTable
 from cmfsim.io import Case, CaseChanges, Cohort, finish_writing, replacing_files
 from cmfsim.io.files.folders import check_below, check_writable
@@ -22,10 +25,10 @@ from cmfsim.io.results.metrics import (
     skin_errors_file,
 )
 from cmfsim.pictures import chart_errors, picture_distance_grid
-from cmfsim.pipeline.evaluating import evaluation_key
-from cmfsim.pipeline.outputs.results import optional_pictures, write_report_page
-from cmfsim.processes.cluster import on_cluster
-from cmfsim.processes.parallel import as_they_end
+from cmfsim.pipeline.evaluating import evaluate, evaluation_key
+from cmfsim.pipeline.outputs.results import optional_pictures, write_report_page, write_results
+from cmfsim.pipeline.predicting import case_for_models, prepare
+from cmfsim.processes.parallel import as_they_end, on_cluster
 from cmfsim.processes.worker import Worker, WorkerEndedError, WorkerFailedError
 from cmfsim.report import Figure, study_document
 from cmfsim.report.study import table3_text
@@ -274,7 +277,7 @@ def _evaluated(job: CaseJob, start: Callable[..., Worker]) -> Mapping[str, Any]:
     log_file.unlink(missing_ok=True)
     with log_file.open("xb") as log, start(threads=job.threads, log=log) as worker:
         try:
-            if worker.ask("cmfsim.study.worker:evaluate_case", case).values:
+            if worker.ask("cmfsim.study.cohort:evaluate_case", case).values:
                 return read_evaluation(output)
         except WorkerEndedError as ended:
             code = ended.code
@@ -414,3 +417,37 @@ def _drawn(folder: Path, errors: Errors) -> Iterator[tuple[str, str]]:
             },
         )
         yield name, FIGURE_10_CAPTION
+
+
+_log = logging.getLogger(__name__)
+
+
+def evaluate_case(file: str, output: str, changes: str, models: Sequence[str]) -> bool:
+    """Whether a case was compared, though some of its models may have failed.
+
+    It writes what `cmfsim evaluate` writes; if so, `metrics.json` is whole and new.
+
+    file, output: The case, and its output folder.
+    changes: Of its settings, as `CaseChanges.as_json` writes them, or an empty text.
+    """
+    logging.basicConfig(format="cmfsim: %(message)s", level=logging.WARNING, stream=sys.stderr)
+    try:
+        made = CaseChanges.from_json(changes) if changes else None
+        return _compared(replace(Case.load(file, changes=made), output=Path(output)), models)
+    except (CmfsimError, OSError, ValueError, MemoryError) as error:
+        _log.error("error: %s", error_text(error))
+        return False
+
+
+def _compared(case: Case, models: Sequence[str]) -> bool:
+    """Whether the doctor let the case pass; it was then predicted, compared and written."""
+    prepare(case, report=True, evaluation=True)
+    found = examine(case_for_models(case, models), models=models).findings
+    if any(finding.severity == "error" for finding in found):
+        _log.error("%s", findings_text(found))
+        return False
+    evaluation = evaluate(case, models, check=False, findings=found)
+    write_results(
+        case.output, evaluation.predictions, models, stage=_log.info, evaluation=lambda: evaluation
+    )
+    return True

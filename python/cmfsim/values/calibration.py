@@ -17,7 +17,7 @@ import numpy as np
 
 from cmfsim.errors import CalibrationError
 from cmfsim.values.checks import Floats, as_number, as_positive, as_text, check_one_of
-from cmfsim.values.model_names import MODELS
+from cmfsim.values.solver_options import MODELS
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import Floats, Frozen, check_one_of, listing
 from cmfsim.values.finding import Finding, counted_findings
-from cmfsim.values.model_names import MODELS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import no_progress
 from cmfsim.values.scene import Scene, SceneResult
 from cmfsim.values.skin_motion import carried_points
+from cmfsim.values.solver_options import MODELS
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ class Prediction(Frozen):
             (also `ValueError`) Another ending; a face that does not move; Pillow, PyVista, OpenGL
             or ffmpeg is missing.
         """
-        animate = _above("pictures.animation").animate_face
+        animate = _above("pictures.faces").animate_face
         animate(path, self.face_before, self.face.vertices, self.face_colours)
 
     def to_pyvista(self) -> Any:

@@ -1,4 +1,4 @@
-"""Solver options: how a scene is solved."""
+"""Solver options, and the names of the models that are solved."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -6,6 +6,11 @@ from typing import Any
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import as_positive, check_one_of
+
+# Kim et al. 2010, section 3.2: homogeneous or with muscles, without or with sliding at teeth and
+# mucosa.
+MODELS = ("H", "M", "H+S", "M+S")
+
 
 CONTACTS = ("bilateral", "unilateral")
 

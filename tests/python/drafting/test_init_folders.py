@@ -9,7 +9,7 @@ import pytest
 import cmfsim
 from cmfsim.cli import main
 from cmfsim.drafting import init_case
-from cmfsim.drafting.case_lines import quoted
+from cmfsim.drafting.choices import quoted
 from cmfsim.drafting.roles import name_role
 from cmfsim.io.files.reading_writing import toml_module
 from dicom_series import axial, write_series

@@ -9,7 +9,7 @@ import cmfsim
 import head_case
 import label_images
 from cmfsim.drafting import init_case, written
-from cmfsim.drafting.case_lines import Text
+from cmfsim.drafting.choices import Text
 from cmfsim.drafting.roles import name_role
 from cmfsim.drafting.written import UNDECIDED
 from scene_text import model, pack, shift, transform, write_scene

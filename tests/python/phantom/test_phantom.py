@@ -11,8 +11,7 @@ from angles import angle_between
 from cmfsim import HeadParameters, PhantomHead, make_head
 from cmfsim.phantom import BONES, LABELS, PARAMETER_RANGES
 from cmfsim.phantom.geometry.courses import COURSES
-from cmfsim.phantom.grid import gradient_at, level_grid
-from cmfsim.phantom.scan import HOUNSFIELD
+from cmfsim.phantom.grid import HOUNSFIELD, gradient_at, level_grid
 
 pytest.importorskip("skimage")
 

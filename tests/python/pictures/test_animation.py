@@ -5,8 +5,8 @@ import pytest
 
 import cmfsim
 import meshes
-from cmfsim.pictures import animation
-from cmfsim.pictures.animation import SIZE, animate_face
+from cmfsim.pictures import faces
+from cmfsim.pictures.faces import FILM_SIZE, animate_face
 
 pytest.importorskip("pyvista")
 image = pytest.importorskip("PIL.Image")
@@ -17,7 +17,7 @@ MOVED = BALL.vertices + np.where(BALL.vertices[:, 1:2] < 0.0, (0.0, -20.0, 0.0),
 
 @pytest.fixture(autouse=True)
 def _few(monkeypatch):
-    monkeypatch.setattr(animation, "STEPS", 2)
+    monkeypatch.setattr(faces, "STEPS", 2)
 
 
 def test_the_front_goes_forwards_and_comes_back(tmp_path):
@@ -27,12 +27,12 @@ def test_the_front_goes_forwards_and_comes_back(tmp_path):
         pytest.skip(f"cannot draw here: {error}")
     fronts, times = [], []
     with image.open(tmp_path / "face.gif") as gif:
-        assert (gif.size, gif.n_frames) == (SIZE, 4)
+        assert (gif.size, gif.n_frames) == (FILM_SIZE, 4)
         for number in range(4):
             gif.seek(number)
             times.append(gif.info["duration"])
             # The foremost column of the left view that shows skin, above its caption.
-            half = np.asarray(gif.convert("RGB"))[: SIZE[1] - 60, SIZE[0] // 2 + 2 :]
+            half = np.asarray(gif.convert("RGB"))[: FILM_SIZE[1] - 60, FILM_SIZE[0] // 2 + 2 :]
             fronts.append(np.flatnonzero((half.min(axis=2) < 230).any(axis=0))[0])
     assert times == [1000, 80, 1000, 80]
     assert fronts[0] > fronts[1] > fronts[2]
@@ -45,9 +45,11 @@ def test_a_film_gets_every_frame_as_long_as_it_is_seen(tmp_path, monkeypatch):
     tool.write_text("#!/bin/sh\nwc -c\n")
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    monkeypatch.setattr(animation, "drawn", lambda *_: np.zeros((*SIZE[::-1], 3), np.uint8))
+    monkeypatch.setattr(faces, "drawn", lambda *_: np.zeros((*FILM_SIZE[::-1], 3), np.uint8))
     animate_face(tmp_path / "face.mp4", BALL, MOVED)
-    assert int((tmp_path / "face.mp4").read_bytes()) == 3 * SIZE[0] * SIZE[1] * (2 * 12 + 2)
+    assert int((tmp_path / "face.mp4").read_bytes()) == 3 * FILM_SIZE[0] * FILM_SIZE[1] * (
+        2 * 12 + 2
+    )
     tool.write_text("#!/bin/sh\necho no such codec >&2; exit 3\n")
     with pytest.raises(
         cmfsim.CaseError, match=r"face\.mp4: ffmpeg ended with code 3: no such codec"

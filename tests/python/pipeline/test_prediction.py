@@ -16,7 +16,7 @@ import phantom_case
 from cmfsim.cli import main
 from cmfsim.pipeline.evaluating import evaluation_key
 from cmfsim.report import case_document, render_page
-from cmfsim.study.worker import _evaluated
+from cmfsim.study.cohort import _evaluated
 from shared_values import drawn_levels, without_pictures
 
 pytest.importorskip("scipy")

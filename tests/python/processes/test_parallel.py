@@ -63,7 +63,7 @@ def test_a_cluster_gives_the_same_and_survives_a_lost_machine(tmp_path):
 def test_a_cluster_that_does_not_answer_is_bad_input(monkeypatch):
     """Nothing listens there."""
     pytest.importorskip("distributed")
-    monkeypatch.setattr("cmfsim.processes.cluster.ANSWER_TIME", 1.0)
+    monkeypatch.setattr("cmfsim.processes.parallel.ANSWER_TIME", 1.0)
     with pytest.raises(CaseInputError, match="no Dask scheduler answers at"):
         list(answers("os:getpid", [{}], 1, "tcp://127.0.0.1:9"))
 

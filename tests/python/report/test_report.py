@@ -9,7 +9,7 @@ import meshes
 from cmfsim.report import Document, Figure, Note, Section, Table, render_page
 from cmfsim.report.clinical import clinical_sections
 from cmfsim.report.document import number
-from cmfsim.report.labels import MESH, MUSCLES, labelled
+from cmfsim.report.page import MESH, MUSCLES, labelled
 
 pytest.importorskip("jinja2")
 

@@ -28,12 +28,12 @@ from cmfsim.lab.frontier import frontier as run_frontier
 from cmfsim.lab.frontier.files import GRID, base_verdict, write_frontier
 from cmfsim.lab.virtual import PatientOutcome, virtual_population
 from cmfsim.lab.virtual import virtual_patients as write_patients
+from cmfsim.lab.virtual.demo import write_phantom_case
 from cmfsim.lab.virtual.patient_folder import PATIENTS_WITH_JOINED_LIPS
-from cmfsim.lab.virtual.phantom_case import write_phantom_case
 from cmfsim.lab.virtual.population import OWN, TRUTHS
 from cmfsim.phantom import HeadParameters, make_head
 from cmfsim.values.checks import as_positive
-from cmfsim.values.model_names import MODELS
+from cmfsim.values.solver_options import MODELS
 
 FRONTIER_FOLDER = Path("cmfsim-frontier")
 # Voxel size of the synthetic head's CT, mm.

@@ -30,9 +30,8 @@ from cmfsim.pipeline.outputs.results import (
 )
 from cmfsim.pipeline.predicting import predict_models, prepare
 from cmfsim.report import Note, Table
-from cmfsim.report.band import band_blocks
+from cmfsim.report.band import band_blocks, summary_blocks
 from cmfsim.report.case import motion_blocks
-from cmfsim.report.causes import summary_blocks
 from cmfsim.report.study import study_text
 from cmfsim.study.cohort import CaseOutcome, StudyOptions, run_study, write_study_report
 from cmfsim.study.trials import sensitivity as landmark_sensitivity

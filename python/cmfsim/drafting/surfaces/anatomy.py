@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cmfsim.drafting.case_lines import Taken
+from cmfsim.drafting.choices import Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.values.checks import Floats
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.drafting.case_lines import Taken
+from cmfsim.drafting.choices import Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.drafting.roles import JAWS_OF_TEETH, MOVING, safe_key
 from cmfsim.drafting.surfaces.anatomy import FLIP, SAMPLES, UNITS, Anatomy, Question

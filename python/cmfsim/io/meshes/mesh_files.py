@@ -17,9 +17,8 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import check_readable, named, utf8_path
 from cmfsim.io.meshes.msh import read_msh
 from cmfsim.io.meshes.obj import read_obj
-from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, oriented
+from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, oriented, stated_frame
 from cmfsim.io.meshes.ply import read_ply
-from cmfsim.io.meshes.stated_frames import stated_frame
 from cmfsim.io.meshes.stl import read_stl
 from cmfsim.io.meshes.vtk.legacy import read_vtk_legacy
 from cmfsim.io.meshes.vtk.xml import read_vtk_xml

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io.files.reading_writing import beside, check_readable, named, utf8_path
 from cmfsim.io.meshes.obj import read_obj
+from cmfsim.io.meshes.plain_mesh import stated_frame
 from cmfsim.io.meshes.ply import read_ply
-from cmfsim.io.meshes.stated_frames import stated_frame
 from cmfsim.processes.child import ReaderError, read_in_child
 from cmfsim.processes.worker import Answer, ReadLimits
 from cmfsim.values.checks import Floats

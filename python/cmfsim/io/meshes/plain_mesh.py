@@ -1,8 +1,10 @@
-"""A mesh as a file has it: points, cells, values, checked whoever read it; tets repaired."""
+"""A mesh as a file has it: points, cells, values, the frame that it states; tets repaired."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -186,3 +188,99 @@ def _check_block(block: Cells, count: int) -> None:
             f"{block.type} {row} names point {block.data[row, column]}, but there are {count} "
             f"points (allowed {f'0 to {count - 1}' if count else 'none'})"
         )
+
+
+Integers = NDArray[np.int64]
+# VTK's numbers (vtkCellType.h); other cells keep their number as their name.
+NAMES = {
+    1: "vertex", 3: "line", 5: "triangle", 9: "quad", 10: "tetra", 12: "hexahedron", 13: "wedge",
+    14: "pyramid", 21: "line3", 22: "triangle6", 24: "tetra10",
+}  # fmt: skip
+
+
+def cells_by_type(
+    types: Integers, counts: Integers, corners: Integers
+) -> tuple[tuple[Cells, ...], tuple[Integers, ...]]:
+    """Cells grouped by type, and the number of each in the file.
+
+    types: (m,) int64.
+    counts: (m,) int64. Number of corners of each cell.
+    corners: (sum of counts,) int64.
+    Raises `CaseError`: A cell with another number of corners than its type has.
+    """
+    starts = np.cumsum(counts) - counts
+    blocks, rows = list[Cells](), list[Integers]()
+    for number in dict.fromkeys(types.tolist()):
+        name = NAMES.get(number, f"VTK cell {number}")
+        of_type = np.flatnonzero(types == number)
+        # Polygons and the like differ in their number of corners.
+        for size in np.unique(counts[of_type]):
+            mine = of_type[counts[of_type] == size]
+            wanted = CELL_CORNERS.get(name)
+            if wanted is not None and size != wanted:
+                raise CaseInputError(
+                    f"cell {mine[0]} is a {name} with {size} corners: {wanted} are needed"
+                )
+            blocks.append(Cells(name, corners[starts[mine][:, None] + np.arange(size)]))
+            rows.append(mine)
+    return tuple(blocks), tuple(rows)
+
+
+# As 3D Slicer writes it; and the words of this package's own files.
+SLICER = re.compile(rb"\bSPACE=([A-Za-z]+)")
+OWN = re.compile(rb"^(?:cmfsim |comment |# )LPS mm\b", re.MULTILINE)
+# Headers end before this, bytes: PLY's has the longest.
+MOST_HEADER = 2**16
+STL_HEADER = 80
+
+
+def stated_frame(data: bytes, suffix: str) -> str | None:
+    """The frame in the header of an STL, PLY, OBJ or legacy VTK file; None where it states none.
+
+    data: The whole file.
+    suffix: Its ending in lower case, such as ".stl".
+    Raises `CaseError`: Two frames, or one that is neither LPS nor RAS.
+    """
+    head = _header(data[:MOST_HEADER], suffix)
+    found = {match.upper() for match in SLICER.findall(head)}
+    if len(found) > 1:
+        names = " and ".join(sorted(name.decode() for name in found))
+        raise CaseInputError(f"its header states two frames, {names}: export it again")
+    return stated_in_field(found.pop()) if found else None
+
+
+def is_own_file(path: Path) -> bool:
+    """Whether a surface states "LPS mm" as this package writes it.
+
+    Where a case states another frame, that is used: the writer cannot know what it was given.
+    """
+    with path.open("rb") as file:
+        return OWN.search(_header(file.read(MOST_HEADER), path.suffix.lower())) is not None
+
+
+def stated_in_field(name: bytes) -> str:
+    """The frame of the name that a file gives for its space: "LPS" or "RAS"."""
+    if name not in {b"LPS", b"RAS"}:
+        shown = name[:20].decode("ascii", "replace")
+        raise CaseInputError(
+            f"its header states SPACE={shown}: LPS and RAS are read; export it from 3D Slicer again"
+        )
+    return name.decode()
+
+
+def _header(head: bytes, suffix: str) -> bytes:
+    """The part of a file's first bytes in which a program may state what it likes."""
+    if suffix == ".stl":
+        return head[:STL_HEADER].partition(b"\n")[0]
+    if suffix == ".ply":
+        comments = head.partition(b"end_header")[0].splitlines()
+        return b"\n".join(line for line in comments if line.startswith((b"comment", b"obj_info")))
+    if suffix == ".obj":
+        lines: list[bytes] = []
+        for line in head.splitlines():
+            if line.strip() and not line.startswith(b"#"):
+                break
+            lines.append(line)
+        return b"\n".join(lines)
+    # Legacy VTK: its second line is a title.
+    return b"\n".join(head.split(b"\n", 2)[1:2])

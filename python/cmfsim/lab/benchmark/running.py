@@ -33,11 +33,10 @@ from cmfsim.lab.benchmark.patients import (
     patients_of,
     read_skin_prediction,
 )
-from cmfsim.lab.benchmark.scores import MethodResult, calibrated_band, score
-from cmfsim.lab.benchmark.tables import BenchmarkTable
+from cmfsim.lab.benchmark.scores import BenchmarkTable, MethodResult, calibrated_band, score
 from cmfsim.processes.parallel import answers
 from cmfsim.values.checks import as_number, check_one_of
-from cmfsim.values.model_names import MODELS
+from cmfsim.values.solver_options import MODELS
 
 OWN = (*ENTRIES, *ON_REQUEST)
 PREDICTIONS, RESULTS = "predictions", "benchmark"

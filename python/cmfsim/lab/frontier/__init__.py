@@ -8,10 +8,10 @@ from cmfsim.lab.frontier.choice import reference_choice as reference_choice
 from cmfsim.lab.frontier.choice import sweep_choices as sweep_choices
 from cmfsim.lab.frontier.files import frontier_page as frontier_page
 from cmfsim.lab.frontier.frontier_run import frontier as frontier
+from cmfsim.lab.frontier.rows import SKIN as SKIN
+from cmfsim.lab.frontier.rows import WHOLE as WHOLE
 from cmfsim.lab.frontier.rows import Frontier as Frontier
 from cmfsim.lab.frontier.rows import FrontierRow as FrontierRow
 from cmfsim.lab.frontier.rows import Spread as Spread
 from cmfsim.lab.frontier.rows import pareto_front as pareto_front
-from cmfsim.lab.frontier.skin_points import SKIN as SKIN
-from cmfsim.lab.frontier.skin_points import WHOLE as WHOLE
-from cmfsim.lab.frontier.skin_points import skin_errors as skin_errors
+from cmfsim.lab.frontier.rows import skin_errors as skin_errors

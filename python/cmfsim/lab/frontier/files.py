@@ -9,8 +9,7 @@ from typing import Any
 from cmfsim.errors import CaseInputError
 from cmfsim.io import replacing_files, write_metrics
 from cmfsim.lab.frontier.choice import Choice
-from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread, unbeaten
-from cmfsim.lab.frontier.skin_points import SKIN, WHOLE
+from cmfsim.lab.frontier.rows import SKIN, WHOLE, Frontier, FrontierRow, Spread, unbeaten
 from cmfsim.pictures.charts import write_figure
 
 # Mean error on the skin that a default may have, mm: a tenth of what surgeons can see, and below

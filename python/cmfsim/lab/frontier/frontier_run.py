@@ -16,8 +16,15 @@ from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.io import Case
 from cmfsim.io.files.archives import member_of, read_archive
 from cmfsim.lab.frontier.choice import Choice, case_choice, reference_choice, sweep_choices
-from cmfsim.lab.frontier.rows import Frontier, FrontierRow, Spread, with_front
-from cmfsim.lab.frontier.skin_points import WHOLE, read_points, skin_errors
+from cmfsim.lab.frontier.rows import (
+    WHOLE,
+    Frontier,
+    FrontierRow,
+    Spread,
+    read_points,
+    skin_errors,
+    with_front,
+)
 from cmfsim.lab.frontier.timing import MOVED_FORMAT, STOPPED, Answer, kept, machine, run_job
 from cmfsim.pipeline.building.inputs import input_hashes
 from cmfsim.values.checks import Floats, as_positive

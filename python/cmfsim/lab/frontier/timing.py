@@ -21,7 +21,7 @@ from cmfsim.errors import CmfsimError
 from cmfsim.io import Case, read_scene, replacing, write_scene
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
-from cmfsim.lab.frontier.skin_points import read_points, skin_points, write_points
+from cmfsim.lab.frontier.rows import read_points, skin_points, write_points
 from cmfsim.pipeline.building.case_model import build_model
 from cmfsim.processes.worker import SILENT, Worker, WorkerEndedError, WorkerFailedError
 from cmfsim.solving.models import model_scene

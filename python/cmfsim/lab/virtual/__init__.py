@@ -2,7 +2,7 @@
 
 The true face is computed independently of the models that are tested on it: hyperelastic tissue, a
 finer mesh, individual muscles and contact that only pushes, solved with scikit-fem and PyAMG.
-`demo` is the case that the package contains; `phantom_case` writes a head with its CT.
+`demo` writes the case that the package contains, and any head with its CT.
 """
 
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions as EquilibriumOptions

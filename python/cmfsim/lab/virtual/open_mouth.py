@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, signed_distance_image
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import PhantomHead
-from cmfsim.phantom.geometry.warp import JawWarp
+from cmfsim.phantom.parameters import JawWarp
 from cmfsim.phantom.skull import UPPER_ARCH
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats

@@ -2,9 +2,9 @@
 
 from cmfsim.muscles.template.bodyparts3d import WHERE as WHERE
 from cmfsim.muscles.template.bodyparts3d import import_bodyparts3d as import_bodyparts3d
-from cmfsim.muscles.template.built_in import template_names as template_names
-from cmfsim.muscles.template.built_in import template_path as template_path
 from cmfsim.muscles.template.checking import check_template as check_template
+from cmfsim.muscles.template.checking import template_names as template_names
+from cmfsim.muscles.template.checking import template_path as template_path
 from cmfsim.muscles.template.from_phantom import phantom_muscle as phantom_muscle
 from cmfsim.muscles.template.from_phantom import phantom_template as phantom_template
 from cmfsim.muscles.template.morphing import MorphedMusculature as MorphedMusculature

@@ -28,8 +28,9 @@ from cmfsim.muscles.template.bodyparts3d_parts import (
     PAIRED_MUSCLES,
     TEETH,
     MusclePair,
+    fan_lines,
+    lane_lines,
 )
-from cmfsim.muscles.template.fibre_lines import fan_lines, lane_lines
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.registration import side_vectors
 from cmfsim.surfaces.checks import SurfaceReport, check_surface

@@ -1,13 +1,15 @@
 """Problems of a muscle template: files, surfaces, sides, landmarks, each with its fix."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from cmfsim._core import Surface
 from cmfsim.io.cases.templates import survey_template
-from cmfsim.muscles.template.built_in import template_path
+from cmfsim.io.files.reading_writing import is_there
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
 from cmfsim.surfaces.repair import clean_surface
@@ -15,6 +17,39 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface, TemplateData
+
+# Made by scripts/make_default_template.py.
+BUILT_IN: Mapping[str, str] = MappingProxyType({"default": "default.npz"})
+
+
+def template_names() -> tuple[str, ...]:
+    """The names of the templates that come with the package.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> cmfsim.template_names()
+    ('default',)
+    """
+    return tuple(BUILT_IN)
+
+
+def template_path(folder_or_name: str | os.PathLike[str]) -> Path:
+    """The folder or archive of a template.
+
+    A text that is the name of a built-in template means that one; `./default` means a folder.
+
+    Raises `FileNotFoundError`: Neither a name nor a folder or archive.
+    Raises `CaseError`: A name that no file can have.
+    """
+    if isinstance(folder_or_name, str) and folder_or_name in BUILT_IN:
+        return Path(__file__).with_name(BUILT_IN[folder_or_name])
+    path = Path(folder_or_name)
+    if not is_there(path):
+        known = ", ".join(BUILT_IN)
+        raise FileNotFoundError(f"{path}: no such template; built in: {known}")
+    return path
+
 
 # Longest extents of a skull or its face, mm: from the facial skeleton alone to a head with neck.
 SKULL_EXTENT = (90.0, 400.0)

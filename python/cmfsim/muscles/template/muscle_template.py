@@ -8,8 +8,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from cmfsim.io.cases.templates import read_template, write_template
-from cmfsim.muscles.template.built_in import template_path
-from cmfsim.muscles.template.checking import check_contents
+from cmfsim.muscles.template.checking import check_contents, template_path
 from cmfsim.muscles.template.morphing import MorphedMusculature, morph_template
 from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import TemplateData

@@ -26,7 +26,15 @@ from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.meshing import tissue_level
 from cmfsim.meshing.lips import seam_faces
 from cmfsim.meshing.node_kinds import KindOptions, dental_arches, kind_options, segment_data
-from cmfsim.pipeline.building.case_checks import jaws, misplaced, plan_sizes
+from cmfsim.pipeline.building.case_checks import (
+    Head,
+    MeshedTissue,
+    Nodes,
+    Tissue,
+    jaws,
+    misplaced,
+    plan_sizes,
+)
 from cmfsim.pipeline.building.inputs import (
     case_key,
     input_hashes,
@@ -40,7 +48,6 @@ from cmfsim.pipeline.building.landmarks import (
     is_to_be_found,
     landmark_summary,
 )
-from cmfsim.pipeline.building.parts import Head, MeshedTissue, Nodes, Tissue
 from cmfsim.pipeline.building.skin.lips import find_seam, lip_summary
 from cmfsim.pipeline.building.skin.skin_part import check_skin, on_skin
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, Stages, build_options
@@ -204,7 +211,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     stages.add(check_skin(head.anatomy, head.skull))
     if case.photo is not None:
         # A case without a photo loads nothing of it.
-        from cmfsim.pipeline.building.skin.photo import with_photo  # noqa: PLC0415
+        from cmfsim.pipeline.building.skin.skin_part import with_photo  # noqa: PLC0415
 
         stages.begin("placing the 3D photo")
         skin, colours, placed = with_photo(head)

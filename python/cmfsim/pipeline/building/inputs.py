@@ -19,7 +19,7 @@ from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.images.dicom.series import dicom_files
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.meshes.photos import photo_files
-from cmfsim.io.results.models import is_model_file
+from cmfsim.io.results.result_files import is_model_file
 from cmfsim.io.slicer.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces
 from cmfsim.surfaces.repair import RepairOptions, repair_surface

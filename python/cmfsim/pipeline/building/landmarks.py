@@ -16,8 +16,8 @@ from cmfsim.bones import CuttingPlane, Procedure
 from cmfsim.doctor.surgery.bone_overlap import jaw_of
 from cmfsim.errors import LandmarkError, LandmarkInputError
 from cmfsim.io import Case
+from cmfsim.pipeline.building.case_checks import Head
 from cmfsim.pipeline.building.inputs import read_placed_sites
-from cmfsim.pipeline.building.parts import Head
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.case_parts import FEW_SITES

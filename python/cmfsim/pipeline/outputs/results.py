@@ -52,9 +52,9 @@ from cmfsim.pictures import (
     plan_picture,
     prediction_picture,
 )
-from cmfsim.pictures.animation import animate_face
+from cmfsim.pictures.canvas import Painter
 from cmfsim.pictures.charts import write_figure
-from cmfsim.pictures.painting import Painter
+from cmfsim.pictures.faces import animate_face
 from cmfsim.pipeline.building.stages import OnMuscles
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.face_regions import face_motion

@@ -5,9 +5,8 @@ import pytest
 from header_files import SHAPE, SHEARED, VALUES, codes, refused, write_meta, write_nifti, write_nrrd
 
 from cmfsim.io.images.image_files import read_image, read_image_file
-from cmfsim.io.images.metaimage import meta_header
 from cmfsim.io.images.nifti import read_nifti
-from cmfsim.io.images.nrrd import nrrd_header
+from cmfsim.io.images.nrrd import meta_header, nrrd_header
 
 sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 

@@ -10,8 +10,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.lab.virtual.demo import read_demo_truth, write_demo_case
-from cmfsim.lab.virtual.demo.patient import DEMO_PARAMETERS
+from cmfsim.lab.virtual.demo import DEMO_PARAMETERS, read_demo_truth, write_demo_case
 from cmfsim.phantom import make_head
 
 pytest.importorskip("skimage")

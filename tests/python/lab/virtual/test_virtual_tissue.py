@@ -18,9 +18,8 @@ from cmfsim.lab.virtual.mechanics.body import (
     Moduli,
     SkinLayer,
 )
-from cmfsim.lab.virtual.mechanics.bone_contact import ONSET, BoneContact, SmoothDistance
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions, find_equilibrium
-from cmfsim.lab.virtual.operation import screw
+from cmfsim.lab.virtual.operation import ONSET, BoneContact, SmoothDistance, screw
 
 TIGHT = EquilibriumOptions(steps=1, tolerance=1e-10, loose=1e-4)
 

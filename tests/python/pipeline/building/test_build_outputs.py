@@ -13,7 +13,7 @@ import pytest
 from build_runs import PICTURES, run
 
 import cmfsim
-from cmfsim.io.results import models
+from cmfsim.io.results import result_files
 from cmfsim.pipeline.building import case_model
 from cmfsim.pipeline.outputs import model as model_output
 from head_case import HeadCase
@@ -111,7 +111,7 @@ def test_writing_that_fails_half_way_leaves_the_old_results(
         return real(*arguments, **options)
 
     owner, name = {"draw": (model_output, "picture_anatomy"), "move": (Path, "replace")}.get(
-        call, (models, call)
+        call, (result_files, call)
     )
     real = getattr(owner, name)
     with monkeypatch.context() as patch:
@@ -170,7 +170,7 @@ def test_a_folder_made_for_nothing_goes_again(ready, ellipsoids, monkeypatch):
     def fail(*_):
         raise FULL
 
-    monkeypatch.setattr(models, "write_scene", fail)
+    monkeypatch.setattr(result_files, "write_scene", fail)
     code, _, _ = run("build", ellipsoids, "-q", "--no-doctor", "-o", ellipsoids.parent / "a" / "b")
     assert code == 1
     assert not (ellipsoids.parent / "a").exists()

@@ -11,7 +11,7 @@ import cmfsim
 import shared_values
 from cmfsim.cli import main
 from cmfsim.io.results.predictions import read_face_colours
-from cmfsim.pictures import animation
+from cmfsim.pictures import faces
 
 pytest.importorskip("jinja2")
 pytest.importorskip("pyvista")
@@ -31,7 +31,7 @@ def folder(tmp_path, tmp_path_factory):
 
 
 def test_page_and_animation_have_the_colours(folder, capsys, monkeypatch):
-    monkeypatch.setattr(animation, "STEPS", 1)
+    monkeypatch.setattr(faces, "STEPS", 1)
     gif = folder.parent / "face.gif"
     assert main(["report", str(folder), "--animation", str(gif), "--json", "-q"]) == 0
     assert json.loads(capsys.readouterr().out)["animation"] == str(gif)

@@ -10,8 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.errors import ImageInputError
-from cmfsim.io.images.dicom.headers import DicomHeader, dicom_header
-from cmfsim.io.images.dicom.slices import counted, is_localizer, listed, slices_of
+from cmfsim.io.images.dicom.headers import (
+    DicomHeader,
+    counted,
+    dicom_header,
+    is_localizer,
+    listed,
+    slices_of,
+)
 from cmfsim.io.images.dicom.stack import volume_of
 from cmfsim.io.images.image_headers import check_shape
 from cmfsim.values.finding import Finding

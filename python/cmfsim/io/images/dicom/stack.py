@@ -19,8 +19,16 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.files.reading_writing import utf8_path
-from cmfsim.io.images.dicom.headers import SHOWN_INVERTED, DicomHeader, numbers_of
-from cmfsim.io.images.dicom.slices import Slice, Stack, counted, is_localizer, listed
+from cmfsim.io.images.dicom.headers import (
+    SHOWN_INVERTED,
+    DicomHeader,
+    Slice,
+    Stack,
+    counted,
+    is_localizer,
+    listed,
+    numbers_of,
+)
 from cmfsim.io.images.image_grids import aligned, of_slices, turn_of, upright
 from cmfsim.io.images.image_headers import check_shape
 from cmfsim.processes.child import ReaderError, read_in_child
@@ -241,7 +249,7 @@ def _of_files(stack: Stack, limits: ReadLimits) -> NDArray[Any]:
         folder = kept.enter_context(tempfile.TemporaryDirectory(prefix="cmfsim-dicom-"))
         for k, one in enumerate(stack.slices):
             paths.append(kept.enter_context(utf8_path(_readable(one.header, folder, f"{k}.dcm"))))
-        answer = read_in_child("cmfsim.io.images.image_reading:read_slices", limits, paths=paths)
+        answer = read_in_child("cmfsim.io.images.image_files:read_slices", limits, paths=paths)
     places = np.array(answer.values["places"])
     expected = np.column_stack([stack.positions, np.tile(stack.spacing, (len(paths), 1))])
     off = np.abs(places - expected).max(axis=1)
@@ -270,7 +278,7 @@ def _of_frames(header: DicomHeader, limits: ReadLimits) -> NDArray[Any]:
         tempfile.TemporaryDirectory(prefix="cmfsim-dicom-") as folder,
         utf8_path(_readable(header, folder, "frames.dcm")) as plain,
     ):
-        answer = read_in_child("cmfsim.io.images.image_reading:read_frames", limits, path=plain)
+        answer = read_in_child("cmfsim.io.images.image_files:read_frames", limits, path=plain)
     values = answer.arrays["values"]
     return values if values.ndim == 3 else values[None]
 

@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io.files.reading_writing import utf8_path
-from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
+from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, cells_by_type, stated_frame
 from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
-from cmfsim.io.meshes.stated_frames import stated_frame
-from cmfsim.io.meshes.vtk.cells import cells_by_type
 from cmfsim.processes.child import ReaderError, read_in_child
 from cmfsim.processes.worker import Answer, ReadLimits
 

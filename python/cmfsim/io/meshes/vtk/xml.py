@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import strict_parser
 from cmfsim.io.files.text_numbers import real_numbers, shown, whole_numbers
-from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
+from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, cells_by_type, stated_in_field
 from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
-from cmfsim.io.meshes.stated_frames import stated_in_field
-from cmfsim.io.meshes.vtk.blocks import UNPACKERS
-from cmfsim.io.meshes.vtk.cells import cells_by_type
+from cmfsim.io.meshes.vtk.writing import UNPACKERS
 
 # Nested elements and all elements that a file may have; VTK nests eight.
 MAX_DEPTH, MAX_ELEMENTS = 32, 100_000

@@ -6,9 +6,13 @@ from dataclasses import asdict, dataclass, replace
 
 from cmfsim._core import TetMesh
 from cmfsim.muscles.blurring import blurred
-from cmfsim.muscles.equivalent import PreparedMuscles, equivalent_material, prepared_muscles
+from cmfsim.muscles.equivalent import (
+    MODULI_CODES,
+    PreparedMuscles,
+    equivalent_material,
+    prepared_muscles,
+)
 from cmfsim.muscles.fitting import MuscleFit, fit_muscles
-from cmfsim.muscles.mixing import MODULI_CODES
 from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.muscles.template.morphing import MorphedMusculature, too_few, without_lost
 from cmfsim.values.anatomy import Anatomy

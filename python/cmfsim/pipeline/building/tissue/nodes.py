@@ -17,11 +17,14 @@ from cmfsim.meshing.node_kinds import (
     lifted_tissue,
     septum,
 )
-from cmfsim.pipeline.building.case_checks import cut_segments, untouched
-from cmfsim.pipeline.building.parts import Head, Nodes, Tissue
-from cmfsim.pipeline.building.skin.lips import CaseLipContact, lip_contact, separated_at_seam
+from cmfsim.pipeline.building.case_checks import Head, Nodes, Tissue, cut_segments, untouched
+from cmfsim.pipeline.building.skin.lips import (
+    CaseLipContact,
+    held_part,
+    lip_contact,
+    separated_at_seam,
+)
 from cmfsim.pipeline.building.stages import Stages
-from cmfsim.pipeline.building.surgery.attached_bodies import held_part
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import (
     CaseContacts,

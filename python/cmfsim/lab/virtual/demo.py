@@ -1,8 +1,8 @@
 """The embedded case: a synthetic head with its operation and its true face.
 
-`truth.npz` next to this file holds the face after the operation: `vertices` (v, 3) float, mm, LPS;
-`triangles` (t, 3) integer, outward; `landmark_names` (k,) text and `landmarks` (k, 3) float, mm;
-and `parameters`, a JSON text whose `head` names the `HeadParameters` that the face belongs to.
+`demo_truth.npz` next to this file holds the face after the operation: `vertices` (v, 3) float, mm,
+LPS; `triangles` (t, 3) integer, outward; `landmark_names` (k,) text and `landmarks` (k, 3) float,
+mm; and `parameters`, a JSON text whose `head` names the `HeadParameters` that the face belongs to.
 `scripts/make_demo_truth.py` computes it, in silico.
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io import Case, write_surface
+from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.lab.virtual.population import PATIENTS
 from cmfsim.phantom import PhantomHead, make_head
@@ -26,7 +26,75 @@ from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
 from cmfsim.values.surface_data import SurfaceData
 
-TRUTH_FILE = "truth.npz"
+CASE_TEXT = """\
+# A synthetic head: no patient. `cmfsim build case.toml` makes its model.
+format = "cmfsim-case"
+version = 1
+name = "phantom"
+
+[image]
+file = "ct.nrrd"
+
+[landmarks]
+skull = "skull.mrk.json"
+skin = "skin.mrk.json"
+
+[[osteotomies]]
+procedure = "le_fort_1"
+
+[[osteotomies]]
+procedure = "bsso"
+
+[plan.maxilla]                    # 5 mm forwards
+translation = [0, -5, 0]
+
+[plan.mandible_body]              # 3 mm backwards
+translation = [0, 3, 0]
+
+[mesh]
+edge_length = 4.0
+
+[output]
+folder = "out"
+"""
+
+
+def write_phantom_case(
+    folder: str | os.PathLike[str], head: PhantomHead, *, spacing: float = 1.0, seed: int = 0
+) -> Path:
+    """The path of a new `case.toml` next to the CT and the landmarks of a synthetic head.
+
+    Parameters
+    ----------
+    folder : path
+        Created if it does not exist.
+    head : PhantomHead
+    spacing : float, mm
+        Of the CT.
+    seed : int
+        Of its noise.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be created or written to.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> case = cmfsim.write_phantom_case("head", cmfsim.make_head())  # doctest: +SKIP
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_image(head.ct((spacing, spacing, spacing), seed=seed), folder / "ct.nrrd")
+    write_landmarks(folder / "skull.mrk.json", head.skull_landmarks)
+    write_landmarks(folder / "skin.mrk.json", head.skin_landmarks)
+    with replacing(folder / "case.toml") as file:
+        file.write(CASE_TEXT.encode())
+    return folder / "case.toml"
+
+
+TRUTH_FILE = "demo_truth.npz"
 MEMBERS = ("vertices", "triangles", "landmark_names", "landmarks", "parameters")
 
 # A mandible that is long and a chin that is strong next to the average synthetic head (3 and 2 mm).
@@ -127,7 +195,7 @@ def read_demo_truth(head: Mapping[str, float], path: Path | None = None) -> Demo
     Raises `CaseError`: Not such an archive, or of another head.
     """
     if path is None:
-        own = files("cmfsim.lab.virtual.demo").joinpath(TRUTH_FILE)
+        own = files("cmfsim.lab.virtual").joinpath(TRUTH_FILE)
         if not own.is_file():
             return None
         path = Path(str(own))
