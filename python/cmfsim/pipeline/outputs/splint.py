@@ -10,14 +10,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.pipeline.building.case_model import planned_head
 from cmfsim.pipeline.building.stages import BuildKeywords, build_options
-from cmfsim.planning.occlusion import (
-    THICKNESS,
-    Splint,
-    refuse_doubtful_rows,
-    rigid_of,
-    splint_between,
-    tooth_rows,
-)
+from cmfsim.planning.occlusion import THICKNESS, Splint, rigid_of, splint_between, tooth_rows
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.dental_arch import JAWS
@@ -76,8 +69,7 @@ def make_splint(
     case = as_case(case)
     with build_options(options, {}) as asked:
         head, bones, findings = planned_head(case, asked)
-        refuse_doubtful_rows(findings)
-        rows = tooth_rows(head.anatomy, bones.segments, head.skull)
+        rows = tooth_rows(head.anatomy, bones.segments, head.skull, findings)
         motions = {row.arch.jaw: rigid_of(bones.motions.get(row.segment)) for row in rows}
         held = JAWS if intermediate is None else (FIRST[intermediate],)
         if all(np.array_equal(motions[jaw], np.eye(4)) for jaw in held):

@@ -21,7 +21,7 @@ from cmfsim.planning.face_measures.occlusion import (
     missing_for_occlusion,
     occlusion,
 )
-from cmfsim.planning.occlusion import bite_sites, tooth_rows
+from cmfsim.planning.occlusion import bite_sites, patient_rows
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.landmark_sites import profile_sites
 from cmfsim.values.patient_model import PatientModel
@@ -103,9 +103,8 @@ def _bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
 
         sites[name] = face.BoneSite(place, min(patient.segments, key=away).name)
     with suppress(CaseInputError):
-        rows = tooth_rows(patient.anatomy, patient.segments, skull)
         given = profile_sites(skull)
-        for name, (place, segment) in bite_sites(*rows).items():
+        for name, (place, segment) in bite_sites(*patient_rows(patient)).items():
             if name not in given:
                 sites[name] = face.BoneSite(place, segment)
     return sites

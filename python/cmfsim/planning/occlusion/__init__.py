@@ -1,13 +1,7 @@
 """Occlusion: how the tooth rows meet before and after the operation, and splints between them."""
 
 from cmfsim.planning.occlusion.contacts import ContactMap, contact_map, planned_contacts
-from cmfsim.planning.occlusion.rows import (
-    ToothRow,
-    bite_sites,
-    refuse_doubtful_rows,
-    rigid_of,
-    tooth_rows,
-)
+from cmfsim.planning.occlusion.rows import ToothRow, bite_sites, patient_rows, rigid_of, tooth_rows
 from cmfsim.planning.occlusion.splint import THICKNESS, Splint, splint_between
 
 __all__ = [
@@ -17,8 +11,8 @@ __all__ = [
     "ToothRow",
     "bite_sites",
     "contact_map",
+    "patient_rows",
     "planned_contacts",
-    "refuse_doubtful_rows",
     "rigid_of",
     "splint_between",
     "tooth_rows",

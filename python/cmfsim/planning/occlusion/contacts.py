@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.planning.occlusion.rows import ToothRow, refuse_doubtful_rows, rigid_of, tooth_rows
+from cmfsim.planning.occlusion.rows import ToothRow, patient_rows, rigid_of
 from cmfsim.surfaces.topology import connected_labels
 from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.prediction import Prediction
@@ -111,10 +111,7 @@ def planned_contacts(prediction: Prediction) -> ContactMap:
     CaseError
         (also `ValueError`) The case has no tooth rows, or doubtful ones.
     """
-    patient = prediction.patient
-    refuse_doubtful_rows(patient.findings)
-    rows = tooth_rows(patient.anatomy, patient.segments, patient.landmarks.get("skull"))
-    plan = prediction.scene.plan
+    plan, rows = prediction.scene.plan, patient_rows(prediction.patient)
     return contact_map(*(row.moved(rigid_of(plan.get(row.segment))) for row in rows))
 
 

@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,7 @@ from cmfsim.values.dental_arch import JAWS, LOWER_BEARERS, UPPER_BEARERS, Dental
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import carried
+from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 BEARERS: Mapping[str, tuple[str, ...]] = {"upper": UPPER_BEARERS, "lower": LOWER_BEARERS}
@@ -182,36 +184,35 @@ def bite_sites(*rows: ToothRow) -> dict[str, tuple[Floats, str]]:
     return found
 
 
-def refuse_doubtful_rows(findings: Iterable[Finding]) -> None:
-    """Raises `CaseError` where the jaws were separated doubtfully: bone would pass for crowns."""
+def tooth_rows(
+    anatomy: Anatomy,
+    segments: Sequence[BoneSegment],
+    landmarks: Mapping[str, ArrayLike] | None = None,
+    findings: Iterable[Finding] = (),
+) -> tuple[ToothRow, ToothRow]:
+    """The upper and the lower tooth row of a head, before the operation.
+
+    Bones that were given as surfaces are taken as given; others are made from the image. `findings`
+    are those of the head: where its jaws were separated doubtfully, bone would pass for crowns.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) No landmarks or teeth locate the rows, no segment bears them, or the
+        jaws are doubtful.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> upper, lower = cmfsim.tooth_rows(anatomy, segments, landmarks, findings)
+    >>> upper.segment, lower.segment
+    ('maxilla', 'mandible_body')
+    """
     doubt = next((f for f in findings if f.code == "jaw-doubtful"), None)
     if doubt is not None:
         raise CaseInputError(
             f"the tooth rows are doubtful (splint-rows-doubtful), because {doubt.what}; {doubt.fix}"
         )
-
-
-def tooth_rows(
-    anatomy: Anatomy,
-    segments: Sequence[BoneSegment],
-    landmarks: Mapping[str, ArrayLike] | None = None,
-) -> tuple[ToothRow, ToothRow]:
-    """The upper and the lower tooth row of a head, before the operation.
-
-    Bones that were given as surfaces are taken as given; others are made from the image.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) No landmarks or teeth locate the rows, or no segment bears them.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> upper, lower = cmfsim.tooth_rows(anatomy, segments, landmarks)
-    >>> upper.segment, lower.segment
-    ('maxilla', 'mandible_body')
-    """
     if not segments:
         raise CaseInputError("no tooth rows: the case has no bone segments")
     arches = dental_arches(anatomy, segments, landmarks)
@@ -225,6 +226,18 @@ def tooth_rows(
         for arch in (arches.by_jaw[jaw] for jaw in JAWS)
     )
     return upper, lower
+
+
+# The rows of patients that are in use: figures, measures of the face and contacts need them.
+_ROWS: WeakKeyDictionary[PatientModel, tuple[ToothRow, ToothRow]] = WeakKeyDictionary()
+
+
+def patient_rows(patient: PatientModel) -> tuple[ToothRow, ToothRow]:
+    """The `tooth_rows` of a patient's model, made once; the same errors."""
+    if patient not in _ROWS:
+        sites = patient.landmarks.get("skull")
+        _ROWS[patient] = tooth_rows(patient.anatomy, patient.segments, sites, patient.findings)
+    return _ROWS[patient]
 
 
 def _bearer(segments: Sequence[BoneSegment], arch: DentalArch) -> str:

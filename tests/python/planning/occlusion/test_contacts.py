@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from tooth_row_heads import closed_rows
+from tooth_row_heads import closed_rows, rows_of
 
 import cmfsim
-from cmfsim.planning.occlusion import refuse_doubtful_rows, rigid_of
+from cmfsim.planning.occlusion import rigid_of
 from cmfsim.planning.occlusion.contacts import signed_gaps
 
 pv = pytest.importorskip("pyvista")
@@ -98,6 +98,8 @@ def test_crowns_of_molars_are_whole(rows):
 
 def test_rows_of_doubtful_jaws_are_refused():
     """On a jaw without teeth, bone would pass for crowns."""
-    refuse_doubtful_rows([cmfsim.Finding("metal", "1 piece", severity="warning")])
+    metal = cmfsim.Finding("metal", "1 piece", severity="warning")
+    doubt = cmfsim.Finding("jaw-doubtful", "the rows rise by -23°")
+    assert len(rows_of(cmfsim.make_head(), findings=[metal])) == 2
     with pytest.raises(cmfsim.CaseError, match=r"splint-rows-doubtful.*rows rise.*by hand"):
-        refuse_doubtful_rows([cmfsim.Finding("jaw-doubtful", "the rows rise by -23°")])
+        rows_of(cmfsim.make_head(), findings=[metal, doubt])

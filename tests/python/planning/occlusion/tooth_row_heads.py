@@ -22,14 +22,14 @@ def level(head, *names):
     return cmfsim.ImageData(np.float32(values).reshape(shape), [SPACING] * 3, LOWEST)
 
 
-def rows_of(head, upper=("cranium", "upper_teeth"), lower=("mandible", "lower_teeth")):
+def rows_of(head, upper=("cranium", "upper_teeth"), lower=("mandible", "lower_teeth"), findings=()):
     """The rows of a head whose bones are made of these parts."""
     levels = {"cranium": level(head, *upper), "mandible": level(head, *lower)}
     anatomy = cmfsim.Anatomy(levels["cranium"], levels)
     segments = [
         cmfsim.BoneSegment(n, bone, surface_of_level(n, bone)) for n, bone in levels.items()
     ]
-    return cmfsim.tooth_rows(anatomy, segments, head.skull_landmarks)
+    return cmfsim.tooth_rows(anatomy, segments, head.skull_landmarks, findings)
 
 
 @functools.cache
