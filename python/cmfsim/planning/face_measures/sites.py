@@ -10,12 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmfsim.errors import LandmarkInputError
+from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.planning.face_measures.definitions import MEASURES, measure_sites
 from cmfsim.planning.face_measures.profile import midline_profile
-from cmfsim.values.anatomy import BoneSegment
+from cmfsim.planning.occlusion import bite_sites, patient_rows
 from cmfsim.values.checks import Floats
-from cmfsim.values.dental_arch import UPPER_BEARERS
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
@@ -30,16 +29,11 @@ MENTON_BEHIND = 25.0
 THROAT_BELOW = 45.0
 # Shortest profile below menton from which the angle of the throat is determined, mm.
 LEAST_THROAT = 20.0
-# Largest distances of the edge of an incisor from the edge of the bone, mm: sideways, in depth,
-# along the crown.
-INCISOR_SIDE, INCISOR_DEPTH, INCISOR_LENGTH = 5.0, 9.0, 14.0
 # The edge of a lip is its furthest point towards the other lip; what lies deeper counts for less by
 # this share of its depth, so that it is not sought inside the mouth.
 LIP_DEPTH = 0.5
 # Lips whose edges are closer than this, mm, are closed: their skin is connected and cannot open.
 LEAST_GAP = 0.3
-# Smallest length of an incisor from the edge of the bone, mm.
-LEAST_CROWN = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +125,15 @@ def face_sites(patient: PatientModel) -> FaceSites:
                 absent[name] = str(error)
     found = [name for name in on_profile if name in skin]
     try:
-        bone[UPPER_INCISOR] = incisor_edge(patient)
-        found.append(UPPER_INCISOR)
-    except LandmarkInputError as error:
+        edges = bite_sites(*patient_rows(patient))
+    except CaseInputError as error:
         absent[UPPER_INCISOR] = str(error)
+    else:
+        if "U1" in edges:
+            bone[UPPER_INCISOR] = BoneSite(*edges["U1"])
+            found.append(UPPER_INCISOR)
+        else:
+            absent[UPPER_INCISOR] = "the upper tooth row has no cusps at the central incisors"
     for name in needed:
         if name not in skin and name not in bone:
             absent.setdefault(name, "the case has no such skin landmark")
@@ -317,35 +316,3 @@ _FINDERS: Mapping[str, Callable[[Floats, Mapping[str, Floats]], Floats]] = {
     "menton": _menton,
     "cervical_point": _cervical_point,
 }
-
-
-def incisor_edge(patient: PatientModel) -> BoneSite:
-    """The edge of the upper central incisors: the furthest point of the bone along their crown.
-
-    LandmarkError (also `ValueError`) if the case or the bone does not show it.
-    """
-    root = "supradentale"
-    skull = patient.landmarks.get("skull", {})
-    if root not in skull:
-        raise LandmarkInputError(f"the case has no skull landmark {root}")
-    bearer = _bearer(patient.segments)
-    away = bearer.surface.vertices - skull[root]
-    along = -away[:, 2]
-    near = (
-        (np.abs(away[:, 0]) <= INCISOR_SIDE)
-        & (np.abs(away[:, 1]) <= INCISOR_DEPTH)
-        & (along >= 0.0)
-        & (along <= INCISOR_LENGTH)
-    )
-    if along[near].max(initial=0.0) < LEAST_CROWN:
-        raise LandmarkInputError(f"the surface of {bearer.name} shows no incisor below {root}")
-    edge = int(np.argmax(np.where(near, along, -np.inf)))
-    return BoneSite(bearer.surface.vertices[edge], bearer.name)
-
-
-def _bearer(segments: tuple[BoneSegment, ...]) -> BoneSegment:
-    by_name = {segment.name: segment for segment in segments}
-    for name in UPPER_BEARERS:
-        if name in by_name:
-            return by_name[name]
-    raise LandmarkInputError("no segment carries the upper teeth")
