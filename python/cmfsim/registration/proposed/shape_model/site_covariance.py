@@ -35,8 +35,8 @@ OWN_STD = 1.5
 SHIFT_STD, TURN_STD, SIZE_STD = 15.0, 0.2, 0.08
 # Errors of proposed sites are alike on a part, because a wrong pose or a wrong cut between the jaws
 # is wrong for all of them: the share of the variance that they have in common, and its reach, mm,
-# the length of a jaw.
-ALIKE_SHARE, ALIKE_LENGTH = 0.8, 100.0
+# the length of a jaw. Of an expected error of 10 mm, 3 mm are then each site's own.
+ALIKE_SHARE, ALIKE_LENGTH = 0.9, 100.0
 # The distance at which a proposed site counts half when the average head is brought onto them, mm.
 HALF_DISTANCE, LEAST_SITES = 6.0, 3
 
