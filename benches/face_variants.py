@@ -6,7 +6,7 @@ Where the face of the unmodified CT moves by more than 0.5 mm, displacements are
 be reported by a finding about what was changed, or refused by an error; otherwise its verdict is
 "SILENT".
 
-    python benches/face_variants.py --markdown docs/real_scans.md [--only NAME ...] [--cache FOLDER]
+    python benches/face_variants.py --markdown docs/landmarks.md [--only NAME ...] [--cache FOLDER]
 
 Needs the real CT (the folder named by CMFSIM_DATA, else ../shared/data). Each row takes a minute or
 two; with a cache, rows that were computed before by the same version are read back.
@@ -301,8 +301,8 @@ def main() -> None:
     ).stdout.strip()  # fmt: skip
     made = (
         f"cmfsim {cmfsim.__version__} after commit {commit}, {platform.machine()}, edges of "
-        f"{options.edge:g} mm; `python {NAME}`. Differences of the face in mm, part of it that the "
-        "variant shows in %, processor time in s."
+        f"{options.edge:g} mm; `python {NAME} --edge {options.edge:g}`. Differences of the face in "
+        "mm, part of it that the variant shows in %, processor time in s."
     )
     lines = [
         made,
