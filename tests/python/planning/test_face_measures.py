@@ -172,3 +172,10 @@ def test_a_profile_follows_its_surface():
     there = a + profile.share[:, None] * (b - a)
     np.testing.assert_allclose(there, profile.points @ motion[:3, :3].T + motion[:3, 3], atol=1e-9)
     assert (np.diff(profile.points[:4, 2]) < 0).all()
+
+
+def test_doubtful_jaws_show_no_incisors():
+    """On a jaw that was separated doubtfully, bone would pass for teeth."""
+    built, _ = patient()
+    built.findings = (cmfsim.Finding("jaw-doubtful", "the tooth rows rise by -23°"),)
+    assert "rise by -23°" in cmfsim.face_sites(built).absent["upper_incisor"]
