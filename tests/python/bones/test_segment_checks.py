@@ -243,3 +243,20 @@ def test_a_build_compares_landmarks_with_the_bones_that_it_made(head, truth, cut
         assert {f.severity for f in told} == {"warning"}
         assert any(words in f.what for f in told if f.where == "landmarks.skull")
         assert any(f.where == "landmarks.skin" for f in told)
+
+
+def test_a_cut_by_lengths_of_roots_is_reported_in_a_head_of_a_childs_size():
+    """0.8 times the ordinary head, unless the height of the cut is given."""
+    sites = cmfsim.make_head().skull_landmarks
+    for size, options, warned in (
+        (0.8, {}, True),
+        (0.8, {"height": 1.4}, False),
+        (1.0, {}, False),
+        (1.1, {}, False),
+    ):
+        placed = cmfsim.place_procedure(
+            "le_fort_1", {name: size * place for name, place in sites.items()}, options
+        )
+        found = [f.what for f in placed.findings if f.code == "cut-small-head"]
+        assert len(found) == warned
+        assert not found or "has 0.80 times" in found[0]
