@@ -110,11 +110,11 @@ def _solved(planning: PlanningModel, plans: Sequence[Motions]) -> Iterator[Float
 
     def solved(plan: Motions) -> Floats | None:
         try:
-            exact = planning.solve(plan)
+            exact, converged = planning.exact(plan)
         except (ContactError, SolverError):
             return None
         # What stopped above its tolerance is no answer to interpolate.
-        return exact.skin_displacements if exact.result.summary["contact_converged"] else None
+        return exact if converged else None
 
     pool = ThreadPoolExecutor(min(MOST_AT_ONCE, os.cpu_count() or 1))
     try:

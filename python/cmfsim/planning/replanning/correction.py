@@ -2,15 +2,16 @@
 
 The operator continues contact to first order. What it misses, e(x), vanishes at the reference
 together with its gradient. It is interpolated between plans that were solved exactly as a Gaussian
-process of which that is known: with the covariance g(x, y) = exp(−|x − y|²/2ℓ²), a process that
-vanishes with its gradient at 0 has
+process of which that is known: with the covariance m(|x − y|) of Matérn 5/2, whose paths are as
+rough as lips that slip over the edges of teeth, a process that vanishes with its gradient at 0 has
 
-    k(x, y) = g(x, y) − g(x, 0) g(0, y) (1 + x·y/ℓ²)
+    k(x, y) = m(|x − y|) − m(|x|) m(|y|) − (5/3) (x·y) n(|x|) n(|y|),
+    m(r) = (1 + √5 r + 5/3 r²) exp(−√5 r),    n(r) = (1 + √5 r) exp(−√5 r)
 
-(Rasmussen and Williams 2006, section 9.4), here summed over the segments, each by itself, and all
-of them together. x has six numbers for each segment: the shift of its centre, mm, and the rotation
-times an arm, mm. Far away k tends to 0, and so does the correction. Length ℓ and noise are those
-with the least error in cross-validation.
+in multiples of a length ℓ (Rasmussen and Williams 2006, sections 4.2 and 9.4), here summed over the
+segments, each by itself, and all of them together. x has six numbers for each segment: the shift of
+its centre, mm, and the rotation times an arm, mm. Far away k tends to 0, and so does the
+correction. Length ℓ and noise are those with the least error in cross-validation.
 """
 
 import math
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.values.checks import Floats
 
 # Lengths ℓ, mm, and noise as a share of the variance, among which plans that are left out choose.
-LENGTHS = (7.0, 10.0, 14.0, 20.0)
+LENGTHS = (10.0, 14.0, 20.0, 30.0)
 NOISES = (1e-3, 1e-2, 1e-1)
 # A rotation counts by the path of a point at this share of the distance of the furthest corner.
 ARM_SHARE = 0.6
@@ -196,9 +197,18 @@ def _covariance(a: Floats, b: Floats, length: float) -> Floats:
     for here, there in pairs:
         x, y = here[:, 0] / length, there[:, 0] / length
         inner = x @ y.T
-        square = (x * x).sum(axis=1)[:, None] + (y * y).sum(axis=1)
-        total += np.exp(inner - 0.5 * square) - np.exp(-0.5 * square) * (1.0 + inner)
+        one, other = (x * x).sum(axis=1)[:, None], (y * y).sum(axis=1)
+        (m_x, n_x), (m_y, n_y) = _matern(one), _matern(other)
+        apart, _ = _matern((one + other - 2.0 * inner).clip(min=0.0))
+        total += apart - m_x * m_y - 5.0 / 3.0 * inner * n_x * n_y
     return total
+
+
+def _matern(square: Floats) -> tuple[Floats, Floats]:
+    """m and n of the squared distance, in multiples of the length."""
+    root = np.sqrt(5.0 * square)
+    slope = (1.0 + root) * np.exp(-root)
+    return slope + 5.0 / 3.0 * square * np.exp(-root), slope
 
 
 def _inverse(plans: Floats, length: float, noise: float) -> Floats:

@@ -21,6 +21,9 @@ from cmfsim.values.scene import Scene
 from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
+# Contact counts as solved at this gap, mm, where a case asks for less: nodes then lie within 0.001 mm
+# of where 0.0001 mm leaves them, since Newton's method converges quadratically, for a fifth less.
+CONTACT_TOLERANCE = 0.01
 # Rigid motions by segment, (4, 4) mm each.
 Motions = Mapping[str, ArrayLike]
 
@@ -117,6 +120,19 @@ class PlanningModel:
         vertices = before.vertices
         return SurfaceData(vertices + self.carried(plan, vertices), before.triangles)
 
+    def exact(self, plan: Motions) -> tuple[Floats, bool]:
+        """How the skin moves under a plan, (k, 3) mm, as `solve`; and whether contact converged.
+
+        Nothing is judged, hashed or kept: for many plans, of which only the skin counts.
+
+        Raises
+        ------
+        ContactError, SolverError
+            As `solve`.
+        """
+        found = self.solver.solve(self.whole(plan), loads=self._scene.loads)
+        return self.patient.skin_field(found.displacements), found.contact_converged
+
     def solve(self, plan: Motions) -> Prediction:
         """The prediction under a plan, solved exactly, contact included.
 
@@ -161,7 +177,8 @@ def planning_model(
     Notes
     -----
     Where the scene leaves the method open, the equations are factorised (Cholesky): every further
-    plan then takes a fraction of a second.
+    plan then takes a fraction of a second. Contact is solved to 0.01 mm, or to the case's
+    `contact_tolerance` if that is larger.
 
     Examples
     --------
@@ -179,9 +196,14 @@ def planning_model(
         patient = patient.with_plan(reference)
     scene = model_scene(patient, model)
     _check_scene(scene)
-    if scene.options.method == "auto":
-        scene = replace(scene, options=replace(scene.options, method="cholesky"))
-        patient = replace(patient, scene=replace(patient.scene, options=scene.options))
+    own = scene.options
+    options = replace(
+        own,
+        method="cholesky" if own.method == "auto" else own.method,
+        contact_tolerance=max(own.contact_tolerance, CONTACT_TOLERANCE),
+    )
+    scene = replace(scene, options=options)
+    patient = replace(patient, scene=replace(patient.scene, options=options))
     solver = scene_solver(scene)
     plan = scene_plan(scene)
     operator = solver.plan_operator(nodes=patient.skin_nodes, plan=plan)

@@ -85,22 +85,33 @@ export class Correction {
     const width = here.length;
     out.fill(0);
     for (let n = 0; n < this.count; n++) {
-      let inner = 0, square = 0, near = 0;
+      const all = [0, 0, 0];
+      let near = 0;
       for (let s = 0; s < width; s += 6) {
-        let i = 0, q = 0;
+        const own = [0, 0, 0];
         for (let k = s; k < s + 6; k++) {
           const there = plans[n * width + k] / length;
-          i += here[k] * there;
-          q += here[k] * here[k] + there * there;
+          own[0] += here[k] * there;
+          own[1] += here[k] * here[k];
+          own[2] += there * there;
         }
-        near += covariance(i, q);
-        inner += i;
-        square += q;
+        near += covariance(own);
+        own.forEach((v, i) => { all[i] += v; });
       }
-      near += covariance(inner, square);
+      near += covariance(all);
       for (let m = 0; m < shapes; m++) out[m] += near * weights[n * shapes + m];
     }
   }
 }
 
-const covariance = (inner, square) => Math.exp(inner - square / 2) - Math.exp(-square / 2) * (1 + inner);
+/** Matérn 5/2 of a squared distance, and the factor of its slope. */
+function matern(square) {
+  const root = Math.sqrt(5 * square), slope = (1 + root) * Math.exp(-root);
+  return [slope + 5 / 3 * square * Math.exp(-root), slope];
+}
+
+/** Of two plans, from x·y, |x|² and |y|². */
+function covariance([inner, one, other]) {
+  const [mx, nx] = matern(one), [my, ny] = matern(other);
+  return matern(Math.max(one + other - 2 * inner, 0))[0] - mx * my - 5 / 3 * inner * nx * ny;
+}
