@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from cmfsim.errors import CaseInputError, ContactError, SolverError
-from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction
+from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction, telling
 from cmfsim.planning.replanning.expected_error import (
     moving_segments,
     plan_distance,
@@ -21,7 +21,9 @@ from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
 CORRECTING = "solving nearby plans to correct the operator"
 # Plans that are solved for a correction.
-CORRECTIONS = 96
+CORRECTIONS = 48
+# Plans that are drawn for each one that is solved.
+DRAWN = 4
 # With fewer solved plans, interpolation between them is meaningless.
 LEAST_PLANS = 8
 # Solutions at once: each takes memory for its own vectors.
@@ -40,8 +42,9 @@ def corrected_planning(
     """The planning model with its operator corrected by exact solutions, if this lowers the error.
 
     Plans are drawn as in `expected_error`, but they are different plans and all from the whole
-    range. The error of the operator is interpolated between them (`PlanCorrection`). The correction
-    is not used if it does not lower the error at plans to which it was not fitted.
+    range; those are solved that tell most of the others. The error of the operator is interpolated
+    between them (`PlanCorrection`). The correction is not used if it does not lower the error at
+    plans to which it was not fitted.
 
     Parameters
     ----------
@@ -82,9 +85,7 @@ def corrected_planning(
         return bare
     boxes = segment_boxes(bare)
     numbers = PlanNumbers.about(bare.reference, {n: boxes[n] for n in moving_segments(bare)})
-    # A stream of its own, so that no plan is one of those by which the error is measured.
-    rng = np.random.default_rng((seed, 1))
-    drawn = [plan_near(bare, rng, shift, turn) for _ in range(plans)]
+    drawn = chosen_plans(bare, numbers, plans, (shift, turn), seed)
     places, distances, errors = [], [], []
     with shown_progress(progress, {CORRECTING: PLANNING[CORRECTING]}) as shown:
         shown(f"{CORRECTING} (1 of {plans})")
@@ -100,6 +101,16 @@ def corrected_planning(
         numbers, np.array(places), np.array(distances), np.array(errors)
     )
     return replace(bare, correction=correction) if pays else bare
+
+
+def chosen_plans(
+    planning: PlanningModel, numbers: PlanNumbers, count: int, reach: tuple[float, float], seed: int
+) -> list[dict[str, Floats]]:
+    """The plans that a correction solves, within `reach`: shift, mm, and turn, degrees."""
+    # A stream of its own, so that no plan is one of those by which the error is measured.
+    rng = np.random.default_rng((seed, 1))
+    drawn = [plan_near(planning, rng, *reach) for _ in range(DRAWN * count)]
+    return [drawn[n] for n in telling(np.array([numbers.of(plan) for plan in drawn]), count)]
 
 
 def _solved(planning: PlanningModel, plans: Sequence[Motions]) -> Iterator[Floats | None]:

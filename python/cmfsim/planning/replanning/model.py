@@ -21,8 +21,8 @@ from cmfsim.values.scene import Scene
 from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
-# Contact counts as solved at this gap, mm, where a case asks for less: nodes then lie within 0.001 mm
-# of where 0.0001 mm leaves them, since Newton's method converges quadratically, for a fifth less.
+# Contact counts as solved at this gap, mm, where a case asks for less. Newton's method converges
+# quadratically, so that nodes are within 0.001 mm of where 0.0001 mm leaves them: a step is saved.
 CONTACT_TOLERANCE = 0.01
 # Rigid motions by segment, (4, 4) mm each.
 Motions = Mapping[str, ArrayLike]

@@ -12,7 +12,7 @@ import cmfsim.planning.page.content
 from cmfsim.cli import main
 from cmfsim.cli.patients.plan_command import _correction_text
 from cmfsim.planning.replanning import plan_distance
-from cmfsim.planning.replanning.expected_error import plan_near
+from cmfsim.planning.replanning.corrected import chosen_plans
 from planning_head import other_plan
 
 pytest.importorskip("skimage")
@@ -83,18 +83,13 @@ def test_corrections_are_the_same_each_time(bare, planning):
     again = cmfsim.corrected_planning(bare, 24).correction
     np.testing.assert_array_equal(again.shapes, planning.correction.shapes)
     np.testing.assert_array_equal(again.weights, planning.correction.weights)
-    serial = [planning.solve(plan).skin_displacements for plan in again_plans(bare, 2)]
+    plans = chosen_plans(bare, again.numbers, 24, (5.0, 5.0), 0)[:2]
+    serial = [planning.solve(plan).skin_displacements for plan in plans]
     largest = [
         np.linalg.norm(exact - bare.displacements(plan), axis=1).max()
-        for exact, plan in zip(serial, again_plans(bare, 2), strict=True)
+        for exact, plan in zip(serial, plans, strict=True)
     ]
     np.testing.assert_array_equal(again.before[:2], largest)
-
-
-def again_plans(bare, count):
-    """The first plans of a correction, by its seed."""
-    rng = np.random.default_rng((0, 1))
-    return [plan_near(bare, rng, 5.0, 5.0) for _ in range(count)]
 
 
 def test_corrections_that_cannot_be_fitted_leave_the_operator_alone(bare, planning):
@@ -164,7 +159,7 @@ def test_the_expected_error_is_that_of_the_trials(planning, errors):
         trial.distance * np.percentile(ratios, 90.0)
     )
     assert errors.usual(trial.distance) < largest
-    drawn = again_plans(planning, len(correction.distances))
+    drawn = chosen_plans(planning, correction.numbers, 24, (5.0, 5.0), 0)
     assert correction.distances[0] == pytest.approx(plan_distance(planning, drawn[0]))
     # Trials differ from the reference, by no more than what was asked for.
     assert 1.0 < trial.distance < 5.0 * 3**0.5 + 15.0
