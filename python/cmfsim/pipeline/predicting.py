@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+from cmfsim._core import MassTensors
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.results.predictions import is_prediction_file
 from cmfsim.pipeline.building.case_model import model_of
 from cmfsim.pipeline.building.inputs import case_key, check_output, input_hashes, plan_key
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, build_options
-from cmfsim.solving.models import predict_patient
+from cmfsim.solving.models import solved_patient
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.checks import check_one_of
 from cmfsim.values.patient_model import PatientModel
@@ -201,11 +202,18 @@ def predictions_of(
     if patient.muscles is not None:
         options.observer.muscles(patient.muscles, patient.segments)
     known = set(patient.findings)
-    for model in models:
+    # By tissue: models of the same tissue differ in their conditions alone.
+    kept: dict[str, MassTensors] = {}
+    for number, model in enumerate(models):
         options.observer.stage(f"solving {model}")
+        tissue = model[0]
         try:
             if band is None:
-                prediction = predict_patient(patient, model)
+                solved = solved_patient(patient, model, tensors=kept.pop(tissue, None))
+                prediction = solved.prediction
+                if any(later.startswith(tissue) for later in models[number + 1 :]):
+                    kept[tissue] = solved.solver.tensors
+                del solved
             else:
                 # Regions and proposed landmarks: a prediction without a band does not load them.
                 from cmfsim.pipeline.banding import predict_with_band  # noqa: PLC0415

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim._core import Solution, StaticSolver, rigid_fit
+from cmfsim._core import MassTensors, Solution, StaticSolver, rigid_fit
 from cmfsim.errors import CaseInputError
-from cmfsim.solving.simulation import scene_solver, solved_scene, told
+from cmfsim.solving.simulation import scene_tensors, solved_scene, solver_of, told
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
@@ -111,15 +111,20 @@ class SolvedPatient:
 
 
 def solved_patient(
-    patient: PatientModel, model: str, *, solver: StaticSolver | None = None
+    patient: PatientModel,
+    model: str,
+    *,
+    solver: StaticSolver | None = None,
+    tensors: MassTensors | None = None,
 ) -> SolvedPatient:
     """The prediction of `predict_patient`, with its solver and solution.
 
     solver: As for `predict_patient`.
+    tensors: Of its mesh and tissue, if another model has them already.
     """
     scene = model_scene(patient, model)
     begun = time.perf_counter()
-    solver = solver or scene_solver(scene)
+    solver = solver or solver_of(scene, tensors or scene_tensors(scene))
     result, solution = solved_scene(scene, solver)
     timings = {**patient.summary.get("timings", {}), "solving": time.perf_counter() - begun}
     skin = patient.skin_field(result.displacements)

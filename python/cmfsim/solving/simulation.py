@@ -55,10 +55,20 @@ def scene_solver(scene: Scene) -> StaticSolver:
     >>> plan = cmfsim.scene_plan(scene) | {"maxilla": cmfsim.rigid_motion((0, -5, 0))}
     >>> solution = solver.solve(plan)
     """
+    return solver_of(scene, scene_tensors(scene))
+
+
+def scene_tensors(scene: Scene) -> MassTensors:
+    """The tensors of a scene, which depend on mesh, tissue and element alone."""
     mesh = TetMesh(scene.nodes, scene.tets)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
+    return MassTensors(mesh, _tissue(scene.tissue), element=scene.options.element)
+
+
+def solver_of(scene: Scene, tensors: MassTensors) -> StaticSolver:
+    """The solver of a scene with its tensors, which scenes of other conditions may share."""
     options = scene.options.as_dict()
-    tensors = MassTensors(mesh, _tissue(scene.tissue), element=options.pop("element"))
+    del options["element"]
     boundary = _boundary(scene)
     if boundary.conflicts:
         _log.warning("%d nodes had two kinds; the stronger one was kept", boundary.conflicts)

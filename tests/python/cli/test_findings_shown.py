@@ -83,7 +83,7 @@ def test_nothing_doubtful_prints_nothing(capsys):
 def noticed(tmp_path, monkeypatch):
     """A case with a warning of the doctor, one of building and one of solving."""
     monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
-    build, solve = (cmfsim.pipeline.predicting.model_of, cmfsim.pipeline.predicting.predict_patient)
+    build, solve = (cmfsim.pipeline.predicting.model_of, cmfsim.pipeline.predicting.solved_patient)
     solved = Finding("of-solving", "solving is doubtful", severity="warning")
 
     def model_of(case, options):
@@ -93,18 +93,20 @@ def noticed(tmp_path, monkeypatch):
         summary = {**found.summary, "findings": findings}
         return dataclasses.replace(found, findings=(*found.findings, *MUSCLES), summary=summary)
 
-    def predict_patient(patient, model):
-        found = solve(patient, model)
+    def solved_patient(patient, model, tensors):
+        whole = solve(patient, model, tensors=tensors)
+        found = whole.prediction
         result = {**found.result.summary, "findings": [dataclasses.asdict(solved)]}
         findings = [*found.summary["findings"], dataclasses.asdict(solved)]
-        return dataclasses.replace(
+        found = dataclasses.replace(
             found,
             result=dataclasses.replace(found.result, summary=result),
             summary={**found.summary, "findings": findings},
         )
+        return dataclasses.replace(whole, prediction=found)
 
     monkeypatch.setattr("cmfsim.pipeline.predicting.model_of", model_of)
-    monkeypatch.setattr("cmfsim.pipeline.predicting.predict_patient", predict_patient)
+    monkeypatch.setattr("cmfsim.pipeline.predicting.solved_patient", solved_patient)
     given = {"where": "case.toml:3", "why": "why", "fix": "fix it"}
     doctor = Finding("of-doctor", "the case is doubtful", severity="warning", **given)
     found = cmfsim.doctor.Examination((doctor,), {})

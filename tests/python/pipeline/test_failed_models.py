@@ -19,14 +19,14 @@ pytest.importorskip("jinja2")
 def unsettled(monkeypatch, tmp_path):
     """A case whose contact never settles, and no PyVista to draw it with."""
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    solve = stage.predict_patient
+    solve = stage.solved_patient
 
-    def predict_patient(patient, model):
+    def solved_patient(patient, model, tensors):
         if model.endswith("+S"):
             raise cmfsim.ContactError("contact does not settle: nodes [7] still change")
-        return solve(patient, model)
+        return solve(patient, model, tensors=tensors)
 
-    monkeypatch.setattr(stage, "predict_patient", predict_patient)
+    monkeypatch.setattr(stage, "solved_patient", solved_patient)
     head = HeadCase(rounds=2)
     head.toml = head.toml.replace("edge_length = 4.0", "edge_length = 16.0")
     after = np.asarray(head.surfaces["skin"].vertices) + [0.0, -1.0, 0.0]
