@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmfsim._core import signed_distance_image
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.meshing import signed_level
 from cmfsim.planning.occlusion.contacts import contact_map, signed_gaps
@@ -34,8 +35,12 @@ MOST_OVERLAP = 3.0
 MOST_OPENING, OPENING_STEP = 15.0, 0.1
 # Play of the imprints, and how deep teeth may lie inside the splint, mm.
 PLAY, SEAT = 0.04, 0.1
-# How far a splint reaches from the middle of a ball as thick as the thinnest wall, mm.
-BLUNT = 1.3
+# Radius of the ball that fits everywhere, mm: half the thinnest wall, and what a surface of voxels
+# cuts off a ball.
+BALL = 0.5 * LEAST_THICKNESS + 0.04
+# Share of the largest piece below which another one is a crumb between teeth.
+CRUMB = 0.01
+NOTHING_LEFT = "nothing is left of the splint (splint-broken): the rows fill it"
 # Letters of a label, mm: their size, how far they stand out, and the widest label.
 LETTER, RAISED, WIDEST_LABEL = 6.0, 0.6, 28.0
 MOST_TRIANGLES = 2_000_000
@@ -127,18 +132,20 @@ def splint_between(
     upper_face, points = (_surface(grid.with_values(level)) for level in taken)
     near = points.vertices[grid.with_values(slab).sample(points.vertices) > 0.0]
     between = float(signed_gaps(near, upper_face).min(initial=MOST_THICKNESS))
-    if between < thickness + SPACING:
+    # The ball has to fit where it is looked for: in the middle of voxels.
+    room = max(thickness + SPACING, LEAST_THICKNESS + 2.0 * SPACING)
+    if between < room:
         axis = carried(frame, np.asarray(hinge, dtype=np.float64).reshape(2, 3))
         raise CaseInputError(
             f"the tooth rows leave {max(between, 0.0):.2f} mm between their biting faces "
-            f"(splint-bite-closed), a splint of {thickness:g} mm needs {thickness + SPACING:g} mm: "
-            f"{_advice(near, upper_face, (axis[0], axis[1]), thickness + SPACING, opening)}"
+            f"(splint-bite-closed), a splint of {thickness:g} mm needs {room:g} mm: "
+            f"{_advice(near, upper_face, (axis[0], axis[1]), room, opening)}"
         )
     teeth = np.maximum(*taken)
-    level = _without_thin(np.minimum(slab, -teeth))
+    level = _without_thin(grid, np.minimum(slab, -teeth))
     if label:
         level = np.maximum(level, np.minimum(_letters(label, grid, slab, ends), -teeth))
-    made = _surface(grid.with_values(_largest(level)))
+    made = _surface(grid.with_values(largest_piece(level)))
     back = np.asarray(np.linalg.inv(frame), dtype=np.float64)
     surface = SurfaceData(carried(back, made.vertices), made.triangles)
     seat = max(_depth(upper, surface), _depth(lower, surface))
@@ -226,10 +233,26 @@ def _grid(
 def _taken(row: ToothRow, frame: Floats, grid: ImageData, *, up: bool) -> NDArray[np.float32]:
     """The level of a row and of all beyond it along the axis of insertion, mm near its surface."""
     surface = SurfaceData(carried(frame, row.surface.vertices), row.surface.triangles)
-    values = 2.0 * SPACING * signed_level(surface, grid).single + np.float32(PLAY)
+    values = 2.0 * SPACING * signed_level(surface, grid).single
+    _hold(values, grid, surface.vertices[row.crowns])
+    values += np.float32(PLAY)
     if up:
         return np.maximum.accumulate(values, axis=2)
     return np.ascontiguousarray(np.maximum.accumulate(values[:, :, ::-1], axis=2)[:, :, ::-1])
+
+
+def _hold(values: NDArray[np.float32], grid: ImageData, points: Floats) -> None:
+    """Raises a level at the corners of voxels that hold points outside it: narrow cusps."""
+    missing = -grid.with_values(values).sample(points)
+    narrow = missing > 0.0
+    first = np.floor((points[narrow] - grid.lowest) / SPACING).astype(np.intp)
+    raised = np.zeros_like(values)
+    for corner in np.ndindex(2, 2, 2):
+        at = first + corner
+        inside = ((at >= 0) & (at < values.shape)).all(axis=1)
+        x, y, z = at[inside].T
+        np.maximum.at(raised, (x, y, z), np.float32(missing[narrow][inside]))
+    values += raised
 
 
 def _slab(
@@ -251,7 +274,10 @@ def _slab(
     # From the middles of voxels inside: the crown's edge may lie a voxel further out.
     around = wall - ndimage.distance_transform_edt(~(feet[0] | feet[1]), sampling=SPACING)
     # Rows that are far apart leave no hole between them.
-    around[ndimage.binary_fill_holes(around > 0.0) & (around <= 0.0)] = SPACING
+    holes = ndimage.binary_fill_holes(around > 0.0) & (around <= 0.0)
+    # With their edges, which would be grooves.
+    holes = ndimage.binary_dilation(holes, iterations=2)
+    around[holes] = np.maximum(around[holes], SPACING)
     behind = max(line[:, 1].max() for line in lines) + BEHIND_CUSP
     round_crowns = np.minimum(around, behind - y[:, :, 0])[:, :, None]
     level = np.minimum(round_crowns, np.minimum(high - z, z - low))
@@ -299,29 +325,47 @@ def _letters(
     )
 
 
-def _without_thin(level: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The level of what balls reach that are as thick as the thinnest wall and fit into it.
+def _without_thin(grid: ImageData, level: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The level opened by a ball as thick as the thinnest wall: what such balls reach inside it.
 
-    So the edges between teeth are blunt, and no sheet is left where bone behind the molars grazes
-    the splint.
+    So edges between teeth and of the slab are blunt, and no sheet is left where bone behind the
+    molars grazes the splint. Distances are those from surfaces: from voxels they would be wrong by
+    half a voxel.
     """
-    ndimage = third_party("scipy.ndimage", "splints are made", "imaging")
-    # Less half a voxel: a sheet with room for five voxels is then as thick as it has to be.
-    solid = level > 0.5 * SPACING
-    depth = ndimage.distance_transform_edt(solid, sampling=SPACING)
-    core = depth > 0.5 * LEAST_THICKNESS
-    # From the core to a flat face there are up to three and a half voxels.
-    reach = np.float32(BLUNT) - ndimage.distance_transform_edt(~core, sampling=SPACING)
-    return np.asarray(np.minimum(level, reach), dtype=np.float32)
+    core = _distances(grid, level) - np.float32(BALL)
+    if not (core > 0.0).any():
+        raise CaseInputError(NOTHING_LEFT)
+    reach = _distances(grid, core) + np.float32(BALL)
+    return np.minimum(level, reach)
 
 
-def _largest(level: NDArray[np.float32]) -> NDArray[np.float32]:
+def _distances(grid: ImageData, level: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The distance from the zero surface of a level, mm, positive inside: up to twice a ball."""
+    nx, ny, nz = grid.values.shape
+    x, y, z = grid.lowest.tolist()
+    return signed_distance_image(
+        _surface(grid.with_values(level)).searched,
+        (nx, ny, nz),
+        (SPACING,) * 3,
+        (x, y, z),
+        band=2.0 * BALL,
+    )
+
+
+def largest_piece(level: NDArray[np.float32]) -> NDArray[np.float32]:
     """The level of the largest connected piece: crumbs between teeth are no part of a splint."""
     ndimage = third_party("scipy.ndimage", "splints are made", "imaging")
     labels, count = ndimage.label(level > 0.0)
     if not count:
-        raise CaseInputError("nothing is left of the splint: the rows fill it")
-    largest = 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
+        raise CaseInputError(NOTHING_LEFT)
+    sizes = np.bincount(labels.ravel())[1:]
+    largest = 1 + int(np.argmax(sizes))
+    if (pieces := int((sizes > CRUMB * sizes.max()).sum())) > 1:
+        raise CaseInputError(
+            f"the splint falls into {pieces} pieces (splint-broken), because walls thinner than "
+            f"{LEAST_THICKNESS:g} mm are removed: open the lower jaw further (--open), or give "
+            "surfaces of the jaws with scanned teeth"
+        )
     outside = np.float32(-SPACING)
     kept: NDArray[np.float32] = np.where((labels == largest) | (labels == 0), level, outside)
     least = np.where(kept > 0.0, np.float32(LEAST_LEVEL), -np.float32(LEAST_LEVEL))

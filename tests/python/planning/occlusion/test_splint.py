@@ -1,13 +1,19 @@
 """Splints against VTK's measurements: closed, thick enough, and teeth seat in them."""
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tooth_row_heads import HINGE, closed_rows, rows_of
 
 import cmfsim
 import real_heads
+from cmfsim.planning.occlusion.splint import largest_piece
 
 pv = pytest.importorskip("pyvista")
+stencil = pytest.importorskip("vtkmodules.vtkImagingStencil")
+ndimage = pytest.importorskip("scipy.ndimage")
 modeling = pytest.importorskip("vtkmodules.vtkFiltersModeling")
 
 
@@ -54,9 +60,55 @@ def atlas():
     return cmfsim.splint_between(moved, lower, heads, thickness=1.5, opening=3.0)
 
 
-@pytest.fixture(params=["final", "atlas"])
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory):
+    """The splint of a real CT, whose bones are voxels of 1 x 1 x 2 mm."""
+    folder = tmp_path_factory.mktemp("phantom")
+    shutil.copy(real_heads.data_folder() / "ct_phantom/ct.nii.gz", folder)
+    moves = {"maxilla": {"forwards": 4.0, "up": 1.0}, "mandible_body": {"forwards": -2.5}}
+    cmfsim.init_case(folder, cuts=("le_fort_1", "bsso"), moves=moves)
+    return cmfsim.make_splint(folder, opening=3.1)
+
+
+@pytest.fixture(params=["final", "atlas", pytest.param("phantom", marks=pytest.mark.slow)])
 def splint(request):
     return request.getfixturevalue(request.param)
+
+
+def solid_of(surface, spacing):
+    """Voxels inside a closed surface by VTK, a few of them beyond its box."""
+    to_stencil, paint = stencil.vtkPolyDataToImageStencil(), stencil.vtkImageStencilToImage()
+    low = surface.vertices.min(axis=0) - 3.0 * spacing
+    size = np.ceil((surface.vertices.max(axis=0) - low) / spacing).astype(int) + 4
+    to_stencil.SetInputData(shape_of(surface))
+    to_stencil.SetOutputSpacing([spacing] * 3)
+    to_stencil.SetOutputOrigin(low.tolist())
+    to_stencil.SetOutputWholeExtent([v for n in size.tolist() for v in (0, n - 1)])
+    paint.SetInputConnection(to_stencil.GetOutputPort())
+    paint.SetInsideValue(1)
+    paint.SetOutsideValue(0)
+    paint.SetOutputScalarTypeToUnsignedChar()
+    paint.Update()
+    inside = np.asarray(pv.wrap(paint.GetOutput()).active_scalars)
+    return inside.reshape(size, order="F") > 0
+
+
+def test_nothing_is_thinner_than_a_ball_of_one_and_a_half_millimetres(splint):
+    """By VTK's voxels and SciPy's distances: balls that fit inside reach all of the splint."""
+    # Upright, so that the box about it is small.
+    upright = np.linalg.qr(np.column_stack([splint.axis, [1, 0, 0], [0, 1, 0]]))[0]
+    turned = cmfsim.SurfaceData(splint.surface.vertices @ upright, splint.surface.triangles)
+    spacing, radius = 0.2, 0.75
+    solid = solid_of(turned, spacing)
+    # To the middles of voxels outside: on a face, half a voxel beyond it.
+    depth = ndimage.distance_transform_edt(solid, sampling=spacing)
+    core = depth >= radius + 0.5 * spacing
+    away = ndimage.distance_transform_edt(~core, sampling=spacing)
+    beyond = solid & (away > radius + 1.5 * spacing)
+    assert beyond.sum() * spacing**3 < 0.3
+    assert away[solid].max() < radius + 2.0 * spacing
+    # All in one piece, also where it is as thick as that.
+    assert ndimage.label(core)[1] == 1
 
 
 def test_a_splint_is_one_closed_surface_also_as_stl(splint, tmp_path):
@@ -104,6 +156,30 @@ def test_walls_are_as_thick_as_asked_for(splint):
     # The points of one imprint from the other row.
     assert distance(in_upper, splint.lower.surface).min() >= least - 0.1
     assert distance(in_lower, splint.upper.surface).min() >= least - 0.1
+
+
+def test_cusps_that_are_narrower_than_voxels_are_held(final):
+    """Tips of a tenth of a millimetre, as those of surfaces of a CT, lie in no voxel's corner."""
+    lower = final.lower.surface
+    vertices = lower.vertices.copy()
+    tips = [*final.lower.cusps.values()][3:15:3]
+    vertices[tips] += 0.9 * final.axis
+    spiky = cmfsim.SurfaceData(vertices, lower.triangles)
+    row = replace(final.lower, surface=spiky)
+    made = cmfsim.splint_between(final.upper, row, HINGE, opening=1.0)
+    tips = made.lower.surface.vertices[tips]
+    assert -distance(tips, made.surface).min() <= 0.1
+
+
+def test_a_splint_that_falls_into_pieces_is_refused():
+    """Never the largest piece alone, without the teeth of the others."""
+    level = np.full((30, 10, 10), -0.3, dtype=np.float32)
+    level[2:12, 2:8, 2:8] = level[16:28, 2:8, 2:8] = 0.3
+    with pytest.raises(cmfsim.CaseError, match=r"2 pieces.*splint-broken.*1\.5 mm.*--open"):
+        largest_piece(level)
+    level[16:28] = -0.3
+    level[20, 5, 5] = 0.3
+    assert largest_piece(level)[20, 5, 5] < 0.0
 
 
 def test_what_cannot_be_made_is_refused_with_its_remedy():
