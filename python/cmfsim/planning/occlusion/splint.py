@@ -343,13 +343,14 @@ def _distances(grid: ImageData, level: NDArray[np.float32]) -> NDArray[np.float3
     """The distance from the zero surface of a level, mm, positive inside: up to twice a ball."""
     nx, ny, nz = grid.values.shape
     x, y, z = grid.lowest.tolist()
-    return signed_distance_image(
+    distances: NDArray[np.float32] = signed_distance_image(
         _surface(grid.with_values(level)).searched,
         (nx, ny, nz),
         (SPACING,) * 3,
         (x, y, z),
         band=2.0 * BALL,
     )
+    return distances
 
 
 def largest_piece(level: NDArray[np.float32]) -> NDArray[np.float32]:
