@@ -1,9 +1,8 @@
 """The work of the desk, as it runs in a worker: the head, the plan operator, the report."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +15,18 @@ from cmfsim.pipeline.building.inputs import (
     read_case_landmarks,
     read_placed_sites,
 )
+from cmfsim.pipeline.building.stages import BuildOptions, OnMuscles
 from cmfsim.pipeline.outputs.landmark_page import head_content
 from cmfsim.pipeline.outputs.results import write_chart_page, write_results
 from cmfsim.pipeline.planning import make_planning_page
-from cmfsim.pipeline.predicting import predict_models, prepare
+from cmfsim.pipeline.predicting import predictions_of, prepare
 from cmfsim.pipeline.proposing import filled_landmarks, proposed_head, unproposed_head
 from cmfsim.planning.page import page_text
 from cmfsim.planning.replanning import PlanningModel
 from cmfsim.planning.server import RefusedError, plan_of_body, solved_plan
 from cmfsim.processes.worker import Answer
 from cmfsim.values.finding import Finding
+from cmfsim.values.prediction import Prediction
 from cmfsim.values.progress import Observer
 
 # What the line of a stage begins with, on standard error.
@@ -35,7 +36,8 @@ MODEL = "M+S"
 # solved exactly as soon as it is kept.
 TRIALS = 4
 
-_held: dict[str, PlanningModel] = {}
+# The planning model of a case file, with the case as it was then.
+_held: dict[str, tuple[Case, PlanningModel]] = {}
 
 
 class _Told(Observer):
@@ -95,7 +97,7 @@ def compute(case_file: str) -> dict[str, Any]:
     made = make_planning_page(
         case, model=MODEL, trials=TRIALS, corrections=0, observer=told, progress=_stage
     )
-    _held[case_file] = made.planning
+    _held[case_file] = case, made.planning
     content = replace(made.content, values={**made.content.values, "on_desk": True})
     return {
         "text": page_text(content, case_file=case.file.name, is_served=True),
@@ -107,7 +109,7 @@ def compute(case_file: str) -> dict[str, Any]:
 
 def solve(case_file: str, body: str) -> Answer:
     """The exact displacements of the skin's nodes under a plan, with a summary."""
-    shift, figures = solved_plan(_held[case_file], _plan(case_file, body))
+    shift, figures = solved_plan(_held[case_file][1], _plan(case_file, body))
     return Answer(figures, {"shift": shift})
 
 
@@ -120,19 +122,28 @@ def _plan(case_file: str, body: str) -> dict[str, Any]:
     if case_file not in _held:
         raise CaseInputError("the plan operator is gone: compute it again on the desk")
     try:
-        return plan_of_body(_held[case_file], body.encode())
+        return plan_of_body(_held[case_file][1], body.encode())
     except RefusedError as error:
         raise CaseInputError(str(error)) from error
 
 
 def report(case_file: str) -> dict[str, Any]:
-    """Predicts the case as `cmfsim predict` does; its report, the page for the chart, findings."""
+    """Predicts the case as `cmfsim predict` does; its report, the page for the chart, findings.
+
+    Where only the plan differs from the case of the plan operator, nothing is built again.
+    """
     case, told = Case.load(case_file), _Told()
     prepare(case, report=True)
-    predicted = partial(predict_models, case, MODEL, observer=told)
-    written = write_results(
-        case.output, lambda on_muscles: predicted(on_muscles=on_muscles), (MODEL,), stage=_stage
-    )
+    built = None
+    if case_file in _held:
+        before, planning = _held[case_file]
+        built = before, planning.patient
+
+    def predicted(on_muscles: OnMuscles) -> Iterator[Prediction]:
+        options = BuildOptions(observer=told, on_muscles=on_muscles)
+        return predictions_of(case, (MODEL,), options, built=built)
+
+    written = write_results(case.output, predicted, (MODEL,), stage=_stage)
     _stage("drawing the page for the chart")
     names = [written.report, write_chart_page(case.output)]
     return {"files": names, "findings": told.as_values()}

@@ -10,7 +10,8 @@ from cmfsim._core import MassTensors
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.io.results.predictions import is_prediction_file
-from cmfsim.pipeline.building.case_model import model_of
+from cmfsim.pipeline.building.case_checks import cut_segments
+from cmfsim.pipeline.building.case_model import model_of, replanned
 from cmfsim.pipeline.building.inputs import case_key, check_output, input_hashes, plan_key
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, build_options
 from cmfsim.solving.models import solved_patient
@@ -192,13 +193,23 @@ def predict_models(
 
 
 def predictions_of(
-    case: Case, models: Sequence[str], options: BuildOptions, *, band: BandOptions | None = None
+    case: Case,
+    models: Sequence[str],
+    options: BuildOptions,
+    *,
+    band: BandOptions | None = None,
+    built: tuple[Case, PatientModel] | None = None,
 ) -> Iterator[Prediction]:
-    """The predictions of several models for one case, as `predict_models` makes them."""
+    """The predictions of several models for one case, as `predict_models` makes them.
+
+    built: What `build_patient` gave of a case that may have had another plan, with that case. It is
+        used if nothing else has changed.
+    """
     if band is not None:
         # Before a case is built for a minute.
         band.check(models)
-    patient = build_patient(case, models, options)
+    patient = None if built is None else _replanned(*built, case, options)
+    patient = patient or build_patient(case, models, options)
     if patient.muscles is not None:
         options.observer.muscles(patient.muscles, patient.segments)
     known = set(patient.findings)
@@ -251,6 +262,24 @@ def case_for_models(case: Case, models: Sequence[str]) -> Case:
     if not any(model.startswith("M") for model in models):
         return replace(case, muscles=None)
     return case if case.muscles is not None else replace(case, muscles=CaseMuscles())
+
+
+def _replanned(
+    before: Case, patient: PatientModel, case: Case, options: BuildOptions
+) -> PatientModel | None:
+    """The patient under the plan of a case; None if not only the plan differs."""
+    hashes = input_hashes(case)
+    # As they were when it was built, but for the case file, in which the plan stands.
+    own = {case.file.name: hashes[case.file.name]}
+    key = case_key(replace(before, plan=case.plan), {**patient.summary["inputs"], **own})
+    # Where tissue slides and is cleft follows from which segments are cut or moved.
+    others = (before.plan.keys() ^ case.plan.keys()) - {*cut_segments(case)}
+    if case_key(case, hashes) != key or others or case.achieved:
+        return None
+    model = replanned(patient, before, case, options)
+    options.observer.found(model.findings)
+    summary = {**model.summary, "inputs": hashes, "inputs_key": key}
+    return replace(model, summary=summary)
 
 
 def build_patient(

@@ -104,12 +104,7 @@ def assembled(
             "contact": departures,
             **({} if nodes.seam is None else {"lips": lip_summary(nodes.seam, nodes.lips)}),
             **({} if bones.achieved is None else {"achieved": bones.achieved.as_dict()}),
-            **(
-                {"plan_fits": {name: fit.as_dict() for name, fit in bones.fits.items()}}
-                if bones.fits
-                else {}
-            ),
-            "plan_sources": dict(bones.sources),
+            **_fits(bones),
         },
         detailed_skin=partial(_detailed_skin, head),
         face_colours=head.colours,
@@ -238,6 +233,45 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
 
 
+def replanned(
+    patient: PatientModel, before: Case, case: Case, options: BuildOptions
+) -> PatientModel:
+    """The model of a case that differs in nothing but its plan from the one of a patient.
+
+    before: The case of which the patient was built.
+    """
+    old = {finding.what for finding in _of_plan(patient, before, Stages(BuildOptions()))[1]}
+    stages = Stages(options)
+    bones, found = _of_plan(patient, case, stages)
+    new = {finding.what for finding in found}
+    kept = [f for f in patient.findings if f.what not in old | new]
+    moved = {n: motion for n, motion in bones.motions.items() if n in patient.scene.segments}
+    model = patient.with_plan(moved)
+    scene = replace(model.scene, options=case.solver)
+    findings = tuple(dict.fromkeys([*found, *kept]))
+    summary = {
+        **{k: v for k, v in patient.summary.items() if k != "plan_fits"},
+        "findings": [asdict(finding) for finding in findings],
+        "timings": dict(stages.seconds),
+        **_fits(bones),
+    }
+    return replace(model, scene=scene, findings=findings, summary=summary)
+
+
+def _of_plan(
+    patient: PatientModel, case: Case, stages: Stages
+) -> tuple[PlannedBones, list[Finding]]:
+    """The bones of a patient with the motions of a case, and what is found of its plan."""
+    stages.begin("checking the case")
+    stages.add(_checked(case))
+    bones = planned_bones(case, patient.segments)
+    _note_plan(stages, case, bones, patient.landmarks.get("skull", {}))
+    if case.image is not None:
+        stages.drop(LANDMARK_CODES)
+    stages.end()
+    return bones, stages.findings
+
+
 def planned_head(
     case: Case, options: BuildOptions
 ) -> tuple[Head, PlannedBones, tuple[Finding, ...]]:
@@ -298,13 +332,7 @@ def _bones(
     if case.achieved:
         stages.begin("reading the achieved plan")
     bones = planned_bones(case, cut.segments, after)
-    for name, fit in bones.fits.items():
-        if fit.method == "shape":
-            # By shape the size is known with an interval, and is no part of the motion.
-            stages.drop({"moved-scaled"}, case.where(f"plan.{name}"))
-    stages.add(bones.findings)
-    stages.add(plan_sizes(case, bones, stages.findings))
-    stages.add(jaws(bones, head.skull, case, stages.findings))
+    _note_plan(stages, case, bones, head.skull)
     if case.image is not None:
         # What was compared with the voxels of the CT is compared with the bones made of them.
         stages.drop(LANDMARK_CODES)
@@ -313,6 +341,24 @@ def _bones(
         # Again for all of them together: pieces of two bones never met before.
         check_segments(bones.segments)
     return bones, cut.procedures
+
+
+def _note_plan(
+    stages: Stages, case: Case, bones: PlannedBones, skull: Mapping[str, Floats]
+) -> None:
+    for name, fit in bones.fits.items():
+        if fit.method == "shape":
+            # By shape the size is known with an interval, and is no part of the motion.
+            stages.drop({"moved-scaled"}, case.where(f"plan.{name}"))
+    stages.add(bones.findings)
+    stages.add(plan_sizes(case, bones, stages.findings))
+    stages.add(jaws(bones, skull, case, stages.findings))
+
+
+def _fits(bones: PlannedBones) -> dict[str, Any]:
+    """What the summary of a patient has of its plan."""
+    fits = {name: fit.as_dict() for name, fit in bones.fits.items()}
+    return {**({"plan_fits": fits} if fits else {}), "plan_sources": dict(bones.sources)}
 
 
 def _meshed(head: Head) -> MeshedTissue:

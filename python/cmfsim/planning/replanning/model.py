@@ -133,6 +133,20 @@ class PlanningModel:
         found = self.solver.solve(self.whole(plan), loads=self._scene.loads)
         return self.patient.skin_field(found.displacements), found.contact_converged
 
+    def predict(self, plan: Motions) -> Prediction:
+        """The prediction of `predict` under a plan: `solve`, with tissue lifted as by this plan.
+
+        Where other nodes are lifted off the bone than at the reference, the equations are
+        factorised again.
+        """
+        patient = self.patient.with_plan(self.whole(plan))
+        reference = self.patient.scene
+        is_same = np.array_equal(patient.scene.fixed, reference.fixed) and all(
+            np.array_equal(segment.joined, reference.segments[name].joined)
+            for name, segment in patient.scene.segments.items()
+        )
+        return predict_patient(patient, self.model, solver=self.solver if is_same else None)
+
     def solve(self, plan: Motions) -> Prediction:
         """The prediction under a plan, solved exactly, contact included.
 
