@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.planning.face_measures import BoneSite
+from cmfsim.planning.page.content import occlusal_measures
 from cmfsim.planning.page.document import joined_scripts
 from cmfsim.values.motion import plan_digits
 
@@ -79,3 +81,50 @@ def test_the_page_and_predict_give_plans_the_same_digits(tmp_path):
     assert [entry[0] for entry in found] == digits
     assert len(set(digits)) == len(plans)
     assert all(f'"A" ({d}) of the case' in entry[1] for d, entry in zip(digits, found, strict=True))
+
+
+@pytest.mark.parametrize("has_teeth", [True, False])
+def test_occlusion_follows_the_moves_of_the_page_as_in_python(has_teeth, tmp_path):
+    """Also of jaws that are turned, of one that stays, and of bone that is in no segment."""
+    head = cmfsim.make_head(cmfsim.HeadParameters(asymmetry=3.0))
+    places = {name: np.asarray(place) for name, place in head.skull_landmarks.items()}
+    if has_teeth:
+        middle = 0.5 * (places["supradentale"] + places["infradentale"])
+        for jaw, high in (("U", -1.0), ("L", 1.0)):
+            for side, across in (("L", 1.0), ("R", -1.0)):
+                places[f"{jaw}{side}1O"] = middle + [4 * across, -3 + high, high]
+                places[f"{jaw}{side}6MB"] = middle + [24 * across, 30 - high, 3 + high]
+    segments = ("mandible_body", "maxilla")
+    sites = {}
+    for name, place in places.items():
+        upper = name[0] == "U" or name.startswith(("supradentale", "supra_m2"))
+        lower = name[0] == "L" or name.startswith(("infradentale", "sub_m2", "chin"))
+        part = "maxilla" if upper else "mandible_body" if lower else "skull"
+        sites[name] = BoneSite(place, part)
+    plans = [
+        {},
+        {"maxilla": cmfsim.rigid_motion((1, -4, 2), 5, (1, 2, 3), (0, -90, -30))},
+        {
+            "maxilla": cmfsim.rigid_motion((0, -6, 1), -3, (0, 1, 0), (5, -80, -30)),
+            "mandible_body": cmfsim.rigid_motion((-3, 3, 0), 8, (0, 0, 1), (0, 0, 0)),
+        },
+    ]
+    rows = [[plan.get(name, np.eye(4)).ravel().tolist() for name in segments] for plan in plans]
+    found = answers(
+        tmp_path,
+        'import { measure } from "./measures.js";'
+        f"const measures = {json.dumps(occlusal_measures(sites, segments))};"
+        f"console.log(JSON.stringify({json.dumps([*rows, None])}"
+        ".map((m) => measure(measures, {}, m))));",
+    )
+    for plan, values in zip([*plans, {}], found, strict=True):
+        moved = {
+            name: plan[site.segment][:3, :3] @ site.place + plan[site.segment][:3, 3]
+            if site.segment in plan
+            else site.place
+            for name, site in sites.items()
+        }
+        wanted = cmfsim.occlusion(moved, places)
+        assert sum(value is not None for value in values) == (7 if has_teeth else 3)
+        for measure, value in zip(cmfsim.OCCLUSAL_MEASURES, values, strict=True):
+            assert value == pytest.approx(wanted[measure.key], abs=1e-6), measure.key

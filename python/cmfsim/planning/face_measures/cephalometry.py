@@ -172,13 +172,18 @@ def projected(
         {name: plane @ place for name, place in profile_sites(sites).items()}
         for sites in (at_rest, landmarks)
     )
-    for ends in BITES:
-        if all(name in places for pair in ends for name in pair):
-            middles = [0.5 * (places[upper] + places[lower]) for upper, lower in ends]
-            places.update(zip(OCCLUSAL, middles, strict=True))
-            break
+    places.update(occlusal_plane(places))
     # An orbit that is moved does not turn the horizontal.
     given = {"Po", "Or"} <= rest.keys()
     level = (rest["Po"], rest["Or"]) if given else (np.zeros(2), np.array([1.0, 0.0]))
     places.update(zip(FRANKFORT, level, strict=True))
     return places
+
+
+def occlusal_plane(sites: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The points of the occlusal plane, from those of `profile_sites`; none where they lack."""
+    for ends in BITES:
+        if all(name in sites for pair in ends for name in pair):
+            middles = [0.5 * (sites[upper] + sites[lower]) for upper, lower in ends]
+            return dict(zip(OCCLUSAL, middles, strict=True))
+    return {}

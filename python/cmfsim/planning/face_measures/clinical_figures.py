@@ -53,7 +53,7 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
     ['SNA', 'SNB', 'ANB']
     """
     patient = prediction.patient
-    bone, sites = _bone_sites(patient), face.face_sites(patient)
+    bone, sites = bone_sites(patient), face.face_sites(patient)
     before = {name: site.place for name, site in bone.items()}
     after = face.moved_bone_sites(prediction, bone)
     at_rest = {**sites.skin, **{name: site.place for name, site in sites.bone.items()}}
@@ -91,7 +91,7 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
     }
 
 
-def _bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
+def bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
     """The sites of the skull on their segments, and the cusps that the bone shows."""
     skull = patient.landmarks.get("skull", {}) if patient.segments else {}
     sites = {}

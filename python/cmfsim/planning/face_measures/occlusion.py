@@ -7,15 +7,16 @@ to, in their middle.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.planning.face_measures.cephalometry import head_axes, projected, value_of
+from cmfsim.planning.face_measures.cephalometry import FORMULAS, OCCLUSAL, head_axes, occlusal_plane
 from cmfsim.planning.face_measures.definitions import Measure
 from cmfsim.values.checks import Floats
-from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, tooth_of
+from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, profile_sites, tooth_of
 
 # Between the central incisors, and at the molars, on the bone: where the teeth are not given.
 UPPER_MIDLINE, LOWER_MIDLINE, MOLARS = "supradentale", "infradentale", "supra_m2"
@@ -72,40 +73,90 @@ def occlusion(
     >>> cmfsim.occlusion(sites)["upper_midline"]
     1.5
     """
-    at_rest = landmarks if before is None else before
-    plane, flat = head_axes(at_rest), projected(landmarks, before)
-    left = np.cross(plane[1], plane[0])
-    found: dict[str, float | None] = {measure.key: None for measure in OCCLUSAL_MEASURES}
+    frame = bite_frame(landmarks if before is None else before)
+    places = np.array([*landmarks.values()], dtype=np.float64).reshape(-1, 3)
+    found = {
+        key: term.value(term.weights @ places, frame)
+        for key, term in occlusal_terms(landmarks).items()
+    }
+    return {measure.key: found.get(measure.key) for measure in OCCLUSAL_MEASURES}
+
+
+@dataclass(frozen=True, eq=False)
+class BiteFrame:
+    """The directions of a head, (3,) each, and where its midsagittal plane cuts that to the left.
+
+    middle: mm; None without sites of the cranium.
+    """
+
+    forwards: Floats
+    up: Floats
+    left: Floats
+    middle: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class OcclusalTerm:
+    """How a measure is taken: a formula of points that are means of sites.
+
+    formula: "along", "across", "left" or "cant".
+    weights: (p, n). Of each of n sites in each point.
+    offset: mm. Subtracted from the formula.
+    """
+
+    formula: str
+    weights: Floats
+    offset: float = 0.0
+
+    def value(self, points: Floats, frame: BiteFrame) -> float | None:
+        """The value at points, (p, 3) mm."""
+        if self.formula == "left":
+            return None if frame.middle is None else float(points[0] @ frame.left) - frame.middle
+        if self.formula == "cant":
+            across = points[0] - points[1]
+            return float(np.degrees(np.arctan2(across @ frame.up, across @ frame.left)))
+        flat = points @ np.stack([frame.forwards, frame.up]).T
+        return FORMULAS[self.formula][0](*flat) - self.offset
+
+
+def bite_frame(landmarks: Mapping[str, ArrayLike]) -> BiteFrame:
+    """The frame in which occlusion is measured, by the landmarks before the operation."""
+    forwards, up = head_axes(landmarks)
+    left: Floats = np.cross(up, forwards)
+    return BiteFrame(forwards, up, left, _middle(landmarks, left))
+
+
+def occlusal_terms(landmarks: Collection[str]) -> dict[str, OcclusalTerm]:
+    """How each of `OCCLUSAL_MEASURES` is taken from landmarks of these names, where it can be."""
+    # Means of unit vectors are the weights of the sites.
+    unit: dict[str, Floats] = dict(zip(landmarks, np.eye(len(landmarks)), strict=True))
+    flat = profile_sites(unit)
+    flat |= occlusal_plane(flat)
+    teeth = {known: unit[name] for name in unit if (known := tooth_of(name)) is not None}
+    found = {}
     for measure in OCCLUSAL_MEASURES[:2]:
-        found[measure.key] = value_of(measure, flat)
-    places = {name: np.asarray(place, dtype=np.float64) for name, place in landmarks.items()}
-    teeth = {known: places[name] for name in places if (known := tooth_of(name)) is not None}
-    middle = _middle(at_rest, left)
+        if all(name in flat for name in measure.sites):
+            points = np.stack([flat[name] for name in measure.sites])
+            found[measure.key] = OcclusalTerm(measure.formula, points)
     for key, tooth, bone in (
         ("upper_midline", "U1", UPPER_MIDLINE),
         ("lower_midline", "L1", LOWER_MIDLINE),
     ):
         pair = _sides(teeth, tooth)
-        site = places.get(bone) if pair is None else 0.5 * (pair[0] + pair[1])
-        if site is not None and middle is not None:
-            found[key] = float(site @ left) - middle
+        site = unit.get(bone) if pair is None else 0.5 * (pair[0] + pair[1])
+        if site is not None:
+            found[key] = OcclusalTerm("left", site[None])
     on_bone = {
-        ("U6", side, "O"): places[f"{MOLARS}_{side}"]
-        for side in "LR"
-        if f"{MOLARS}_{side}" in places
+        ("U6", side, "O"): unit[f"{MOLARS}_{side}"] for side in "LR" if f"{MOLARS}_{side}" in unit
     }
     ends = _sides(teeth, "U6") or _sides(on_bone, "U6")
     if ends is not None:
-        across = ends[0] - ends[1]
-        found["cant"] = float(np.degrees(np.arctan2(across @ plane[1], across @ left)))
+        found["cant"] = OcclusalTerm("cant", np.stack(ends))
     for side, (cusp, offset) in itertools.product(("left", "right"), CLASS_I.items()):
         upper, lower = (teeth.get((name, side[0].upper(), cusp)) for name in ("U6", "L6"))
-        if upper is None or lower is None or "OP-front" not in flat:
-            continue
-        if found[f"molar_{side}"] is None:
-            along = flat["OP-front"] - flat["OP-back"]
-            ahead = float(along @ (plane @ (upper - lower)) / np.hypot(*along))
-            found[f"molar_{side}"] = ahead - offset
+        if upper is not None and lower is not None and OCCLUSAL[0] in flat:
+            points = np.stack([*(flat[name] for name in OCCLUSAL), upper, lower])
+            found.setdefault(f"molar_{side}", OcclusalTerm("along", points, offset))
     return found
 
 

@@ -1,6 +1,6 @@
 """The content of a planning page: surfaces, operator, sites, errors and band, as plain values."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,7 +9,20 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, __version__
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, midline_profile
+from cmfsim.planning.face_measures import (
+    MEASURES,
+    OCCLUSAL_MEASURES,
+    BoneSite,
+    FaceSites,
+    face_sites,
+    midline_profile,
+)
+from cmfsim.planning.face_measures.clinical_figures import bone_sites
+from cmfsim.planning.face_measures.occlusion import (
+    bite_frame,
+    missing_for_occlusion,
+    occlusal_terms,
+)
 from cmfsim.planning.page.segment_points import segment_points
 from cmfsim.planning.page.tooth_rows import tooth_rows
 from cmfsim.planning.replanning import (
@@ -325,9 +338,48 @@ def _measured(planning: PlanningModel, sites: FaceSites) -> dict[str, Any]:
                 "absent": sites.why_absent(measure.sites),
             }
             for measure in MEASURES
-        ],
+        ]
+        + occlusal_measures(bone_sites(planning.patient), planning.segments),
         "measure_notes": notes,
     }
+
+
+def occlusal_measures(
+    sites: Mapping[str, BoneSite], segments: Sequence[str]
+) -> list[dict[str, Any]]:
+    """The measures of occlusion, by points that move with segments, each with its share."""
+    before = {name: site.place for name, site in sites.items()}
+    frame, terms, absent = bite_frame(before), occlusal_terms(before), missing_for_occlusion(before)
+    numbers = {name: number for number, name in enumerate(segments)}
+    bearers = np.array([numbers.get(site.segment, -1) for site in sites.values()])
+    places = np.array([*before.values()]).reshape(-1, 3)
+
+    def point(weights: Floats) -> list[dict[str, Any]]:
+        shares = {int(b): weights * (bearers == b) for b in np.unique(bearers[weights > 0.0])}
+        return [
+            {
+                "segment": None if bearer < 0 else bearer,
+                "share": float(share.sum()),
+                "place": (share @ places / share.sum()).tolist(),
+            }
+            for bearer, share in shares.items()
+        ]
+
+    axes = {n: getattr(frame, n).tolist() for n in ("forwards", "up", "left")}
+    found = []
+    for measure in OCCLUSAL_MEASURES:
+        text = {name: getattr(measure, name) for name in ("key", "label", "unit", "about")}
+        own: dict[str, Any] = {"sites": [], "formula": "", "absent": absent[measure.key]}
+        if not own["absent"]:
+            term = terms[measure.key]
+            own |= {
+                "formula": term.formula,
+                "points": [point(weights) for weights in term.weights],
+                "offset": frame.middle if term.formula == "left" else term.offset,
+                "axes": axes,
+            }
+        found.append({**text, **own})
+    return found
 
 
 def _profile(

@@ -1,4 +1,4 @@
-// The measures of the face before, under the case's plan, and under the variant that is shown.
+// The measures of face and occlusion before, under the case's plan, and under the variant that is shown.
 
 import { element, shown, signed } from "./elements.js";
 
@@ -8,7 +8,7 @@ export class MeasurePanel {
     this.body = element("tbody");
     const heads = ["", "before", "case's plan", "now", "change"];
     this.root = element("div", {},
-      element("h2", { textContent: "Measures of the face" }),
+      element("h2", { textContent: "Measures of face and occlusion" }),
       element("div", { className: "wide" }, element("table", { id: "measures" },
         element("caption", { textContent: "Change: now minus before; mm and degrees." }),
         element("thead", {}, element("tr", {}, ...heads.map((h) => element("th", { scope: "col", textContent: h })))),

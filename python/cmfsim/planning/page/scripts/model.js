@@ -106,7 +106,7 @@ export class PatientFace {
 
   /** The value of each measure under the motions, or before them. */
   measures(motions = null) {
-    return measure(this.page.measures, this.sitePlaces(motions));
+    return measure(this.page.measures, this.sitePlaces(motions), motions);
   }
 
   /** The midline profile of face places: rows of y, z, and whether joined to the row before. */
