@@ -186,8 +186,7 @@ def test_a_ct_becomes_a_saved_plan_and_a_printed_page_by_clicks(browser, folder)
         assert person.count <= MOST_CLICKS
     check_saved(folder, digits)
     assert "# coarse" in (folder / "case.toml").read_text(encoding="utf-8")
-    # The page draws neither the mouth from inside nor the cut through the neck, and keeps what was
-    # lifted off the bone for the first moves.
+    # The page draws neither the mouth from inside nor the cut through the neck.
     predicted = cmfsim.read_surface(folder / "out/prediction.stl").vertices
     away = np.linalg.norm(cmfsim.Surface(*face).closest(predicted)[0] - predicted, axis=1)
     assert np.percentile(away, 75) < 0.5
