@@ -136,8 +136,8 @@ class PlanningModel:
     def predict(self, plan: Motions) -> Prediction:
         """The prediction of `predict` under a plan: `solve`, with tissue lifted as by this plan.
 
-        Where other nodes are lifted off the bone than at the reference, the equations are
-        factorised again.
+        Where other nodes are lifted off the bone than at the reference, the equations are set up
+        again, and solved as a single plan is.
         """
         patient = self.patient.with_plan(self.whole(plan))
         reference = self.patient.scene
@@ -145,7 +145,11 @@ class PlanningModel:
             np.array_equal(segment.joined, reference.segments[name].joined)
             for name, segment in patient.scene.segments.items()
         )
-        return predict_patient(patient, self.model, solver=self.solver if is_same else None)
+        if is_same:
+            return predict_patient(patient, self.model, solver=self.solver)
+        # A factorisation pays for many plans only.
+        once = replace(patient.scene, options=replace(patient.scene.options, method="auto"))
+        return predict_patient(replace(patient, scene=once), self.model)
 
     def solve(self, plan: Motions) -> Prediction:
         """The prediction under a plan, solved exactly, contact included.
