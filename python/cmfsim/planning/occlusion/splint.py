@@ -336,21 +336,20 @@ def _without_thin(grid: ImageData, level: NDArray[np.float32]) -> NDArray[np.flo
     if not (core > 0.0).any():
         raise CaseInputError(NOTHING_LEFT)
     reach = _distances(grid, core) + np.float32(BALL)
-    return np.minimum(level, reach)
+    return np.asarray(np.minimum(level, reach), dtype=np.float32)
 
 
 def _distances(grid: ImageData, level: NDArray[np.float32]) -> NDArray[np.float32]:
     """The distance from the zero surface of a level, mm, positive inside: up to twice a ball."""
     nx, ny, nz = grid.values.shape
     x, y, z = grid.lowest.tolist()
-    distances: NDArray[np.float32] = signed_distance_image(
+    return signed_distance_image(
         _surface(grid.with_values(level)).searched,
         (nx, ny, nz),
         (SPACING,) * 3,
         (x, y, z),
         band=2.0 * BALL,
     )
-    return distances
 
 
 def largest_piece(level: NDArray[np.float32]) -> NDArray[np.float32]:
