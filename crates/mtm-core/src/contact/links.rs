@@ -24,6 +24,16 @@ impl Link {
         self.stiffness * (self.goal - self.along(x))
     }
 
+    /// The force at c·x = `along` of a link that only pushes, N.
+    pub fn push(&self, along: f64) -> f64 {
+        (self.stiffness * (self.goal - along)).max(0.0)
+    }
+
+    /// Adds that force to rows y.
+    pub fn add_push(&self, along: f64, y: &mut [[f64; 3]]) {
+        self.add(self.push(along), y);
+    }
+
     /// Adds k (c·x) c to rows y.
     pub fn add_product(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
         self.add(self.stiffness * self.along(x), y);
@@ -37,6 +47,11 @@ impl Link {
     /// Adds k (goal − c·x) c to rows y: the force that the spring exerts on them at x, N.
     pub fn add_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
         self.add(self.pull(x), y);
+    }
+
+    /// Subtracts the force of a link that only pushes.
+    pub fn take_push(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
+        self.add(-self.push(self.along(x)), y);
     }
 
     /// Subtracts the same force again.

@@ -359,13 +359,13 @@ impl Pairs {
     }
 
     /// The round at displacements `u` of all nodes, prescribed ones at their target, with the forces of
-    /// `touching`.
-    pub fn round(&self, planes: &Planes, u: &[[f64; 3]], touching: &Touching) -> Round {
+    /// `touching`: links of `all` candidates, which only push, or of those under pressure.
+    pub fn round(&self, planes: &Planes, u: &[[f64; 3]], touching: &Touching, all: bool) -> Round {
         let (mut links, mut number) = (Vec::new(), vec![None; self.candidates.len()]);
         for (i, c) in self.candidates.iter().enumerate() {
             let Some(plane) = &planes.at[i] else { continue };
             let force = touching.multipliers[i];
-            if force - c.stiffness * plane.at(u) <= 0.0 {
+            if !all && force - c.stiffness * plane.at(u) <= 0.0 {
                 continue;
             }
             let row = |(j, n): &(u32, [f64; 3])| (self.row_of[*j as usize], *n);
@@ -383,25 +383,6 @@ impl Pairs {
             });
         }
         Round { number, links }
-    }
-
-    /// The slope of Σ ½ k ⟨λ/k − g⟩₊² over `planes`, N mm, at any share of the way between displacements `from`
-    /// and `to` of all nodes: the contribution of contact to that of the energy.
-    pub fn press(
-        &self,
-        planes: &Planes,
-        (from, to): (&[[f64; 3]], &[[f64; 3]]),
-        touching: &Touching,
-    ) -> impl Fn(f64) -> f64 {
-        let each = self.candidates.iter().zip(&planes.at).zip(&touching.multipliers);
-        let force = |((c, plane), force): ((&Candidate, &Option<Plane>), &f64)| {
-            let plane = plane.as_ref()?;
-            let (start, end) = (plane.at(from), plane.at(to));
-            let (force, rate) = (force - c.stiffness * start, c.stiffness * (end - start));
-            Some((force, rate, end - start))
-        };
-        let ways: Vec<(f64, f64, f64)> = each.filter_map(force).collect();
-        move |share| ways.iter().map(|(f, rate, way)| -(f - share * rate).max(0.0) * way).sum()
     }
 
     /// The residuals of `round` at displacements `rows` of the unknown nodes, given the `gap` of each plane.

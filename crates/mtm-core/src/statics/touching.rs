@@ -21,10 +21,10 @@ use crate::statics::options::StaticOptions;
 use crate::statics::plans::settling::{ContactSolve, RowLinks, Settled, WarmStart};
 use crate::statics::reduction::Reduction;
 use crate::statics::solution::{Clock, TouchResult};
-use crate::vector::{add, between, dot, norm, scaled, sub};
+use crate::vector::{add, norm, scaled, sub};
 
 /// Motion of the bones in one step, over the mean edge of the tissue that may be touched.
-const STEP_EDGES: f64 = 2.0;
+const STEP_EDGES: f64 = 4.0;
 /// Depth, over the same edge, that a node may reach in a step; if it goes deeper, the step is halved.
 const DEEP_EDGES: f64 = 0.75;
 /// Shortest step, as a share of the plan.
@@ -50,18 +50,12 @@ const LAST_ROUNDS: usize = 5;
 const STILL: f64 = 4.0;
 /// Rounds of a step that use the normals as they are found; after that, oscillating normals are damped.
 const SHARP_ROUNDS: usize = 6;
-/// Shortest share of a round, whatever its energy, and the bisections that find the share.
-const SHORTEST_SHARE: f64 = 1.0 / 32.0;
-const BISECTIONS: usize = 20;
-/// Slope of the energy at the end of a round, over that at its start, up to which all of it is taken.
-const FLAT_SHARE: f64 = 0.05;
 /// Rounds of a step with the planes at its start, and the depth behind them, over the mean edge, at which they
 /// end.
 const MOST_ROUNDS_AHEAD: usize = 8;
-const AHEAD_EDGES: f64 = 0.05;
-/// Relative accuracy of a round, in the energy norm, before the last ones: which nodes touch changes more in a
-/// round than its error does.
-const ROUGH_SHARE: f64 = 0.3;
+const AHEAD_EDGES: f64 = 0.3;
+/// Share of the first residual, in the energy norm, that a round before the last ones may leave.
+const ROUGH_SHARE: f64 = 0.1;
 /// Maximum number of nodes listed in an error.
 const NAMED_NODES: usize = 10;
 
@@ -222,16 +216,12 @@ impl TouchingPlan<'_> {
         let mut pose = PartialState { u, ..pose.clone() };
         let deep = AHEAD_EDGES * self.pairs.mean_edge();
         for round in 1..=MOST_ROUNDS_AHEAD {
-            let links = self.pairs.round(ahead, &pose.u, &pose.touching);
+            let links = self.pairs.round(ahead, &pose.u, &pose.touching, true);
             let (rows, found) = self.linked(&links, (&pose, contact), goal, true, solve)?;
-            // The first round moves the sliding nodes with their bones.
-            let share = if round == 1 { 1.0 } else { self.share(&pose, ahead, &rows, goal) };
-            pose = self.moved(&pose, &rows, found, share, goal);
-            if share == 1.0 {
-                pose.touching.follow(&links, &pose.rows);
-                if self.left(ahead, &links, &pose).penetration <= deep {
-                    return Ok((pose, round));
-                }
+            pose = self.moved(&pose, rows, found, goal);
+            pose.touching.follow(&links, &pose.rows);
+            if self.left(ahead, &links, &pose).penetration <= deep {
+                return Ok((pose, round));
             }
             contact = self.begun(&pose);
         }
@@ -257,11 +247,10 @@ impl TouchingPlan<'_> {
         loop {
             count += 1;
             pose.touching.gaps = planes.gaps();
-            let round = self.pairs.round(&planes, &pose.u, &pose.touching);
+            let round = self.pairs.round(&planes, &pose.u, &pose.touching, rough);
             let begun = self.begun(&pose);
             let (rows, contact) = self.linked(&round, (&pose, begun), goal, rough, solve)?;
-            let share = if rough { self.share(&pose, &planes, &rows, goal) } else { 1.0 };
-            let next = self.moved(&pose, &rows, contact, share, goal);
+            let next = self.moved(&pose, rows, contact, goal);
             let change = largest_change(&pose.u, &next.u);
             pose = next;
             let mut met = self.pairs.planes(self.mesh, &pose.u, goal.motions, &pose.touching)?;
@@ -269,10 +258,8 @@ impl TouchingPlan<'_> {
                 met.steady(&planes, &pose.u);
             }
             let left = self.left(&met, &round, &pose);
-            if share == 1.0 {
-                pose.touching.follow(&round, &pose.rows);
-            }
-            let near = share == 1.0 && left.distance() <= close && change <= STILL * close;
+            pose.touching.follow(&round, &pose.rows);
+            let near = left.distance() <= close && change <= STILL * close;
             let converged = near && !rough;
             let over = converged || count >= most || (near && !is_last);
             if over {
@@ -292,59 +279,16 @@ impl TouchingPlan<'_> {
         self.pairs.left(planes, round, &pose.rows, |plane| plane.at(&pose.u))
     }
 
-    /// `pose` moved by `share` of the way to `rows`.
+    /// `pose` moved to `rows`.
     fn moved(
         &self,
         pose: &PartialState,
-        rows: &[[f64; 3]],
+        rows: Vec<[f64; 3]>,
         contact: Option<ContactState>,
-        share: f64,
         goal: &StepTarget<'_>,
     ) -> PartialState {
-        let rows = if share == 1.0 { rows.to_vec() } else { between(&pose.rows, rows, share) };
         let u = self.reduction.filled(goal.prescribed, &rows);
         PartialState { u, rows, contact, touching: pose.touching.clone() }
-    }
-
-    /// How far to go from `pose` towards the solution `rows` of a round: to the smallest sum of elastic energy and
-    /// contact energy against the planes, which is convex along the way.
-    fn share(
-        &self,
-        pose: &PartialState,
-        planes: &Planes,
-        rows: &[[f64; 3]],
-        goal: &StepTarget<'_>,
-    ) -> f64 {
-        let (Some(first), Some(last)) = (
-            self.system.out_of_balance(&pose.rows, goal.b),
-            self.system.out_of_balance(rows, goal.b),
-        ) else {
-            return 1.0;
-        };
-        let mut way: Vec<[f64; 3]> =
-            rows.iter().zip(&pose.rows).map(|(to, from)| sub(*to, *from)).collect();
-        // The contact forces of sliding nodes do no work along their surfaces.
-        for node in self.sliding.iter().flat_map(|s| s.nodes()) {
-            way[node.row as usize] = [0.0; 3];
-        }
-        let work = |f: &[[f64; 3]]| -> f64 { f.iter().zip(&way).map(|(f, w)| dot(*f, *w)).sum() };
-        let (from, to) = (work(&first), work(&last));
-        let end = self.reduction.filled(goal.prescribed, rows);
-        let press = self.pairs.press(planes, (&pose.u, &end), &pose.touching);
-        let slope = |share: f64| from + share * (to - from) + press(share);
-        if slope(1.0) <= FLAT_SHARE * slope(0.0).abs() {
-            return 1.0;
-        }
-        let (mut low, mut high) = (0.0, 1.0);
-        for _ in 0..BISECTIONS {
-            let middle = 0.5 * (low + high);
-            if slope(middle) > 0.0 {
-                high = middle;
-            } else {
-                low = middle;
-            }
-        }
-        low.max(SHORTEST_SHARE)
     }
 
     /// Positions of the sliding nodes in `pose`.

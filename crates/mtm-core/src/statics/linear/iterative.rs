@@ -18,6 +18,7 @@ use crate::error::{MtmError, Result, Shortfall};
 use crate::mechanics::tissue::Tissue;
 use crate::statics::linear::confirmed::{Confirmed, is_doubtful};
 use crate::statics::linear::effort::PlanSolve;
+use crate::statics::linear::pressed::{Pressed, onto};
 use crate::statics::linear::projected_product::ProjectedProduct;
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::linear::unstable::{at_fault, carry_on};
@@ -30,6 +31,10 @@ const RELAXATION_FACTOR: f64 = 1.6;
 const MAX_SWEEPS: usize = 200_000;
 /// Estimated error of a solution that is worth nothing, over the largest displacement.
 const WORTH: f64 = 1e-3;
+/// Least tolerance under links: touching nodes are up to a hundredth of a millimetre from their surfaces.
+const LINKED_TOLERANCE: f64 = 1e-4;
+/// Maximum number of iterations under links that only push.
+const MOST_PRESSED: usize = 60;
 /// Accuracy, as a share of the tolerance, to which the error left by the sweeps is measured.
 const MEASURED_SHARE: f64 = 0.1;
 /// λ/μ above which a stronger smoother pays: at ν = 0.499 it takes 113 iterations instead of 186. ν = 0.48.
@@ -264,18 +269,21 @@ impl Iterative {
             let rows = vec![[0.0; 3]; b.len()];
             return Ok(Advance { rows, solved: true, is_carried: false });
         }
+        let links = leave.links;
         let length = *trail.reach.get_or_insert_with(|| {
             StartedPreconditioner::new(&self.multigrid, &b).reach(solve.scale)
         });
         let length = conditions.constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
-        let tolerance = self.tolerance * length;
+        let mut tolerance = self.tolerance * length;
+        if !links.is_empty() {
+            tolerance = tolerance.max(LINKED_TOLERANCE * length);
+        }
         if self.sweeps {
             let system = conditions.applied_to(&self.matrix);
             let rows = self.relax_to_bound(&system, &b, tolerance, solve)?;
             return Ok(Advance { rows, solved: true, is_carried: false });
         }
         let RowConditions { constraints, mut springs } = conditions;
-        let links = leave.links;
         let mut start = trail.rows.clone();
         start.resize(b.len(), [0.0; 3]);
         for k in &constraints {
@@ -321,6 +329,45 @@ impl Iterative {
             is_carried = carry_on(&product, &b, &unheld, leave.reach, &mut rows);
         }
         Ok(Advance { rows, solved, is_carried })
+    }
+
+    /// Rows from `start` on under `conditions` and `links` that only push, until `share` of the first residual is
+    /// left. If springs make the body unstable, those of negative stiffness are left out.
+    pub fn press(
+        &self,
+        b: &[[f64; 3]],
+        conditions: RowConditions,
+        (links, share): (&[Link], f64),
+        start: Vec<[f64; 3]>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<Advance> {
+        let RowConditions { constraints, mut springs } = conditions;
+        let mut rows = start;
+        rows.resize(b.len(), [0.0; 3]);
+        onto(&constraints, &mut rows);
+        loop {
+            if (solve.interrupted)() {
+                return Err(MtmError::Interrupted);
+            }
+            let product = ProjectedProduct::new(&self.matrix, &constraints, &springs);
+            let mut forces = self.matrix.multiply(&rows);
+            for (f, b) in forces.iter_mut().zip(b) {
+                *f = sub(*b, *f);
+            }
+            for (row, s) in &springs {
+                let pull = s.stiffness * (s.goal - dot(s.axis, rows[*row]));
+                forces[*row] = add(forces[*row], scaled(s.axis, pull));
+            }
+            product.project(&mut forces);
+            let pressed = Pressed { a: &product, preconditioner: &*self.multigrid, links };
+            let found = pressed.solve(rows, forces, (share, MOST_PRESSED));
+            solve.effort.add(found.history.len(), found.history);
+            rows = found.x;
+            if !found.is_indefinite || springs.iter().all(|(_, s)| s.stiffness >= 0.0) {
+                return Ok(Advance { rows, solved: true, is_carried: false });
+            }
+            springs.retain(|(_, s)| s.stiffness >= 0.0);
+        }
     }
 
     fn options(&self, tolerance: f64) -> PcgOptions {

@@ -3,6 +3,7 @@
 pub(crate) mod confirmed;
 pub(crate) mod effort;
 pub(crate) mod iterative;
+pub(crate) mod pressed;
 pub(crate) mod projected_product;
 pub(crate) mod row_conditions;
 pub(crate) mod system;

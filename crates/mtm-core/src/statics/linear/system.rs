@@ -25,7 +25,7 @@ use crate::statics::plans::settling::{
 };
 use crate::statics::restraint::Support;
 use crate::statics::solution::Clock;
-use crate::vector::{add, sub};
+use crate::vector::add;
 
 /// Maximum number of sliding nodes for which their flexibility is kept: 54 bytes a pair of nodes, 1.9 GB.
 const MAX_KEPT_SLIDING: usize = 6000;
@@ -211,13 +211,6 @@ impl System {
         }
     }
 
-    /// Residual forces of the rows at displacements `x`, A x − b, N; nothing if the matrix is not kept.
-    pub fn out_of_balance(&self, x: &[[f64; 3]], b: &[[f64; 3]]) -> Option<Rows> {
-        let Kept::Matrix(system) = &self.kept else { return None };
-        let product = system.matrix().multiply(x);
-        Some(product.iter().zip(b).map(|(f, b)| sub(*f, *b)).collect())
-    }
-
     /// Rows under links if no node slides, starting from displacements `start`.
     ///
     /// # Errors
@@ -232,6 +225,11 @@ impl System {
         let Kept::Matrix(Unfactored::Iterative(iterative)) = &self.kept else {
             return Err(touching_needs_pcg(Method::Cholesky));
         };
+        if let (Some(share), false) = (linked.share, linked.links.is_empty()) {
+            let conditions = RowConditions { constraints: Vec::new(), springs: Vec::new() };
+            let pressed = (linked.links, share);
+            return Ok(iterative.press(b, conditions, pressed, start.to_vec(), solve)?.rows);
+        }
         let mut b = b.to_vec();
         for link in linked.links {
             link.add_goal(&mut b);

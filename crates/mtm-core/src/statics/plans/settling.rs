@@ -95,6 +95,12 @@ impl Unfactored {
         solve: &mut PlanSolve<'_>,
     ) -> Result<Advance> {
         let conditions = RowConditions::new(sliding, c);
+        if let (Self::Iterative(iterative), Some(share), false) =
+            (self, linked.share, linked.links.is_empty())
+        {
+            let start = std::mem::take(&mut trail.rows);
+            return iterative.press(b, conditions, (linked.links, share), start, solve);
+        }
         let b = linked.pulled(b, &conditions.constraints);
         let mut rhs = projected_rhs(self.matrix(), &b, &conditions.constraints);
         conditions.add_pull(&mut rhs);
@@ -281,7 +287,10 @@ impl Projected<'_, '_> {
             *f = sub(*f, *b);
         }
         for link in self.linked.links {
-            link.take_force(x, &mut out);
+            match self.linked.share {
+                Some(_) => link.take_push(x, &mut out),
+                None => link.take_force(x, &mut out),
+            }
         }
         out
     }
