@@ -8,7 +8,7 @@
 //! Rockafellar 1973; for contact Simo & Laursen 1992). Each round minimises
 //!
 //! ```text
-//! E(u) + Σ ½ k (g(u) − λ/k)²     over the nodes with λ − k g > 0,
+//! E(u) + Σ ½ k ⟨λ/k − g(u)⟩₊²,
 //! ```
 //!
 //! with g linearised about the last state, and then updates λ ← max(0, λ − k g). The stiffness k only affects

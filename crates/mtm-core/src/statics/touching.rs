@@ -24,7 +24,7 @@ use crate::statics::solution::{Clock, TouchResult};
 use crate::vector::{add, norm, scaled, sub};
 
 /// Motion of the bones in one step, over the mean edge of the tissue that may be touched.
-const STEP_EDGES: f64 = 4.0;
+const STEP_EDGES: f64 = 2.0;
 /// Depth, over the same edge, that a node may reach in a step; if it goes deeper, the step is halved.
 const DEEP_EDGES: f64 = 0.75;
 /// Shortest step, as a share of the plan.

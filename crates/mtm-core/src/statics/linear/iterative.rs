@@ -31,8 +31,6 @@ const RELAXATION_FACTOR: f64 = 1.6;
 const MAX_SWEEPS: usize = 200_000;
 /// Estimated error of a solution that is worth nothing, over the largest displacement.
 const WORTH: f64 = 1e-3;
-/// Least tolerance under links: touching nodes are up to a hundredth of a millimetre from their surfaces.
-const LINKED_TOLERANCE: f64 = 1e-4;
 /// Maximum number of iterations under links that only push.
 const MOST_PRESSED: usize = 60;
 /// Accuracy, as a share of the tolerance, to which the error left by the sweeps is measured.
@@ -269,21 +267,18 @@ impl Iterative {
             let rows = vec![[0.0; 3]; b.len()];
             return Ok(Advance { rows, solved: true, is_carried: false });
         }
-        let links = leave.links;
         let length = *trail.reach.get_or_insert_with(|| {
             StartedPreconditioner::new(&self.multigrid, &b).reach(solve.scale)
         });
         let length = conditions.constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
-        let mut tolerance = self.tolerance * length;
-        if !links.is_empty() {
-            tolerance = tolerance.max(LINKED_TOLERANCE * length);
-        }
+        let tolerance = self.tolerance * length;
         if self.sweeps {
             let system = conditions.applied_to(&self.matrix);
             let rows = self.relax_to_bound(&system, &b, tolerance, solve)?;
             return Ok(Advance { rows, solved: true, is_carried: false });
         }
         let RowConditions { constraints, mut springs } = conditions;
+        let links = leave.links;
         let mut start = trail.rows.clone();
         start.resize(b.len(), [0.0; 3]);
         for k in &constraints {
