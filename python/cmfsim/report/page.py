@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from importlib.resources import files
 
@@ -91,9 +92,13 @@ def render_page(document: Document) -> str:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.globals.update(kind_of=_kind, address=_address)
     text = files("cmfsim.report").joinpath("page.html").read_text(encoding="utf-8")
     blocks = [block for section in document.sections for block in section.blocks]
+    figures = [block for block in blocks if isinstance(block, Figure)]
+    # Two pictures at a time: to make them small takes longer than the page.
+    with ThreadPoolExecutor(2) as pool:
+        addresses = dict(zip(map(id, figures), pool.map(_address, figures), strict=True))
+    environment.globals.update(kind_of=_kind, address=lambda figure: addresses[id(figure)])
     page: str = environment.from_string(text).render(
         document=document,
         disclaimer=DISCLAIMER,

@@ -235,5 +235,6 @@ def packed_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[str, list[dict[st
         block.extend(b"\0" * (-len(block) % ALIGNED))
         table.append({"name": name, "type": kind, "shape": list(array.shape), "start": len(block)})
         block.extend(np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes())
-    # Without the time, so that equal pages have equal bytes.
-    return base64.b64encode(gzip.compress(bytes(block), 9, mtime=0)).decode(), table
+    # Without the time, so that equal pages have equal bytes. Level 9 takes four times as long for
+    # 1 % fewer bytes.
+    return base64.b64encode(gzip.compress(bytes(block), 6, mtime=0)).decode(), table
