@@ -18,6 +18,7 @@ mod contact {
     mod unilateral;
 }
 mod geometry {
+    mod decimation;
     mod motion;
     mod surface;
     mod winding;
