@@ -49,6 +49,8 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
 MARGIN = 1.04
 TEXT_SIZE = 9
 LEGEND_ROW = 26  # pixels
+# Pixels left of texts below the views, and from a swatch to its text.
+EDGE, SWATCH = 12, 26
 # Opacity of the ground of a caption, and pixels between a scale and its title.
 CAPTION_GROUND, TITLE_GAP = 0.8, 14
 # Of zlib: level 6 takes three times as long for files that are 4 to 11 % smaller.
@@ -88,7 +90,8 @@ def draw(
 ) -> None:
     """Writes the views side by side, in rows of `columns`, under a temporary name first.
 
-    Below them stand the words, a paragraph each; the views shrink for them, by half at most.
+    Below them stand the legend and the words, a paragraph each; the views shrink for them, by half
+    at most.
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
@@ -114,8 +117,8 @@ def drawn(
     width, height = (int(as_positive("picture size", n)) for n in size)
     pv = pyvista_module()
     check_can_draw(name)
-    lines = _wrapped(words, width)
-    band = len(lines) * LEGEND_ROW + 16 if lines else 0
+    texts, swatches, below = _placed(legend, words, width)
+    band = below * LEGEND_ROW + 16 if below else 0
     height = max(height - band, height // 2)
     # One scale for all views.
     columns = columns or len(views)
@@ -142,38 +145,46 @@ def drawn(
                     # Legible where the head lies behind it.
                     caption.prop.background_color = "white"
                     caption.prop.background_opacity = CAPTION_GROUND
-                plotter.subplot(0, 0)
-                swatches = _legend_text(plotter, legend, height)
                 image = np.array(plotter.screenshot(return_img=True))[:, :, :3]
             finally:
                 plotter.close()
             if band:
-                written = _band_of_text(lines, width, band)
+                written = _band_of_text(texts, width, band)
     except (RuntimeError, OSError, AttributeError) as error:
         raise CaseInputError(
             f"{name}: the picture cannot be drawn ({error}); {NO_OPENGL}"
         ) from error
-    _colour_swatches(image, swatches)
-    return np.concatenate([image, written]) if band else image
+    if not band:
+        return image
+    for left, row, colour in swatches:
+        top = 12 + row * LEGEND_ROW
+        written[top - 1 : top + 19, left - 1 : left + 19] = 90
+        rgb = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+        written[top : top + 18, left : left + 18] = rgb
+    return np.concatenate([image, written])
 
 
-def _legend_text(
-    plotter: Any, legend: Sequence[tuple[str, str]], height: int
-) -> list[tuple[int, str]]:
-    """Writes the words of a legend; the row of pixels and the colour of each swatch."""
-    swatches = []
-    for row, (text, colour) in enumerate(legend):
-        top = height - 14 - (row + 1) * LEGEND_ROW
-        plotter.add_text(text, position=(38, top), font_size=TEXT_SIZE, color="black")
-        swatches.append((height - top - LEGEND_ROW + 4, colour))
-    return swatches
+def _placed(
+    legend: Sequence[tuple[str, str]], words: Sequence[str], width: int
+) -> tuple[list[tuple[int, int, str]], list[tuple[int, int, str]], int]:
+    """The texts and the swatches below the views: pixels from the left, row, text or colour.
 
-
-def _colour_swatches(image: NDArray[np.uint8], swatches: Sequence[tuple[int, str]]) -> None:
-    """Colours the swatches of a legend, with a grey rim, in place."""
-    for top, colour in swatches:
-        image[top - 1 : top + 19, 11:31] = 90
-        image[top : top + 18, 12:30] = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    Entries of a legend stand beside each other, in as many rows as they need; the last value is the
+    number of all rows.
+    """
+    texts, swatches = [], []
+    left, row = EDGE, 0
+    for text, colour in legend:
+        length = SWATCH + int(LETTER * len(text)) + 24
+        if left > EDGE and left + length > width:
+            left, row = EDGE, row + 1
+        swatches.append((left, row, colour))
+        texts.append((left + SWATCH, row, text))
+        left += length
+    row += bool(legend)
+    lines = _wrapped(words, width)
+    texts += [(EDGE, row + k, line) for k, line in enumerate(lines)]
+    return texts, swatches, row + len(lines)
 
 
 def _wrapped(words: Sequence[str], width: int) -> list[str]:
@@ -187,16 +198,18 @@ def _wrapped(words: Sequence[str], width: int) -> list[str]:
     ]
 
 
-def _band_of_text(lines: Sequence[str], width: int, height: int) -> NDArray[np.uint8]:
-    """Lines of text on white, (height, width, 3)."""
+def _band_of_text(
+    texts: Sequence[tuple[int, int, str]], width: int, height: int
+) -> NDArray[np.uint8]:
+    """Texts on white, (height, width, 3)."""
     plotter = pyvista_module().Plotter(off_screen=True, window_size=[width, height])
     try:
         plotter.set_background("white")
-        for row, line in enumerate(lines):
+        for left, row, text in texts:
             # The fonts that come with VTK have no minus sign; it sets formulas between dollars.
             plotter.add_text(
-                "".join(c if c.isprintable() and c != "$" else "?" for c in line.replace("−", "-")),
-                position=(12, height - 8 - (row + 1) * LEGEND_ROW),
+                "".join(c if c.isprintable() and c != "$" else "?" for c in text.replace("−", "-")),
+                position=(left, height - 8 - (row + 1) * LEGEND_ROW),
                 font_size=TEXT_SIZE,
                 color="black",
             )

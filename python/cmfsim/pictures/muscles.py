@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.pictures.canvas import LEGEND_ROW, SIZE, Shown, View, bounds, draw, polydata
+from cmfsim.pictures.canvas import SIZE, Shown, View, bounds, draw, polydata
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 
@@ -100,17 +100,14 @@ def picture_muscles(
     colours = {name: _hue(number) for number, name in enumerate(names)}
 
     def paint_names(plotter: Any, view: View) -> None:
-        if not view.caption:
-            return
+        del view
         paint_skull(plotter)
         for muscle in musculature:
             make = partial(add_muscle, plotter, muscle, colours[_without_side(muscle.name)])
             shown.add(plotter, f"muscle {muscle.name}", make)
 
-    # The legend is next to the heads, not on them.
-    views = (View("front", ""), View("front", "front"), View("left", "left"))
-    rows = int(size[1]) // LEGEND_ROW - 1
-    draw(path, views, corners, size, paint_names, legend=list(colours.items())[:rows])
+    views = tuple(View(name, name) for name in ("front", "left front", "left"))
+    draw(path, views, corners, size, paint_names, legend=list(colours.items()))
 
 
 def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> Any:
