@@ -397,6 +397,9 @@ pub fn tube_levels<'py>(
     Ok(py.detach(|| core_tube_levels(segments, points, outside)).into_pyarray(py))
 }
 
+/// Vertices and triangles as arrays.
+type SurfaceArrays<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>);
+
 /// The surface with about `wanted` triangles: vertices (v, 3) mm and triangles (t, 3) uint32.
 #[pyfunction]
 pub fn decimated<'py>(
@@ -404,7 +407,7 @@ pub fn decimated<'py>(
     vertices: &Bound<'py, PyAny>,
     triangles: &Bound<'py, PyAny>,
     wanted: usize,
-) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>)> {
+) -> PyResult<SurfaceArrays<'py>> {
     let vertices = arrays::points(vertices, Named("vertices", MESH))?;
     let triangles = arrays::triangles(triangles, Named("triangles", MESH))?;
     // On the caller's own thread: it has one, and several surfaces may be decimated at a time.

@@ -58,7 +58,7 @@ impl Quadric {
         let (axx, axy, axz) = (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy);
         let (ayy, ayz, azz) = (xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy);
         let det = xx * axx + xy * axy + xz * axz;
-        if !(det > f64::MIN_POSITIVE) {
+        if det.is_nan() || det <= f64::MIN_POSITIVE {
             return None;
         }
         let b = &self.b;
@@ -75,6 +75,9 @@ impl Quadric {
 /// A round collapses at most this share of the edges, those of least error: rounds cost less than a queue of all
 /// edges, which has to be kept in order after each collapse.
 const ROUND_SHARE: usize = 4;
+
+/// Vertices, mm, and triangles of them.
+type Triangles = (Vec<[f64; 3]>, Vec<[u32; 3]>);
 
 /// An edge and what its collapse costs: the bits of its error in single precision, and its ends.
 type Rated = (u32, u32, u32);
@@ -109,7 +112,7 @@ pub fn decimated(
     vertices: &[[f64; 3]],
     triangles: &[[u32; 3]],
     wanted: usize,
-) -> Result<(Vec<[f64; 3]>, Vec<[u32; 3]>)> {
+) -> Result<Triangles> {
     check_coordinates("surface vertices", vertices, ErrorKind::Mesh)?;
     check_corners(vertices.len(), triangles)?;
     // A triangle with two equal corners is an edge: without it the surface is connected as before.
@@ -374,7 +377,7 @@ impl Decimation {
     }
 
     /// Vertices and triangles that are left, in their old order.
-    fn finished(self) -> (Vec<[f64; 3]>, Vec<[u32; 3]>) {
+    fn finished(self) -> Triangles {
         let mut number = vec![0_u32; self.places.len()];
         let alive =
             || self.triangles.iter().zip(&self.is_alive).filter(|(_, is)| **is).map(|(t, _)| *t);
