@@ -267,9 +267,8 @@ def test_metal_is_found_where_the_image_is_cut_off_below_the_usual_threshold(hea
     assert "2 pieces" in metal.what
     assert "above 1940 HU" in metal.what
     # What the case sets counts.
-    set_higher = segment_head(
-        with_fillings(head, 2000.0), SegmentOptions(metal_threshold=2400.0, part_jaws=False)
-    )
+    options = SegmentOptions(metal_threshold=2400.0, part_jaws=False)
+    set_higher = segment_head(with_fillings(head, 2000.0), options)
     assert not {"metal", "ct-saturated"} & codes(set_higher)
 
 
@@ -279,20 +278,16 @@ def test_an_image_cut_off_too_low_to_tell_metal_is_reported(head):
     (finding,) = [f for f in found.findings if f.code == "ct-saturated"]
     assert finding.severity == "warning"
     assert "metal_threshold" in finding.fix
-    lower = segment_head(
-        with_fillings(head, 1500.0), SegmentOptions(metal_threshold=1400.0, part_jaws=False)
-    )
+    options = SegmentOptions(metal_threshold=1400.0, part_jaws=False)
+    lower = segment_head(with_fillings(head, 1500.0), options)
     assert "metal" in codes(lower)
 
 
 def test_one_bright_voxel_is_no_saturation(head):
     values = head.image.values.copy()
     values[40, 20, 20] = 2000
-    assert "ct-saturated" not in {
-        f.code
-        for f in segment_head(head.image.with_values(values), landmarks=head.landmarks).findings
-        if f.severity == "warning"
-    }
+    found = segment_head(head.image.with_values(values), landmarks=head.landmarks).findings
+    assert "ct-saturated" not in {f.code for f in found if f.severity == "warning"}
 
 
 @pytest.mark.parametrize(("hu", "kind"), [(250.0, "plastic"), (60.0, "other side")])
