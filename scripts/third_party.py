@@ -57,6 +57,7 @@ PYTHON: Mapping[str, str] = {
     "SimpleITK": "Apache-2.0",
     "scikit-image": "BSD-3-Clause",
     "scipy": "BSD-3-Clause",
+    "fast-simplification": "MIT",
     "meshio": "MIT",
     "pyvista": "MIT",
     "tqdm": "MPL-2.0 AND MIT",

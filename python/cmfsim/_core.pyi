@@ -38,7 +38,6 @@ __all__ = [
     "ThinPlateSpline",
     "Tissue",
     "__version__",
-    "decimated",
     "distance_image",
     "icp",
     "label_image",
@@ -477,9 +476,6 @@ def stuff_image(
 def distance_image(
     targets: ArrayLike, spacing: tuple[float, float, float], *, within: float = ...
 ) -> NDArray[np.float32]: ...
-def decimated(
-    vertices: ArrayLike, triangles: ArrayLike, wanted: int
-) -> tuple[_Floats, _Indices]: ...
 def label_image(
     mask: ArrayLike, *, corners: bool = ...
 ) -> tuple[NDArray[np.int32], NDArray[np.intp]]: ...

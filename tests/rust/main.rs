@@ -18,7 +18,6 @@ mod contact {
     mod unilateral;
 }
 mod geometry {
-    mod decimation;
     mod motion;
     mod surface;
     mod winding;

@@ -92,7 +92,6 @@ pub use boundary::{
 };
 pub use contact::{ContactMode, ContactOptions};
 pub use error::{ErrorKind, MtmError, Result, Shortfall};
-pub use geometry::decimation::decimated;
 pub use geometry::motion::{RigidMotion, SurfaceMotion, rigid_matrix};
 pub use geometry::surface::{Closest, Surface};
 pub use geometry::triangle::{DEGENERATE_AREA, Feature};

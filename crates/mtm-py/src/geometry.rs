@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use mtm_core::{
     ErrorKind, MeshQuality, Surface, SurfaceMotion, TetMesh, TubeEnd, WindingTree,
-    decimated as core_decimated, rigid_matrix as core_rigid_matrix,
-    tube_levels as core_tube_levels,
+    rigid_matrix as core_rigid_matrix, tube_levels as core_tube_levels,
 };
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -395,24 +394,6 @@ pub fn tube_levels<'py>(
     let ends: Vec<TubeEnd> = ends.collect();
     let (segments, points) = (ends.as_chunks::<2>().0, points.as_chunks::<3>().0);
     Ok(py.detach(|| core_tube_levels(segments, points, outside)).into_pyarray(py))
-}
-
-/// Vertices and triangles as arrays.
-type SurfaceArrays<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>);
-
-/// The surface with about `wanted` triangles: vertices (v, 3) mm and triangles (t, 3) uint32.
-#[pyfunction]
-pub fn decimated<'py>(
-    py: Python<'py>,
-    vertices: &Bound<'py, PyAny>,
-    triangles: &Bound<'py, PyAny>,
-    wanted: usize,
-) -> PyResult<SurfaceArrays<'py>> {
-    let vertices = arrays::points(vertices, Named("vertices", MESH))?;
-    let triangles = arrays::triangles(triangles, Named("triangles", MESH))?;
-    // On the caller's own thread: it has one, and several surfaces may be decimated at a time.
-    let made = py.detach(|| core_decimated(&vertices, &triangles, wanted)).map_err(Failure)?;
-    Ok((arrays::rows(py, made.0), arrays::table(py, made.1)))
 }
 
 /// Motion of a bone surface vertex by vertex: joined nodes and contact surfaces follow it.

@@ -1,6 +1,8 @@
 """Closed, lightly smoothed surfaces of levels, of a size that contact can be searched on."""
 
 import logging
+import os
+import threading
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import cast
@@ -24,6 +26,25 @@ SHRINK, GROW = 0.5, -0.53
 CONTACT_RELIEF = 3.0
 # Where the blur is cut off, in standard deviations.
 BLUR_REACH = 3.0
+
+
+class _OneAtATime:
+    """A lock for one call at a time in a process, free again in the child of a fork."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        if hasattr(os, "register_at_fork"):
+            # A thread that holds the lock while another forks does not exist in the child.
+            os.register_at_fork(after_in_child=self._renew)
+
+    def _renew(self) -> None:
+        self.lock = threading.Lock()
+
+
+# fast-simplification keeps its mesh in global variables: two threads inside it would exchange
+# their meshes without an error. Version 0.2.0 holds Python's lock while it works, but does not
+# promise to.
+_DECIMATING = _OneAtATime()
 
 
 @dataclass(frozen=True)
@@ -77,7 +98,8 @@ def surface_of_level(
     Raises
     ------
     CaseError
-        (also `ValueError`) A level without an inside; scikit-image is missing.
+        (also `ValueError`) A level without an inside; scikit-image, or fast-simplification where
+        the surface has to be decimated, is missing.
     """
     options = options or SurfaceOptions()
     values = level.single
@@ -98,8 +120,7 @@ def surface_of_level(
     points = level.lowest + points * spacing
     points = _smoothed(points, corners, options.smoothing)
     if len(corners) > options.max_triangles:
-        points, fewer = _core.decimated(points, corners, options.max_triangles)
-        corners = fewer.astype(np.int64)
+        points, corners = _decimated(name, points, corners, options.max_triangles)
     return SurfaceData(points, _outward(points, corners))
 
 
@@ -225,6 +246,13 @@ def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floa
     return points
 
 
+def _decimated(
+    name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
+) -> tuple[Floats, NDArray[np.int64]]:
+    # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
+    return _closed(*_simplified(name, points, triangles, wanted))
+
+
 def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> SurfaceData:
     """The surface with about as many triangles as wanted, open where it was (Garland 1997).
 
@@ -239,14 +267,86 @@ def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> S
     Raises
     ------
     CaseError
-        (also `ValueError`) Nothing is left of the surface.
+        (also `ValueError`) fast-simplification is missing; nothing is left of the surface.
     """
-    if len(surface.triangles) <= max_triangles:
+    triangles = surface.triangles.astype(np.int64)
+    if len(triangles) <= max_triangles:
         return surface
-    points, corners = _core.decimated(surface.vertices, surface.triangles, max_triangles)
+    points, corners = _simplified(name, surface.vertices, triangles, max_triangles)
     if not len(corners):
         raise CaseInputError(f"nothing is left of {name!r} at {max_triangles} triangles")
-    return SurfaceData(points, corners)
+    used, left = used_nodes(corners)
+    return SurfaceData(points[used], left)
+
+
+def _simplified(
+    name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
+) -> tuple[Floats, NDArray[np.int64]]:
+    quadrics = third_party(
+        "fast_simplification",
+        f"the surface of {name!r} ({len(triangles)} triangles; or raise max_triangles to keep "
+        f"them) is decimated to {wanted}",
+        "imaging",
+    )
+    # A copy: it takes no read-only array.
+    places = np.array(points, dtype=np.float64, order="C")
+    with _DECIMATING.lock:
+        fewer, corners = quadrics.simplify(places, triangles.astype(np.int32), target_count=wanted)
+    return np.asarray(fewer, dtype=np.float64), np.asarray(corners, dtype=np.int64)
+
+
+def _closed(points: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+    """The surface with triangles at edges that more than two share removed, and holes filled."""
+    while True:
+        low, high = np.sort(_half_edges(triangles), axis=1).T
+        _, number, count = np.unique(
+            low * len(points) + high, return_inverse=True, return_counts=True
+        )
+        shared = (count[number] > 2).reshape(3, -1).any(axis=0)
+        if not shared.any():
+            break
+        triangles = triangles[~shared]
+    edges = _half_edges(triangles)
+    n = len(points)
+    lone = ~np.isin(edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0])
+    centres: list[Floats] = []
+    fans: list[tuple[int, int, int]] = []
+    for loop in _loops(edges[lone][:, ::-1]):
+        centre = n + len(centres)
+        centres.append(points[loop].mean(axis=0))
+        fans += [(a, b, centre) for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
+    if not centres:
+        return points, triangles
+    return np.vstack([points, centres]), np.vstack([triangles, np.array(fans, dtype=np.int64)])
+
+
+def _half_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The directed edges (3 t, 2): first those of all first corners."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+
+
+def _loops(edges: NDArray[np.int64]) -> list[list[int]]:
+    """Directed border edges as loops that pass each of their vertices once."""
+    onward: dict[int, list[int]] = {}
+    for a, b in edges.tolist():
+        onward.setdefault(a, []).append(b)
+    loops = []
+    for start in sorted(onward):
+        while onward[start]:
+            path, place = [start], {start: 0}
+            while onward.get(path[-1]):
+                after = onward[path[-1]].pop()
+                if after in place:
+                    # The part since the last visit is a loop by itself.
+                    cut = place[after]
+                    loops.append(path[cut:])
+                    for vertex in path[cut + 1 :]:
+                        del place[vertex]
+                    path = path[: cut + 1]
+                else:
+                    place[after] = len(path)
+                    path.append(after)
+    return loops
 
 
 def _outward(points: Floats, triangles: NDArray[np.int64]) -> Indices:

@@ -110,6 +110,7 @@ def test_a_level_that_reaches_the_border_has_a_closed_surface():
 
 
 def test_surfaces_are_decimated_to_the_wanted_size_and_stay_closed():
+    pytest.importorskip("fast_simplification")
     image = cmfsim.ImageData(np.zeros((50, 50, 50)), (1, 1, 1))
     x, y, z = image.axes()
     wave = 3.0 * np.sin(x / 3) * np.sin(y / 3)
@@ -118,7 +119,7 @@ def test_surfaces_are_decimated_to_the_wanted_size_and_stay_closed():
     fine = surface_of_level("ball", level)
     coarse = surface_of_level("ball", level, SurfaceOptions(max_triangles=1500))
     assert len(fine.triangles) > 6000
-    assert len(coarse.triangles) == 1500
+    assert abs(len(coarse.triangles) - 1500) < 50
     surfaces = [cmfsim.Surface(s.vertices, s.triangles) for s in (fine, coarse)]
     assert all(s.is_closed for s in surfaces)
     assert surfaces[1].volume == pytest.approx(surfaces[0].volume, rel=0.01)

@@ -1,6 +1,5 @@
 //! Geometry without mechanics: triangles, closed surfaces, tubes, winding numbers, rigid motions.
 
-pub mod decimation;
 pub(crate) mod lattice_hash;
 pub mod motion;
 pub mod surface;

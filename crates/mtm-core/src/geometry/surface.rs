@@ -135,7 +135,18 @@ impl Surface {
             return Err(MtmError::Empty { what: "surface triangles", kind });
         }
         check_coordinates("surface vertices", &vertices, kind)?;
-        check_corners(vertices.len(), &triangles)?;
+        for (row, vertex) in triangles.iter().enumerate() {
+            if let Some(&index) = vertex.iter().find(|&&v| v as usize >= vertices.len()) {
+                return Err(MtmError::IndexOutOfRange {
+                    what: "surface triangles".to_owned(),
+                    row,
+                    item: "vertex",
+                    index: index as usize,
+                    count: vertices.len(),
+                    kind,
+                });
+            }
+        }
         let facets = facets(&vertices, &triangles)?;
         let normals: Vec<Vec3> = facets.iter().map(|facet| facet.normal).collect();
         let topology = Topology::new(vertices.len(), triangles, &normals, crease_angle);
@@ -440,23 +451,6 @@ impl Shape {
             vertices,
         }
     }
-}
-
-/// Refuses triangles of vertices that do not exist.
-pub(crate) fn check_corners(n_vertices: usize, triangles: &[[u32; 3]]) -> Result<()> {
-    for (row, corners) in triangles.iter().enumerate() {
-        if let Some(&index) = corners.iter().find(|&&v| v as usize >= n_vertices) {
-            return Err(MtmError::IndexOutOfRange {
-                what: "surface triangles".to_owned(),
-                row,
-                item: "vertex",
-                index: index as usize,
-                count: n_vertices,
-                kind: ErrorKind::Mesh,
-            });
-        }
-    }
-    Ok(())
 }
 
 /// Shape of each triangle, or the first degenerate one as an error.
