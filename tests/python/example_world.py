@@ -25,6 +25,7 @@ def example_values(temporary: pytest.TempPathFactory) -> dict[str, Any]:
         "patient": patient,
         "prediction": prediction,
         "anatomy": patient.anatomy,
+        "findings": patient.findings,
         "segments": patient.segments,
         "scene": patient.scene,
         "result": prediction.result,

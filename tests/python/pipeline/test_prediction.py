@@ -16,7 +16,7 @@ import phantom_case
 from cmfsim.cli import main
 from cmfsim.pipeline.evaluating import evaluation_key
 from cmfsim.report import case_document, render_page
-from cmfsim.study.cohort import _evaluated
+from cmfsim.study.cohort import _compared
 from shared_values import drawn_levels, without_pictures
 
 pytest.importorskip("scipy")
@@ -219,7 +219,7 @@ def test_a_face_beyond_every_forehead_is_no_comparison(with_truth):
     made = with_face(with_truth, "low", far)
     # As the process does that works on a case of a cohort.
     with pytest.raises(cmfsim.CaseError, match="more than any model moves the skin"):
-        _evaluated(made, ["H"])
+        _compared(made, ["H"])
 
 
 def test_a_face_after_that_is_the_face_before_is_no_comparison(with_truth):

@@ -183,7 +183,7 @@ import time
 from cmfsim.planning import server
 
 class Planning:
-    def solve(self, plan):
+    def predict(self, plan):
         print("solving", flush=True)
         time.sleep(60.0)
 
