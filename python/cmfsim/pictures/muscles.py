@@ -60,6 +60,7 @@ def picture_muscles(
     clouds = [muscle.surface.vertices for muscle in musculature]
     corners = bounds(clouds if skull is None else [*clouds, skull.vertices])
 
+    views = tuple(View(name, name) for name in ("front", "left front", "left"))
     shown = Shown()
 
     def paint_skull(plotter: Any) -> None:
@@ -92,7 +93,6 @@ def picture_muscles(
             ("box", BOX_COLOUR),
             ("box of a sheet", SHEET_COLOUR),
         ]
-        views = tuple(View(name, name) for name in ("front", "left front", "left"))
         draw(path, views, corners, size, paint_fibres, legend=legend)
         return
 
@@ -106,7 +106,6 @@ def picture_muscles(
             make = partial(add_muscle, plotter, muscle, colours[_without_side(muscle.name)])
             shown.add(plotter, f"muscle {muscle.name}", make)
 
-    views = tuple(View(name, name) for name in ("front", "left front", "left"))
     draw(path, views, corners, size, paint_names, legend=list(colours.items()))
 
 

@@ -7,6 +7,7 @@
 use std::sync::{Arc, OnceLock};
 
 use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::constraints::add_offsets;
 use crate::algebra::krylov::{
     Operator, PcgOptions, PcgOutcome, Preconditioner, Problem, Reached, Spectrum, StepAccuracy,
     Trial, pcg_near,
@@ -18,7 +19,7 @@ use crate::error::{MtmError, Result, Shortfall};
 use crate::mechanics::tissue::Tissue;
 use crate::statics::linear::confirmed::{Confirmed, is_doubtful};
 use crate::statics::linear::effort::PlanSolve;
-use crate::statics::linear::pressed::{Pressed, onto};
+use crate::statics::linear::pressed::Pressed;
 use crate::statics::linear::projected_product::ProjectedProduct;
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::linear::unstable::{at_fault, carry_on};
@@ -339,7 +340,7 @@ impl Iterative {
         let RowConditions { constraints, mut springs } = conditions;
         let mut rows = start;
         rows.resize(b.len(), [0.0; 3]);
-        onto(&constraints, &mut rows);
+        add_offsets(&mut rows, &constraints);
         loop {
             if (solve.interrupted)() {
                 return Err(MtmError::Interrupted);

@@ -4,11 +4,10 @@
 //! conjugate to the last one (Polak & Ribière 1969) and followed to the minimum of the energy along it, so that
 //! links may begin or cease to push in any iteration and the iterations never start again.
 
-use crate::algebra::constraints::Constraint;
 use crate::algebra::krylov::{Operator, Preconditioner};
 use crate::algebra::row_sums::{advance, dot};
 use crate::contact::links::Link;
-use crate::vector::{self, add, scaled};
+use crate::vector::{add, scaled};
 
 /// Bisections that find the minimum along a direction.
 const BISECTIONS: usize = 40;
@@ -107,13 +106,5 @@ impl Pressed<'_> {
             }
         }
         0.5 * (low + high)
-    }
-}
-
-/// `x` with held rows moved onto their constraints.
-pub(crate) fn onto(constraints: &[Constraint], x: &mut [[f64; 3]]) {
-    for c in constraints {
-        let short = c.offset - vector::dot(c.normal, x[c.row]);
-        x[c.row] = add(x[c.row], scaled(c.normal, short));
     }
 }

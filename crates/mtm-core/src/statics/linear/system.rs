@@ -225,10 +225,9 @@ impl System {
         let Kept::Matrix(Unfactored::Iterative(iterative)) = &self.kept else {
             return Err(touching_needs_pcg(Method::Cholesky));
         };
-        if let (Some(share), false) = (linked.share, linked.links.is_empty()) {
-            let conditions = RowConditions { constraints: Vec::new(), springs: Vec::new() };
-            let pressed = (linked.links, share);
-            return Ok(iterative.press(b, conditions, pressed, start.to_vec(), solve)?.rows);
+        let conditions = RowConditions { constraints: Vec::new(), springs: Vec::new() };
+        if let Some(pressing) = linked.pressing() {
+            return Ok(iterative.press(b, conditions, pressing, start.to_vec(), solve)?.rows);
         }
         let mut b = b.to_vec();
         for link in linked.links {
@@ -240,7 +239,6 @@ impl System {
             links: linked.links,
         };
         let mut trail = SolveMemory::starting(start.to_vec());
-        let conditions = RowConditions { constraints: Vec::new(), springs: Vec::new() };
         Ok(iterative.solve_projected(b, conditions, leave, &mut trail, solve)?.rows)
     }
 

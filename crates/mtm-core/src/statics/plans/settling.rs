@@ -95,11 +95,9 @@ impl Unfactored {
         solve: &mut PlanSolve<'_>,
     ) -> Result<Advance> {
         let conditions = RowConditions::new(sliding, c);
-        if let (Self::Iterative(iterative), Some(share), false) =
-            (self, linked.share, linked.links.is_empty())
-        {
+        if let (Self::Iterative(iterative), Some(pressing)) = (self, linked.pressing()) {
             let start = std::mem::take(&mut trail.rows);
-            return iterative.press(b, conditions, (linked.links, share), start, solve);
+            return iterative.press(b, conditions, pressing, start, solve);
         }
         let b = linked.pulled(b, &conditions.constraints);
         let mut rhs = projected_rhs(self.matrix(), &b, &conditions.constraints);
@@ -149,6 +147,11 @@ pub(crate) struct RowLinks<'a> {
 }
 
 impl RowLinks<'_> {
+    /// The links and the share, where links only push: before an answer within the tolerance is wanted.
+    pub fn pressing(&self) -> Option<(&[Link], f64)> {
+        self.share.filter(|_| !self.links.is_empty()).map(|share| (self.links, share))
+    }
+
     /// `b` with the forces of the links, where rows satisfy their constraints.
     fn pulled<'b>(&self, b: &'b [[f64; 3]], constraints: &[Constraint]) -> Cow<'b, [[f64; 3]]> {
         if self.links.is_empty() {
