@@ -103,14 +103,14 @@ peers: $(BUILD_STAMP) ## compare with the peers that are installed (benches/peer
 	"$(PY)" benches/peers/run.py --markdown peers.md --out peers.json
 
 stability: $(BUILD_STAMP) ## measure stiff and extreme cases, and write docs/stability.md
-	"$(PY)" benches/stability.py --markdown docs/stability.md
+	"$(PY)" -m benches.stability.stability --markdown docs/stability.md
 
 elements: $(BUILD_STAMP) ## measure elements and kinematics on a shell, and put the table into docs/benchmarks.md
-	"$(PY)" benches/elements.py --level 1 --layers 2 --markdown docs/benchmarks.md
+	"$(PY)" -m benches.stability.elements --level 1 --layers 2 --markdown docs/benchmarks.md
 
 frontier: $(BUILD_STAMP) ## measure error against run time (hours), and put it into docs/frontier.md
 	"$(PY)" -m cmfsim bench frontier -o target/frontier
-	"$(PY)" benches/fill_frontier.py target/frontier head
+	"$(PY)" -m benches.speed.fill_frontier target/frontier head
 
 fuzz: $(BUILD_STAMP) ## feed 10,000 damaged files to every reader, and put the table into docs/robustness.md
 	"$(PY)" fuzz/readers.py --mutants 10000 --seed 0 --fill docs/robustness.md

@@ -11,8 +11,9 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-import slicer
 import vtk
+
+import slicer
 
 SIZE = (1400, 700)
 FACE, ACTIVE = "face predicted", "displacement_length_mm"

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import ctk
 import qt
-import slicer
 import vtk
 from slicer.ScriptedLoadableModule import (
     ScriptedLoadableModule,
@@ -22,6 +21,7 @@ from slicer.ScriptedLoadableModule import (
     ScriptedLoadableModuleWidget,
 )
 
+import slicer
 from CmfSimLib.case_folder import BONES, MODELS, Choice, ChoiceError, Segment, face_of, write_case
 from CmfSimLib.running import Run, page_command, predict_command, words_of
 

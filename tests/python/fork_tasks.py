@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 NODES, TETS = meshes.box((12, 10, 8), seed=3)
 LEFT, RIGHT = (np.flatnonzero(NODES[:, 0] == x) for x in (NODES[:, 0].min(), NODES[:, 0].max()))

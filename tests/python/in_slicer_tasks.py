@@ -13,9 +13,10 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-import slicer
 import vtk
 from vtk.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray, vtk_to_numpy
+
+import slicer
 
 FLIP = np.array([-1.0, -1.0, 1.0])
 # Node classes that the headless build does not know by name.

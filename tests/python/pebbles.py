@@ -3,7 +3,7 @@
 import numpy as np
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 
 def pebble(level=4, seed=0, centre=(0.0, 0.0, 0.0)):

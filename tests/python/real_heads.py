@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 HEADS = ("atlas_head", "ct_phantom")
 # Levels are right to this many voxels from the surface, and clipped beyond.

@@ -2,7 +2,7 @@
 //!
 //! `cargo run --release -p mtm-core --example shell_case -- 300000 OUT_FOLDER`
 
-#[path = "../../../benches/shell.rs"]
+#[path = "../../../benches/scenes/shell.rs"]
 mod shell;
 
 use std::error::Error;

@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
-from cmfsim.bones.achieved import measure_pair
-from cmfsim.bones.pairs.coherent_motion import coherent_motion
-from cmfsim.bones.pairs.paired_surfaces import AlongSurface
-from paired_motion import (
+from benches.accuracy.paired_motion import (
     ALL,
     EXACT,
     MOVES,
@@ -19,6 +15,10 @@ from paired_motion import (
     pair_of,
     synthetic_head,
 )
+from benches.scenes import meshes
+from cmfsim.bones.achieved import measure_pair
+from cmfsim.bones.pairs.coherent_motion import coherent_motion
+from cmfsim.bones.pairs.paired_surfaces import AlongSurface
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 import arch_head
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.bones import contact_sheets, sheet_departure
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts, arch_sheets
 from cmfsim.surfaces.levels import surface_of_level

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
 import real_heads
+from benches.scenes import meshes
 from cmfsim.bones.achieved import measure_pair
 from cmfsim.bones.pairs.shape_fit import BLOCKS, fit_shape
 from pebbles import apart, moved, operated_bone, pebble, without

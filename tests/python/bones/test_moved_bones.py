@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import cmfsim
+from benches.scenes.meshes import icosphere
 from cmfsim.bones.motion import missing_patches, moves_as_one, sound_motion, torn_pieces
 from cmfsim.bones.pairs.coherent_motion import coherent_motion
 from head_case import ELLIPSOIDS, HeadCase
-from meshes import icosphere
 
 pytest.importorskip("meshio")
 pytest.importorskip("scipy")

@@ -8,7 +8,7 @@ import pytest
 
 import cmfsim
 import real_heads
-from angles import angle_between
+from benches.scenes.angles import angle_between
 from cmfsim.bones import PROCEDURES, CutOptions
 from cmfsim.bones.cuts import procedures
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level

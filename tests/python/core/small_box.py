@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 NODES, TETS = meshes.box((2, 2, 2), (4.0, 4.0, 4.0))
 LOW = meshes.nodes_where(NODES[:, 2] == 0.0)

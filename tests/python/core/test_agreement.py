@@ -12,7 +12,7 @@ import scipy.sparse.linalg
 import skfem
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 # Where a process of its own finds this module and the meshes.
 PATHS = [

@@ -7,7 +7,7 @@ import pytest
 from small_box import EYE, HIGH, LOW, NODES, TETS, floor, refused, solver, tensors
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 
 @pytest.mark.parametrize(

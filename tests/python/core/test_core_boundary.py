@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 ONE_NODES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 ONE_TET = np.array([[0, 1, 2, 3]], dtype=np.uint32)

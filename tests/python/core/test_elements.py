@@ -9,13 +9,19 @@ import pytest
 from numpy.typing import NDArray
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 skfem = pytest.importorskip("skfem")
 from skfem.models.elasticity import linear_elasticity  # noqa: E402
 
-from independent import corotational_stress, internal_forces, lame, neo_hookean_stress, space_of  # noqa: E402
-from panels import BEAM, COOK, far_side_loads, panel  # noqa: E402
+from benches.scenes.independent import (  # noqa: E402
+    corotational_stress,
+    internal_forces,
+    lame,
+    neo_hookean_stress,
+    space_of,
+)
+from benches.scenes.panels import BEAM, COOK, far_side_loads, panel  # noqa: E402
 
 Array = NDArray[np.float64]
 STILL = np.eye(4)

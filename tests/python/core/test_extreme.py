@@ -1,4 +1,4 @@
-"""Stiff and extreme cases: the suite of benches/stability.py, and the references it rests on."""
+"""Stiff and extreme cases: benches/stability/stability.py and its references."""
 
 import itertools
 from dataclasses import replace
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import cmfsim
-import extended
-from extreme import bodies, contact, elements, kinematics, linear
-from extreme.problem import NU
-from extreme.rows import ALL, FAST
+from benches.scenes import extended
+from benches.stability.extreme import bodies, contact, elements, kinematics, linear
+from benches.stability.extreme.problem import NU
+from benches.stability.extreme.rows import ALL, FAST
 
 CASES = linear.cases()
 SOLVED = [

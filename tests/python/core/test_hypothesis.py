@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 moduli = st.floats(1e-3, 1e3)
 ratios = st.floats(0.0, 0.495)

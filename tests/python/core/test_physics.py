@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 YOUNG, POISSON = 0.7, 0.3
 

@@ -14,7 +14,7 @@ import skfem
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 # Half width and height of each block, mm; radius of the upper one's underside; way of its lid.
 WIDTH, HEIGHT, RADIUS, DOWN = 4.0, 3.0, 60.0, 0.06

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 YOUNG, POISSON = 0.5, 0.3
 SIZE = (6.0, 5.0, 4.0)

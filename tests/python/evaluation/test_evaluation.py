@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from real_faces import face, moved
 
 import cmfsim
-import meshes
 import real_heads
+from benches.scenes import meshes
 
 stats = pytest.importorskip("scipy.stats")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import ct_variants as variants
+from benches.scenes import ct_variants as variants
 from cmfsim import ImageData, ImageError, SegmentOptions, segment_head
 from cmfsim.imaging.intensities import intensity
 from phantom_reference import check_face, dice, distances, face, parted_as, surface_points

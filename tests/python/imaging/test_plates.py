@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import ct_variants as variants
+from benches.scenes import ct_variants as variants
 from synthetic_head import made_head
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.io.cases.tables import read_tables
 from cmfsim.io.cases.template_archives import read_template_archive
 from cmfsim.io.files.archives import read_archive

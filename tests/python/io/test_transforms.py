@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 numbers = st.floats(-100.0, 100.0)
 vectors = st.tuples(numbers, numbers, numbers)

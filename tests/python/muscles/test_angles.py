@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-import meshes
-from angles import angle_between, angle_of_lines, angle_of_rotation
+from benches.scenes import meshes
+from benches.scenes.angles import angle_between, angle_of_lines, angle_of_rotation
 
 SIZES = (0.0, 1e-12, 1e-9, 1e-6, 0.3, 45.0, 90.0, 135.0, 179.999999, 180.0)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.muscles.blurring import Blur, blurred
 
 SIZE = 24.0

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
 import real_heads
-from angles import angle_of_lines
+from benches.scenes import meshes
+from benches.scenes.angles import angle_of_lines
 from cmfsim.muscles.equivalent import prepared_muscles
 
 # Fat, and muscle along and across: Table 1 of Kim et al. (2010), and muscle at rest.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from angles import angle_of_lines
+from benches.scenes.angles import angle_of_lines
 
 # Median angle between boxes and true fibres over the volume of a muscle, degrees, and its P95, as
 # measured on the phantom and rounded up. Bent ends, converging lines and thin rings are worse.

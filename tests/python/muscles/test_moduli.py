@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.values.moduli import PRESET_MODULI
 
 NAMES = ("masseter_L", "buccinator_L")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
-import skin_roughness
+from benches.accuracy import skin_roughness
+from benches.scenes import meshes
 from cmfsim.muscles.blurring import blurred
 
 RADIUS = 8.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from angles import angle_between
+from benches.scenes.angles import angle_between
 from cmfsim import HeadParameters, PhantomHead, make_head
 from cmfsim.phantom import BONES, LABELS, PARAMETER_RANGES
 from cmfsim.phantom.geometry.courses import COURSES

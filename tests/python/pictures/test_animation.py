@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.pictures import faces
 from cmfsim.pictures.faces import FILM_SIZE, animate_face
 

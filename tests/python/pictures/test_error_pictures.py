@@ -7,7 +7,7 @@ import pytest
 from test_pictures import painted, read
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim import pictures
 
 pytest.importorskip("pyvista")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim import pictures
 
 pv = pytest.importorskip("pyvista")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-import ct_variants as variants
 import real_heads
+from benches.scenes import ct_variants as variants
 from cmfsim.bones import cut_bones, place_procedure
 from cmfsim.cli import main
 from cmfsim.pipeline import proposing

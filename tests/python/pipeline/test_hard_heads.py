@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-import ct_variants as variants
 import phantom_reference
+from benches.scenes import ct_variants as variants
 from cmfsim.cli import main
 from cmfsim.pipeline.outputs import model as model_output
 from real_heads import data_folder

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-import ct_variants as variants
 import real_heads
+from benches.scenes import ct_variants as variants
 from cmfsim import SegmentOptions, segment_head
 from cmfsim.pipeline.building.skin.skin_part import check_skin
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.pipeline.building.skin import skin_part
 
 RADIUS = 30.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from browser_page import open_page, serious_faults, until
 from cmfsim.planning.face_view import FACE_TRIANGLES, face_view
 from cmfsim.report import Document, Section, View, render_page

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.deferred import PUBLIC
 from cmfsim.errors import MeshInputError, third_party
 from head_case import HeadCase

@@ -32,7 +32,7 @@ PAGES = {
 }
 BLOCK = re.compile(r"^( *)```([a-z]*)\n(.*?)^ *```", re.DOTALL | re.MULTILINE)
 # Blocks without a language that are drawings, lists of options, or what a command prints.
-NOT_TYPED = re.compile(r"─|^plan: |^cmfsim demo \[FOLDER\]|^python benches")
+NOT_TYPED = re.compile(r"─|^plan: |^cmfsim demo \[FOLDER\]|^python (?:-m )?benches")
 
 
 def blocks(page):
@@ -258,8 +258,8 @@ WHOLE = (
 
 def prepare(folder, coarse_case):
     """What the pages take for granted: a case, a CT, a scene, a cohort, an atlas."""
-    for name in ("patient", "packed", "benches"):
-        (folder / name).mkdir()
+    for name in ("patient", "packed", "benches/scenes"):
+        (folder / name).mkdir(parents=True)
     for file in coarse_case.iterdir():
         if file.is_file():
             (folder / file.name).write_bytes(file.read_bytes())
@@ -279,8 +279,8 @@ def prepare(folder, coarse_case):
     pack(folder / "packed", folder / "planning.mrb")
     plan = "[plan.maxilla]\ntranslation = [0, -3, 0]\n"
     (folder / "demo-B-6d0f1c2a.toml").write_text(plan, encoding="utf-8")
-    variants = (ROOT / "benches/variants.toml").read_text("utf-8")
-    (folder / "benches" / "variants.toml").write_text(variants, encoding="utf-8")
+    variants = (ROOT / "benches/scenes/variants.toml").read_text("utf-8")
+    (folder / "benches/scenes/variants.toml").write_text(variants, encoding="utf-8")
     write_template(folder / "atlas", cmfsim.MuscleTemplate.load("default"))
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-import ct_variants as variants
 import real_heads
+from benches.scenes import ct_variants as variants
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
 from cmfsim.registration.proposed.average_head import average_head

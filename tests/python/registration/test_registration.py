@@ -12,13 +12,13 @@ import pytest
 from scanner_points import OFFSET, gap, moved, random_landmarks
 
 import cmfsim
-from angles import angle_of_rotation
+from benches.scenes.angles import angle_of_rotation
 
 TESTS = Path(__file__).parents[1]
 PATHS = [
     str(TESTS),
     str(Path(__file__).parent),
-    str(TESTS.parents[1] / "benches"),
+    str(TESTS.parents[1]),
     str(Path(cmfsim.__file__).parents[1]),
 ]
 

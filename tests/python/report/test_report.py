@@ -5,7 +5,7 @@ from dataclasses import asdict
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.report import Document, Figure, Note, Section, Table, render_page
 from cmfsim.report.clinical import clinical_sections
 from cmfsim.report.document import number

@@ -3,7 +3,7 @@
 import numpy as np
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 
 NODES, TETS = meshes.box((3, 3, 3), (9.0, 9.0, 6.0), jitter=0.1)
 LOW = meshes.nodes_where(NODES[:, 2] == 0.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import contact_plans
+from benches.stability import contact_plans
 from shared_values import phantom_model
 
 pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
@@ -36,7 +36,7 @@ def plans(model):
 
 
 def test_random_plans_converge_in_few_steps(scene, plans):
-    """The small twin of benches/contact_plans.py."""
+    """The small twin of benches/stability/contact_plans.py."""
     assert len(plans) == 8
     tally = contact_plans.Tally("phantom", "H+S", scene.n_tets, 0)
     contact_plans.run(tally, scene, plans)

@@ -9,14 +9,14 @@ import pytest
 
 import cmfsim
 import cmfsim.solving.inversion
+from benches.scenes.meshes import box
 from cmfsim.solving.inversion import inversion_finding, least_volume_ratios
-from meshes import box
 
 LENGTH = 60.0  # mm
 
 
 def bar(kinematics, shift=-0.5 * LENGTH, element="p1"):
-    """The bar of `benches/extreme/kinematics.py`, one end held, the other pushed along it."""
+    """The bar of `benches/stability/extreme/kinematics.py`, held at one end and pushed along it."""
     nodes, tets = box((6, 2, 2), (LENGTH, 20.0, 20.0), jitter=0.15)
     x = nodes[:, 0]
     return cmfsim.Scene(

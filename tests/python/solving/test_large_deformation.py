@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from meshes import box, plane
+from benches.scenes.meshes import box, plane
 
 SIZE = (30.0, 24.0, 18.0)  # mm
 FIRST = cmfsim.rigid_motion((0.0, 4.0, -3.0))

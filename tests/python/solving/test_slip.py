@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import cmfsim
+from benches.scenes.meshes import box, plane
 from cmfsim.solving.simulation import slip_finding
-from meshes import box, plane
 
 MOTION = cmfsim.rigid_motion((5.0, 0.0, 0.0))
 

@@ -1,6 +1,6 @@
-//! The small twin of `benches/error_estimate.rs`: scenes in which stiff and soft tissue are mixed.
+//! The small twin of `benches/stability/error_estimate.rs`: scenes in which stiff and soft tissue are mixed.
 
-#[path = "../../../benches/random_scenes.rs"]
+#[path = "../../../benches/scenes/random_scenes.rs"]
 #[allow(dead_code)] // the bench sorts scenes by more than the test
 mod random_scenes;
 

@@ -97,7 +97,7 @@ pub struct Solution {
     /// follows from the residual and the observed spectrum, confirmed on a known solution if stiff and soft
     /// tissue are mixed; for Cholesky it is a hundred times the error with which the factorisation recovered a
     /// known solution. It refers to the exact solution of K as stored: the rounding of K itself is not
-    /// included, and the error left by contact only as ten times the largest gap. `benches/error_estimate.rs`
+    /// included, and the error left by contact only as ten times the largest gap. `benches/stability/error_estimate.rs`
     /// measures how often it is too small.
     pub error_estimate: f64,
     /// Iterations of the linear solver (0 for Cholesky), summed over all contact iterations; for large

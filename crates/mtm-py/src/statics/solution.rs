@@ -57,7 +57,7 @@ impl PySolution {
     /// solution if stiff and soft tissue are mixed; for Cholesky it is a hundred times the error with which the
     /// factorisation recovered a known solution, or ten times the largest gap of contact; with large rotations
     /// it follows from the last Newton step. Rounding of the stiffness itself is not included.
-    /// `benches/error_estimate.rs` measures how often the estimate is too small.
+    /// `benches/stability/error_estimate.rs` measures how often the estimate is too small.
     #[getter]
     fn error_estimate(&self) -> f64 {
         self.core.error_estimate

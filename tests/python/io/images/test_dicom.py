@@ -8,7 +8,7 @@ import pytest
 from small_scans import codes, noisy, refused, same, smooth
 
 import cmfsim
-import ct_variants as variants
+from benches.scenes import ct_variants as variants
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.images.image_grids import of_slices
 from dicom_series import axial, tilted, write_classic_frames, write_series

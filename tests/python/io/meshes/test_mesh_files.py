@@ -8,7 +8,7 @@ import pytest
 from refused_surfaces import refused, saved
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.io.meshes.mesh_files import read_mesh
 from head_case import icosphere
 

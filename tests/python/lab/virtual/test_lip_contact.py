@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim import HeadParameters, make_head
 from cmfsim.errors import CaseInputError
 from cmfsim.lab.virtual.mechanics.body import FAT, HyperelasticBody, HyperelasticTissue

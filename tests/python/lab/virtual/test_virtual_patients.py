@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError
 from cmfsim.lab.virtual import PATIENTS, EquilibriumOptions

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.lab.virtual.mechanics.body import (
     CRUSHED,

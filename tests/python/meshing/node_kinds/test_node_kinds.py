@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
 import real_heads
+from benches.scenes import meshes
 from cmfsim.pipeline.building.tissue.contacts import arch_sheets
 
 BONE, SKIN, LEVEL, LAYERS = 20.0, 32.0, 3, 4

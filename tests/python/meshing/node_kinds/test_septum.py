@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import cmfsim
+from benches.accuracy.nose_ratios import ratios
 from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.meshing.node_kinds import septum
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from nose_ratios import ratios
 
 ADVANCE = 4.0
 FORWARDS = {"maxilla": cmfsim.rigid_motion(translation=(0.0, -ADVANCE, 0.0))}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-import meshes
+from benches.scenes import meshes
 from cmfsim.doctor.surgery.operation import check_photo
 from cmfsim.io import write_landmarks
 from cmfsim.pipeline.building.case_checks import Head

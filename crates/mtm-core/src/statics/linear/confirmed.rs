@@ -20,7 +20,7 @@ const TRIAL_SHARE: f64 = 0.1;
 /// Multiple of the error of a trial that is taken as the error of any solution, as for a factorisation.
 const TRIAL_SAFETY: f64 = 10.0;
 
-/// Multiple of the estimate at the end of the iteration that is reported: in `benches/error_estimate.rs` about
+/// Multiple of the estimate at the end of the iteration that is reported: in `benches/stability/error_estimate.rs` about
 /// one estimate in a thousand was up to 2.2 times too small.
 const REPORT_SAFETY: f64 = 4.0;
 

@@ -2,7 +2,7 @@
 //!
 //! An iteration can only estimate its own error. If stiff and soft tissue are mixed, or the spectrum is wide,
 //! the estimate may miss a slow motion. In these cases a trial with a known solution is solved first, and its
-//! true errors calibrate the estimates (`benches/error_estimate.rs` measures how often they fail).
+//! true errors calibrate the estimates (`benches/stability/error_estimate.rs` measures how often they fail).
 
 use std::sync::{Arc, OnceLock};
 

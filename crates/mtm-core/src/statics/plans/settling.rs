@@ -27,7 +27,7 @@ use crate::vector::{between, dot, norm, sub};
 const CONTACT_SHARE: f64 = 0.1;
 
 /// Multiple of a factorisation's trial error that is taken as the error of any solution by it. A factor of ten
-/// was too small for one solution in 300 of `benches/error_estimate.rs`, most of them with contact.
+/// was too small for one solution in 300 of `benches/stability/error_estimate.rs`, most of them with contact.
 const TRIAL_SAFETY: f64 = 100.0;
 
 /// Multiple of the largest remaining contact gap that is taken as the error of a solution with contact.

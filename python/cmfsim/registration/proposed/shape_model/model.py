@@ -116,7 +116,7 @@ SITES = tuple(("skull", name) for name in SKULL_LANDMARKS) + tuple(
 # What skulls of one size differ by: measures over the whole skull have standard deviations of 4 to
 # 7 mm within a population, 3 to 5 mm of them beyond size, and those over 30 mm some 2 mm (Howells
 # 1973, Farkas 1994). Sides differ by a third of that. Of two real heads, one makes these deviations
-# the likeliest and the other 0.7 times as much (`benches/placed_sites.py`).
+# the likeliest and the other 0.7 times as much (`benches/accuracy/placed_sites.py`).
 HEAD = Kernel(((120.0, 3.5), (60.0, 2.2), (30.0, 1.0)), 0.35, 30)
 # The mandible against the cranium: classes II and III, width, height of the rami.
 JAW = Kernel(((70.0, 2.5), (35.0, 1.0)), 0.35, 8)

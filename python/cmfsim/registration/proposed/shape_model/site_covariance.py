@@ -29,7 +29,7 @@ from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 # 2 mm at most sites (docs/landmarks.md).
 PLACED_STD = 1.0
 # What each site has on its own, alike on both sides: relief, and what an operator takes it to be.
-# The likeliest of two real heads together (`benches/placed_sites.py`).
+# The likeliest of two real heads together (`benches/accuracy/placed_sites.py`).
 OWN_STD = 1.5
 # Uncertainty of the pose before any site is seen: shift in mm, turn in radians, relative size.
 SHIFT_STD, TURN_STD, SIZE_STD = 15.0, 0.2, 0.08
