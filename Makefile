@@ -66,7 +66,7 @@ test-python: $(DEVELOP_STAMP)
 	"$(PY)" -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test-slow: $(DEVELOP_STAMP) ## run the tests that take minutes, such as README and docs typed from top to bottom
-	"$(PY)" -m pytest -m slow
+	"$(PY)" -m pytest -m slow --timeout 3600
 
 lint: lint-rust lint-python ## rustfmt, clippy, rustdoc, ruff, mypy, stubtest, the import rules and the licences
 

@@ -73,6 +73,7 @@ PYTHON: Mapping[str, str] = {
     "playwright": "Apache-2.0",
     "slicer-core": "Apache-2.0",
     "pytest": "MIT",
+    "pytest-timeout": "MIT",
     "pytest-xdist": "MIT",
     "hypothesis": "MPL-2.0",
     "nbclient": "BSD-3-Clause",

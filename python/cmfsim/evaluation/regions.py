@@ -34,14 +34,6 @@ REGIONS: Mapping[str, str] = MappingProxyType(
         "right cheek": "its mirror image",
     }
 )
-# Where no operation on the jaws moves anything: what differs there has another cause.
-UNMOVED_REGIONS: Mapping[str, str] = MappingProxyType(
-    {
-        "forehead": "above the brows, below the hair, as wide as the eyes",
-        "left temple": "beside the eye and above it",
-        "right temple": "its mirror image",
-    }
-)
 # Proportions, each a factor on a distance between landmarks (no unit). They put the borders into
 # folds of the two heads that they were looked at on: an adult male and a phantom.
 NOSE_WIDTH = 1.2  # of the wings, on the distance of alare from the midline
@@ -267,7 +259,10 @@ def _beside(root: Place, wing: Place, height: float) -> Place:
 
 
 def _unmoved_outlines(at: Mapping[str, Floats]) -> dict[str, list[Place]]:
-    """The outlines of `UNMOVED_REGIONS` in the view from the front: (left, up), mm."""
+    """The outlines of forehead and temples in the view from the front: (left, up), mm.
+
+    No operation on the jaws moves anything there: what differs has another cause.
+    """
     middle, base = at["subnasale"][0], at["subnasale"][1]
     eyes = _eyes(at)
     left, right = (float(at[f"exocanthion_{side}"][0] - middle) for side in "LR")

@@ -25,9 +25,8 @@ USUAL_ERROR, ALIKE_ERROR = 2.0, 1.0
 IMAGE_ENDS = "the image ends there"
 # Left and right differ by so much in few faces, mm of the average head.
 MOST_UNEVEN = 6.0
-# A point so near to where the image ends may lie on the cut instead of on bone, and one a little
-# farther away is doubtful, mm.
-AT_CUT, NEAR_CUT = 3.0, 8.0
+# A point so near to where the image ends may lie on the cut instead of on bone, mm.
+AT_CUT = 3.0
 # The jaw below the lower incisors must be there as far down as this for its profile to be read,
 # average-head mm: to the deepest point, and to the foremost one of the chin.
 TO_FOLD, TO_CHIN = 18.0, 27.0

@@ -10,8 +10,6 @@ from cmfsim.values.checks import Floats
 
 # Edge of a cell, mm.
 STEP = 0.75
-# Cells without a point are filled from their neighbours this many cells around.
-FILL = 3
 
 
 @dataclass(frozen=True, eq=False)
