@@ -1,11 +1,8 @@
-"""Images in the formats that SimpleITK reads: NRRD, NIfTI, MetaImage and folders of DICOM."""
+"""Images: NRRD, NIfTI and MetaImage by our own readers, DICOM's pixels and writing by ITK."""
 
 import glob
 import os
 import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -19,30 +16,15 @@ from cmfsim.io.files.leftovers import abandoned, temporary_folder
 from cmfsim.io.files.reading_writing import is_there, utf8_path
 from cmfsim.io.images.dicom.series import read_dicom_file, read_dicom_folder
 from cmfsim.io.images.image_grids import aligned, shear_of, turn_of, upright
-from cmfsim.io.images.image_headers import KNOWN, ImageHeader, apart
+from cmfsim.io.images.image_headers import KNOWN
 from cmfsim.io.images.nifti import GZIP, is_nifti, read_nifti
-from cmfsim.io.images.nrrd import is_meta, meta_header, nrrd_header
-from cmfsim.processes.child import ReaderError, read_in_child
-from cmfsim.processes.worker import Answer, ReadLimits
+from cmfsim.io.images.nrrd import is_meta, read_meta, read_nrrd
+from cmfsim.processes.worker import Answer
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
 # What the child process imports before the time of a file begins.
 LIBRARIES = ("SimpleITK",)
-
-
-def read_volume(path: str, reader: str) -> Answer:
-    """The voxels of a file, axes z, y, x, with the place that the reader gives them."""
-    image = _read(path, reader)
-    if image.GetDimension() == 4:
-        image = image[:, :, :, 0]
-    place = {
-        "size": list(image.GetSize()),
-        "spacing": list(image.GetSpacing()),
-        "origin": list(image.GetOrigin()),
-        "direction": list(image.GetDirection()),
-    }
-    return Answer(place, {"values": _itk().GetArrayFromImage(image)})
 
 
 def read_slices(paths: list[str]) -> Answer:
@@ -114,16 +96,10 @@ def last_line(error: Exception) -> str:
 SUFFIXES = (".nrrd", ".nii", ".nii.gz", ".mha")
 # Names of files that are no DICOM, whose content is none of their formats.
 OTHER_SUFFIXES = (".nrrd", ".nhdr", ".nii", ".gz", ".mha", ".mhd", ".hdr")
-# The ending of a file that holds header and voxels, by ITK's reader.
-ATTACHED = {"NrrdImageIO": ".nrrd", "MetaImageIO": ".mha"}
 # What tells formats apart.
 FIRST_BYTES = 1024
-# The header as read here and by ITK agree on the place of each corner to this, mm.
-READERS_AGREE = 0.1
 # Axes farther from a right angle than this are reported as sheared, degrees.
 SHEARED = 0.06
-# Copies of an image that reading it holds at once.
-COPIES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,17 +162,17 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
         begin = file.read(FIRST_BYTES)
     if not begin:
         raise ImageInputError(f"{path.name}: is empty")
-    _simpleitk()
     # A DICOM file may begin with anything.
     if begin[128:132] != b"DICM":
         if begin.startswith(GZIP) or is_nifti(begin):
             return placed(path, *read_nifti(path))
         if begin.startswith(b"NRRD000"):
-            return _read_file(path, nrrd_header(path))
+            return placed(path, *read_nrrd(path))
         if is_meta(begin):
-            return _read_file(path, meta_header(path))
+            return placed(path, *read_meta(path))
         if path.name.lower().endswith(OTHER_SUFFIXES):
             raise ImageInputError(f"{path.name}: is not a readable image; {KNOWN}")
+    _simpleitk()
     return ImageFile(*read_dicom_file(path))
 
 
@@ -250,48 +226,6 @@ def _simpleitk() -> Any:
     return third_party("SimpleITK", "images are read", "imaging", ImageError)
 
 
-def _read_file(path: Path, header: ImageHeader) -> ImageFile:
-    """The image of a file whose header was read."""
-    size = max(path.stat().st_size, header.bytes)
-    limits = ReadLimits(20.0 + size / 5e6, 4 * 2**30 + COPIES * size)
-    try:
-        with _unpacked(path, header) as readable, utf8_path(readable) as plain:
-            task = "cmfsim.io.images.image_files:read_volume"
-            answer = read_in_child(task, limits, path=plain, reader=header.reader)
-    except ReaderError as error:
-        raise ImageInputError(f"{path.name}: {error}") from error
-    values = answer.arrays["values"].T
-    if values.shape != header.size:
-        raise ImageInputError(
-            f"{path.name}: its header states {header.size} voxels, and {values.shape} were read: "
-            "is it damaged?"
-        )
-    theirs = _affine_of(answer.values)
-    affine = header.affine
-    if affine is None:
-        affine = theirs
-    elif not header.scaled and (off := apart(affine, theirs, header.size)) > READERS_AGREE:
-        raise ImageInputError(
-            f"{path.name}: two readings of its header disagree by {off:.4g} mm about its "
-            f"position ({affine.round(4).tolist()} and {theirs.round(4).tolist()}): export the "
-            "image again"
-        )
-    return placed(path, values, affine, header.findings)
-
-
-@contextmanager
-def _unpacked(path: Path, header: ImageHeader) -> Iterator[Path]:
-    """A file that ITK reads: this one, or a copy with its voxels unpacked."""
-    if header.packed is None:
-        yield path
-        return
-    with tempfile.TemporaryDirectory(prefix="cmfsim-unpacked-") as folder:
-        # ITK goes by the ending as well: that of a header alone has its voxels elsewhere.
-        copy = Path(folder, path.name).with_suffix(ATTACHED[header.reader])
-        header.packed.write(copy, header.bytes)
-        yield copy
-
-
 def placed(
     path: Path, values: NDArray[Any], affine: NDArray[np.float64], findings: tuple[Finding, ...]
 ) -> ImageFile:
@@ -304,12 +238,6 @@ def placed(
             upright(values, affine, path.name), "", (*findings, _resampled(path, affine))
         )
     return ImageFile(image, "", findings)
-
-
-def _affine_of(place: Any) -> NDArray[np.float64]:
-    """The map from index to place of an ITK image, (3, 4)."""
-    direction = np.array(place["direction"]).reshape(3, 3)
-    return np.column_stack([direction * np.array(place["spacing"]), place["origin"]])
 
 
 def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:

@@ -9,16 +9,16 @@ import bz2
 import math
 import re
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.files.reading_writing import check_readable, is_below
+from cmfsim.io.files.text_numbers import real_numbers, whole_numbers
 from cmfsim.values.finding import Finding
 
 # Larger images are refused before memory is taken, voxels: 1024 × 1024 × 2000.
@@ -43,52 +43,6 @@ LENGTHS: Mapping[str, float] = {
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
 _WHOLE = re.compile(r"\d{1,18}")
 KNOWN = "NRRD, NIfTI, MetaImage or DICOM is needed"
-
-
-@dataclass(frozen=True, eq=False)
-class PackedVoxels:
-    """Voxels that ITK does not unpack, and the header of a file that has them unpacked.
-
-    start: Where they begin.
-    packing: As `check_length` takes it.
-    """
-
-    header: bytes
-    data: Path
-    start: int
-    packing: str
-
-    def write(self, path: Path, needed: int) -> None:
-        """Writes the file with its voxels unpacked, `needed` bytes of them."""
-        reader = _unpacker(self.packing)
-        with self.data.open("rb") as file, path.open("wb") as copy:
-            copy.write(self.header)
-            file.seek(self.start)
-            while not reader.eof and (block := file.read(CHUNK)):
-                copy.write(reader.decompress(block))
-            copy.truncate(len(self.header) + needed)
-
-
-@dataclass(frozen=True, eq=False)
-class ImageHeader:
-    """What the header of an image file states.
-
-    reader: ITK's name of the reader for its format.
-    size: Voxels along each of the three axes.
-    affine: (3, 4) or None, mm. Takes an index (i, j, k, 1) to its place in LPS; None where the file
-        states no frame: then the reader's own spacing and origin are all that is known.
-    bytes: Of all voxels, unpacked.
-    scaled: Whether the affine differs from the reader's for a stated reason: a unit, a choice.
-    packed: Where ITK does not unpack them.
-    """
-
-    reader: str
-    size: tuple[int, int, int]
-    affine: NDArray[np.float64] | None
-    bytes: int
-    scaled: bool = False
-    findings: tuple[Finding, ...] = ()
-    packed: PackedVoxels | None = None
 
 
 def check_shape(name: str, size: list[int], components: int = 1) -> None:
@@ -117,71 +71,78 @@ def check_shape(name: str, size: list[int], components: int = 1) -> None:
         )
 
 
-def check_length(
-    data: Path, start: int, needed: int, layer: int, packing: str = ""
-) -> tuple[Finding, ...]:
-    """A finding on bytes after the voxels; refuses voxels that are fewer, or damaged where packed.
+def stored_voxels(
+    data: Path, start: int, dtype: np.dtype[Any], sizes: Sequence[int], packing: str = ""
+) -> tuple[NDArray[Any], tuple[Finding, ...]]:
+    """The voxels of a file, the first axis the fastest, and a finding on bytes after them.
 
-    ITK pads what is short, drops what is long, and does not compare checksums.
-
-    start: Where the voxels begin.
-    needed: Bytes of the voxels, unpacked.
-    layer: Bytes of one slice: as many more may be slices that the header misses, and are refused.
-    packing: "gzip", "zlib" or "bzip2"; empty where they are not packed.
-    Raises `ImageError`: With both lengths.
+    start: Where the voxels begin; -1 where they end with the file.
+    packing: "zlib" (gzip too), "bzip2", "hex" or "text"; empty where they are not packed.
+    Raises `ImageError`: With both lengths where they are fewer, or so many more that they may be a
+        slice that the header misses; damaged.
     """
-    found, left = data.stat().st_size - start, 0
-    if packing:
-        found, left = _unpacked_length(data, start, needed + layer, packing)
+    needed, layer = (math.prod(n) * dtype.itemsize for n in (sizes, sizes[:2]))
+    there, left = data.stat().st_size, 0
+    with data.open("rb") as file:
+        file.seek(max(0, there - needed) if start < 0 else start)
+        if packing in {"zlib", "bzip2"}:
+            raw: bytes | bytearray
+            raw, left = _unpacked(data.name, file, needed + layer, packing)
+        else:
+            raw = _plain(data.name, file.read(-1 if packing else needed + layer), packing, dtype)
+    found = len(raw)
     if not 0 <= found - needed < layer:
         what = "is cut short" if found < needed else "is longer than its header states"
         raise ImageInputError(
             f"{data.name}: {what}: {found} of {needed} bytes of voxels; copy it again"
         )
+    voxels = np.frombuffer(raw, dtype, math.prod(sizes)).reshape(tuple(sizes), order="F")
     left += found - needed
-    if not left:
-        return ()
     what = f"{left} bytes after its voxels were ignored: they are no slice that its header misses"
-    return (Finding("field-ignored", what, where=data.name),)
+    findings = (Finding("field-ignored", what, where=data.name),) if left else ()
+    return voxels.astype(dtype.newbyteorder("="), copy=False), findings
 
 
-def _unpacked_length(data: Path, start: int, most: int, packing: str) -> tuple[int, int]:
-    """The bytes of voxels in a packed file, or a few above `most`, and those after its end."""
-    reader = _unpacker(packing)
-    found = 0
+def _plain(name: str, raw: bytes, packing: str, dtype: np.dtype[Any]) -> bytes:
+    """The bytes of voxels that are written as such, as hexadecimal digits or as words."""
+    if not packing:
+        return raw
     try:
-        with data.open("rb") as file:
-            file.seek(start)
-            while not reader.eof and found < most and (block := file.read(CHUNK)):
-                # Unpacked by pieces: a block of zeros alone would take a thousand times its size.
-                found += len(reader.decompress(block, CHUNK))
-                while not reader.eof and found < most and (more := _rest(reader)):
-                    found += len(more)
-            left = len(reader.unused_data) + len(file.read(CHUNK))
+        if packing == "hex":
+            return bytes.fromhex(raw.decode("ascii"))
+        read = real_numbers if dtype.kind == "f" else whole_numbers
+        # Of a list, numpy refuses whole numbers that the type does not hold.
+        values: list[Any] = read(raw.split(), "voxel {}".format).tolist()
+        return np.array(values, dtype).tobytes()
+    except (ValueError, OverflowError) as error:
+        raise ImageInputError(f"{name}: its voxels are damaged ({error}); copy it again") from error
+
+
+def _unpacked(name: str, file: BinaryIO, most: int, packing: str) -> tuple[bytearray, int]:
+    """The voxels in the rest of a packed file, or a few above `most`; bytes after their end."""
+    bzip2 = packing == "bzip2"
+    # zlib tells its two forms apart.
+    reader: Any = bz2.BZ2Decompressor() if bzip2 else zlib.decompressobj(zlib.MAX_WBITS + 32)
+    found = bytearray()
+    try:
+        while not reader.eof and len(found) < most and (block := file.read(CHUNK)):
+            # Unpacked by pieces: a block of zeros alone would take a thousand times its size.
+            while block and not reader.eof and len(found) < most:
+                found += reader.decompress(block, CHUNK)
+                block = b"" if bzip2 else reader.unconsumed_tail
+            while bzip2 and not (reader.eof or reader.needs_input) and len(found) < most:
+                found += reader.decompress(b"", CHUNK)
+        left = len(reader.unused_data) + len(file.read(CHUNK))
     except (OSError, zlib.error) as error:
         raise ImageInputError(
-            f"{data.name}: its voxels are damaged ({error}); copy the file again"
+            f"{name}: its voxels are damaged ({error}); copy the file again"
         ) from error
-    if found < most and not reader.eof:
+    if len(found) < most and not reader.eof:
         raise ImageInputError(
-            f"{data.name}: is cut short: its voxels are compressed, and the file ends before them; "
+            f"{name}: is cut short: its voxels are compressed, and the file ends before them; "
             "copy it again"
         )
     return found, left if reader.eof else 0
-
-
-def _unpacker(packing: str) -> Any:
-    if packing == "bzip2":
-        return bz2.BZ2Decompressor()
-    return zlib.decompressobj(zlib.MAX_WBITS + 16 if packing == "gzip" else zlib.MAX_WBITS)
-
-
-def _rest(reader: Any) -> bytes:
-    """More of what is unpacked of the block that was given last; nothing once it is used up."""
-    if isinstance(reader, bz2.BZ2Decompressor):
-        return b"" if reader.needs_input else reader.decompress(b"", CHUNK)
-    tail = reader.unconsumed_tail
-    return bytes(reader.decompress(tail, CHUNK)) if tail else b""
 
 
 def data_file(path: Path, name: str) -> Path:

@@ -1,9 +1,10 @@
-"""Headers of NRRD (.nrrd, .nhdr) and MetaImage (.mha, .mhd), with their data or next to them."""
+"""NRRD (.nrrd, .nhdr) and MetaImage (.mha, .mhd), with their data or next to them."""
 
 import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,24 +14,24 @@ from cmfsim.io.images.image_headers import (
     LENGTHS,
     MOST_DIGITS,
     MOST_HEADER,
-    MOST_PACKED,
-    ImageHeader,
-    PackedVoxels,
     check_affine,
-    check_length,
     check_shape,
     data_file,
     number,
+    stored_voxels,
     unstated,
     whole,
 )
 from cmfsim.values.finding import Finding
 
-MET_BYTES: Mapping[str, int] = {
-    "MET_CHAR": 1, "MET_UCHAR": 1, "MET_SHORT": 2, "MET_USHORT": 2, "MET_INT": 4, "MET_UINT": 4,
-    "MET_LONG": 8, "MET_ULONG": 8, "MET_LONG_LONG": 8, "MET_ULONG_LONG": 8, "MET_FLOAT": 4,
-    "MET_DOUBLE": 8,
+MET_TYPES: Mapping[str, str] = {
+    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4",
+    "MET_UINT": "u4", "MET_LONG": "i4", "MET_ULONG": "u4", "MET_LONG_LONG": "i8",
+    "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
 }  # fmt: skip
+ORDER_KEYS = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
+# An image: voxels, axes x, y, z, the map from index to LPS (3, 4), mm, and findings.
+Read = tuple[NDArray[Any], NDArray[np.float64], tuple[Finding, ...]]
 
 
 def is_meta(begin: bytes) -> bool:
@@ -39,10 +40,10 @@ def is_meta(begin: bytes) -> bool:
     return bool(re.match(rb"\s*(ObjectType|NDims|Comment|ObjectSubType)\s*=", line))
 
 
-def meta_header(path: Path) -> ImageHeader:
-    """The checked header of a MetaImage file.
+def read_meta(path: Path) -> Read:
+    """The image of a MetaImage file.
 
-    Raises `ImageError`: Something impossible is stated, or a data file elsewhere.
+    Raises `ImageError`: Something impossible is stated, or a data file elsewhere; cut short.
     """
     fields, begin = _fields(path)
     axes = whole(path, "NDims", fields.get("NDims", ""))
@@ -51,42 +52,31 @@ def meta_header(path: Path) -> ImageHeader:
         raise ImageInputError(f"{path.name}: NDims is {axes} and DimSize {sizes}")
     channels = whole(path, "ElementNumberOfChannels", fields.get("ElementNumberOfChannels", "1"))
     check_shape(path.name, sizes, channels)
-    each = MET_BYTES.get(fields.get("ElementType", ""))
-    if each is None:
+    kind = MET_TYPES.get(fields.get("ElementType", ""))
+    if kind is None:
         raise ImageInputError(
             f"{path.name}: ElementType is {fields.get('ElementType', '')!r}: whole or real numbers "
             "are needed"
         )
-    needed = math.prod(sizes) * each
-    name = fields["ElementDataFile"]
-    data, start = path, begin
-    if name.upper() != "LOCAL":
-        data, start = data_file(path, name), 0
-    packed = fields.get("CompressedData", "False").lower() in {"true", "1"}
-    findings: tuple[Finding, ...] = ()
-    if fields.get("HeaderSize", "0") == "0":
-        layer = sizes[0] * sizes[1] * each
-        findings = check_length(data, start, needed, layer, "zlib" if packed else "")
-    elif (found := data.stat().st_size - start) * (MOST_PACKED if packed else 1) < needed:
-        raise ImageInputError(
-            f"{data.name}: is cut short: {found} of {needed} bytes; copy it again"
-        )
-    unpacked = None
-    if packed and data == path and "CompressedDataSize" not in fields:
-        # ITK would take the header for the begin of the voxels.
-        unpacked = _unpacked(path, start)
-    size = (sizes[0], sizes[1], sizes[2])
-    affine, scaled = _affine(path, fields, axes)
-    check_affine(path.name, affine, size)
-    return ImageHeader("MetaImageIO", size, affine, needed, scaled, findings, unpacked)
+    affine = _affine(path, fields, axes)
+    check_affine(path.name, affine, (sizes[0], sizes[1], sizes[2]))
+    name, skip = fields["ElementDataFile"], fields.get("HeaderSize", "0")
+    data, start = (path, begin) if name.upper() == "LOCAL" else (data_file(path, name), 0)
+    if skip != "0":
+        start = -1 if skip == "-1" else whole(path, "HeaderSize", skip)
 
+    def is_set(key: str, *, default: bool = False) -> bool:
+        return fields.get(key, str(default)).lower() in {"true", "1"}
 
-def _unpacked(path: Path, start: int) -> PackedVoxels:
-    """The voxels of a file, and its header without their packing."""
-    with path.open("rb") as file:
-        text = file.read(start)
-    header = re.sub(rb"(?m)^\s*CompressedData\s*=.*$", b"CompressedData = False", text)
-    return PackedVoxels(header, path, start, "zlib")
+    packing = "zlib" if is_set("CompressedData") else ""
+    if not is_set("BinaryData", default=True):
+        packing = "text"
+    orders = {is_set(key) for key in ORDER_KEYS if key in fields}
+    if len(orders) > 1:
+        raise ImageInputError(f"{path.name}: {' and '.join(ORDER_KEYS)} contradict each other")
+    order = ">" if True in orders else "<"
+    values, findings = stored_voxels(data, start, np.dtype(order + kind), sizes, packing)
+    return values.reshape(values.shape[:3]), affine, findings
 
 
 def _fields(path: Path) -> tuple[dict[str, str], int]:
@@ -104,7 +94,7 @@ def _fields(path: Path) -> tuple[dict[str, str], int]:
     )
 
 
-def _affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[NDArray[np.float64], bool]:
+def _affine(path: Path, fields: Mapping[str, str], axes: int) -> NDArray[np.float64]:
     def numbers(keys: tuple[str, ...], default: list[float]) -> NDArray[np.float64]:
         key = next((k for k in keys if k in fields), None)
         if key is None:
@@ -128,12 +118,13 @@ def _affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[NDArray[n
     scale = LENGTHS.get(unit, 1.0)
     # A row of the matrix is the direction of an axis.
     direction = turn.reshape(axes, axes).T[:3, :3]
-    return scale * np.column_stack([direction * spacing[:3], place[:3]]), scale != 1.0
+    return scale * np.column_stack([direction * spacing[:3], place[:3]])
 
 
-# NRRD's encodings whose length is known beforehand; text and hexadecimal are ITK's to read.
+# NRRD's encodings, as `stored_voxels` has them.
 PACKINGS: Mapping[str, str] = {
-    "raw": "", "gzip": "gzip", "gz": "gzip", "bzip2": "bzip2", "bz2": "bzip2",
+    "raw": "", "gzip": "zlib", "gz": "zlib", "bzip2": "bzip2", "bz2": "bzip2", "hex": "hex",
+    "text": "text", "txt": "text", "ascii": "text",
 }  # fmt: skip
 # NRRD's anatomical spaces: what takes each axis to L, P and S.
 SPACES: Mapping[str, tuple[float, float, float]] = {
@@ -144,34 +135,37 @@ SPACES: Mapping[str, tuple[float, float, float]] = {
     "left-posterior-superior": (1.0, 1.0, 1.0),
     "lps": (1.0, 1.0, 1.0),
 }
-BYTES: Mapping[str, int] = {
-    **dict.fromkeys(("signed char", "int8", "int8_t", "uchar", "unsigned char"), 1),
-    **dict.fromkeys(("uint8", "uint8_t"), 1),
-    **dict.fromkeys(("short", "short int", "signed short", "signed short int"), 2),
-    **dict.fromkeys(("int16", "int16_t", "ushort", "unsigned short", "unsigned short int"), 2),
-    **dict.fromkeys(("uint16", "uint16_t"), 2),
-    **dict.fromkeys(("int", "signed int", "int32", "int32_t", "uint", "unsigned int"), 4),
-    **dict.fromkeys(("uint32", "uint32_t", "float"), 4),
-    **dict.fromkeys(("longlong", "long long", "long long int", "signed long long"), 8),
-    **dict.fromkeys(("signed long long int", "int64", "int64_t", "ulonglong"), 8),
-    **dict.fromkeys(("unsigned long long", "unsigned long long int", "uint64", "uint64_t"), 8),
-    "double": 8,
-}
+TYPES: Mapping[str, str] = {
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(
+        ("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"
+    ),
+    **dict.fromkeys(
+        ("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"
+    ),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **dict.fromkeys(("longlong", "long long", "long long int", "signed long long"), "i8"),
+    **dict.fromkeys(("signed long long int", "int64", "int64_t"), "i8"),
+    **dict.fromkeys(("ulonglong", "unsigned long long", "unsigned long long int"), "u8"),
+    **dict.fromkeys(("uint64", "uint64_t"), "u8"),
+    "float": "f4", "double": "f8",
+}  # fmt: skip
 # NRRD axes that run through space; others hold the numbers of one voxel.
 SPATIAL = frozenset({"domain", "space", "none", "???", "time"})
 # NRRD fields of free text.
 TEXTS = frozenset({"content", "data file", "datafile", "labels", "units", "sample units"})
 
 
-def nrrd_header(path: Path) -> ImageHeader:
-    """The checked header of a NRRD file.
+def read_nrrd(path: Path) -> Read:
+    """The image of a NRRD file.
 
-    Raises `ImageError`: Something impossible is stated, or a data file elsewhere.
+    Raises `ImageError`: Something impossible is stated, or a data file elsewhere; cut short.
     """
     fields, begin = nrrd_fields(path)
     kind = fields.get("type", "").lower()
-    each = BYTES.get(kind)
-    if each is None:
+    if kind not in TYPES:
         raise ImageInputError(f"{path.name}: type is {kind!r}: whole or real numbers are needed")
     axes = whole(path, "dimension", fields.get("dimension", ""))
     sizes = [whole(path, "sizes", text) for text in fields.get("sizes", "").split()]
@@ -182,15 +176,10 @@ def nrrd_header(path: Path) -> ImageHeader:
     if components:
         check_shape(path.name, sizes[-3:], math.prod(components))
     check_shape(path.name, sizes)
-    more = _check_data(path, fields, begin, (math.prod(sizes) * each, math.prod(sizes[:2]) * each))
-    affine, scaled, findings = nrrd_affine(path, fields, axes)
-    # ITK's reader has no bzip2.
-    packed = _packed(path, fields, begin) if _packing(fields) == "bzip2" else None
-    size = (sizes[0], sizes[1], sizes[2])
-    if affine is not None:
-        check_affine(path.name, affine, size)
-    n_bytes = math.prod(sizes) * each
-    return ImageHeader("NrrdImageIO", size, affine, n_bytes, scaled, (*findings, *more), packed)
+    affine, findings = nrrd_affine(path, fields, axes)
+    check_affine(path.name, affine, (sizes[0], sizes[1], sizes[2]))
+    values, more = nrrd_voxels(path, fields, begin, sizes)
+    return values.reshape(values.shape[:3]), affine, (*findings, *more)
 
 
 def nrrd_fields(path: Path) -> tuple[dict[str, str], int]:
@@ -218,50 +207,46 @@ def nrrd_fields(path: Path) -> tuple[dict[str, str], int]:
     return fields, end
 
 
-def _packing(fields: Mapping[str, str]) -> str | None:
-    return PACKINGS.get(fields.get("encoding", "raw").lower())
-
-
-def _packed(path: Path, fields: Mapping[str, str], begin: int) -> PackedVoxels:
-    """The voxels of a file, and its header without their packing."""
-    with path.open("rb") as file:
-        text = file.read(begin)
-    text = re.sub(rb"(?im)^(encoding|data ?file): .*\n?", b"", text).rstrip()
-    data, start = path, begin
-    if "data file" in fields:
-        data, start = data_file(path, fields["data file"]), 0
-    return PackedVoxels(text + b"\nencoding: raw\n\n", data, start, "bzip2")
-
-
-def _check_data(
-    path: Path, fields: Mapping[str, str], begin: int, lengths: tuple[int, int]
-) -> tuple[Finding, ...]:
-    """Refuses too few bytes of voxels; `lengths` are those of all, and of one slice."""
-    needed, layer = lengths
-    skips = False
-    for key in ("byte skip", "byteskip", "line skip", "lineskip"):
-        if fields.get(key, "0") != "0":
-            skips = True
-            if fields[key] != "-1":
-                whole(path, key, fields[key])
-    data, start = path, begin
-    if "data file" in fields:
-        data, start = data_file(path, fields["data file"]), 0
-    packing = _packing(fields)
-    if packing is not None and not skips:
-        return check_length(data, start, needed, layer, packing)
-    if packing == "" and data.stat().st_size - start < needed:
+def nrrd_voxels(
+    path: Path, fields: Mapping[str, str], begin: int, sizes: list[int]
+) -> tuple[NDArray[Any], tuple[Finding, ...]]:
+    """The voxels of a file, axes in the order of its sizes, and findings."""
+    packing = PACKINGS.get(fields.get("encoding", "raw").lower())
+    if packing is None:
         raise ImageInputError(
-            f"{data.name}: is cut short: {data.stat().st_size - start} of {needed} bytes; copy it "
-            "again"
+            f"{path.name}: encoding is {fields['encoding']!r}: use one of {', '.join(PACKINGS)}"
         )
-    return ()
+    kind = TYPES[fields["type"].lower()]
+    order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
+    if order is None and kind[1] != "1" and packing != "text":
+        raise ImageInputError(
+            f"{path.name}: endian is {fields.get('endian', '')!r}: little or big is needed"
+        )
+    data, start = path, begin
+    if "data file" in fields:
+        data, start = data_file(path, fields["data file"]), 0
+    if (lines := _skip(path, fields, "line skip")) > 0:
+        with data.open("rb") as file:
+            file.seek(start)
+            for _ in range(min(lines, data.stat().st_size)):
+                file.readline()
+            start = file.tell()
+    if (skip := _skip(path, fields, "byte skip")) and packing:
+        raise ImageInputError(f"{path.name}: its voxels are packed: write byte skip: 0")
+    start = -1 if skip < 0 else start + skip
+    return stored_voxels(data, start, np.dtype((order or "=") + kind), sizes, packing)
+
+
+def _skip(path: Path, fields: Mapping[str, str], key: str) -> int:
+    """How many lines or bytes are passed over before the voxels; -1: they end with the file."""
+    text = fields.get(key, fields.get(key.replace(" ", ""), "0"))
+    return -1 if text == "-1" and key == "byte skip" else whole(path, key, text)
 
 
 def nrrd_affine(
     path: Path, fields: Mapping[str, str], axes: int
-) -> tuple[NDArray[np.float64] | None, bool, tuple[Finding, ...]]:
-    """The map from index to LPS mm, (3, 4), if it is stated; whether in mm already; findings."""
+) -> tuple[NDArray[np.float64], tuple[Finding, ...]]:
+    """The map from index to LPS mm, (3, 4), and a finding where its frame is not stated."""
     signs = SPACES.get(fields.get("space", "").lower())
     rows = _vectors(path, "space directions", fields.get("space directions", ""))
     origin = _vectors(path, "space origin", fields.get("space origin", ""))
@@ -271,7 +256,8 @@ def nrrd_affine(
                 number(path, key, text)
     if signs is None:
         stated = f"its space is {fields['space']!r}" if "space" in fields else "it states no space"
-        return None, False, (unstated(path, stated, "space: left-posterior-superior"),)
+        plain = _unstated_affine(path, fields, rows, origin)
+        return plain, (unstated(path, stated, "space: left-posterior-superior"),)
     vectors = [row for row in rows if row is not None]
     if len(rows) != axes or len(vectors) != 3 or any(len(row) != 3 for row in vectors):
         raise ImageInputError(
@@ -293,7 +279,34 @@ def nrrd_affine(
     affine = np.zeros((3, 4))
     affine[:, :3] = np.array(vectors, dtype=np.float64).T
     affine[:, 3] = origin[0] if origin and origin[0] is not None else 0.0
-    return scale * np.array(signs)[:, None] * affine, scale != 1.0, findings
+    return scale * np.array(signs)[:, None] * affine, findings
+
+
+def _unstated_affine(
+    path: Path,
+    fields: Mapping[str, str],
+    rows: list[list[float] | None],
+    origin: list[list[float] | None],
+) -> NDArray[np.float64]:
+    """The map of a file that states no frame of the patient: along its own axes, as ITK has it."""
+    texts = fields.get("spacings", "").split()[:3]
+    spacing = [1.0 if text.lower() == "nan" else number(path, "spacings", text) for text in texts]
+    affine = np.eye(3, 4)
+    affine[:, :3] = np.diag([*spacing, 1.0, 1.0, 1.0][:3])
+    vectors = [row for row in rows if row is not None]
+    if len(vectors) == 3 and all(len(row) == 3 for row in vectors):
+        affine[:, :3] = np.array(vectors).T
+    if origin and origin[0] is not None and len(origin[0]) == 3:
+        affine[:, 3] = origin[0]
+    if lows := fields.get("axis mins", fields.get("axismins", "")).split()[:3]:
+        if len(spacing) < 3 or vectors:
+            raise ImageInputError(f"{path.name}: states axis mins without spacings: write them")
+        nodes = [text == "node" for text in fields.get("centerings", "").lower().split()[:3]]
+        nodes += [False] * (3 - len(nodes))
+        # Between the borders of a cell lies its voxel.
+        for axis, (low, node) in enumerate(zip(lows, nodes, strict=False)):
+            affine[axis, 3] = number(path, "axis mins", low) + (0.0 if node else spacing[axis] / 2)
+    return affine
 
 
 def _vectors(path: Path, key: str, text: str) -> list[list[float] | None]:

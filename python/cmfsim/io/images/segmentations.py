@@ -4,7 +4,6 @@ import gzip
 import json
 import math
 import re
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,20 +17,17 @@ from cmfsim.io.files.reading_writing import check_readable
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.images.image_headers import check_shape, whole
 from cmfsim.io.images.nifti import read_nifti
-from cmfsim.io.images.nrrd import BYTES, nrrd_affine, nrrd_fields
+from cmfsim.io.images.nrrd import SPACES, TYPES, nrrd_affine, nrrd_fields, nrrd_voxels
 from cmfsim.values.finding import Finding
 
 MAX_SEGMENTS = 200
 # Voxels of all layers, bytes in memory: those of a head CT in eight layers.
 MAX_VOXELS = 2**31
-LABEL_TYPES: Mapping[int, str] = {1: "u1", 2: "u2", 4: "u4"}
 # What Slicer states of each segment, one line each.
 ABOUT = re.compile(rb"^Segment(\d{1,4})_(Name|LabelValue|Layer):=([^\r\n]*)", re.MULTILINE)
 LAYER = re.compile(r"[0-9]{1,4}", re.ASCII)
 # Kinds of axes in NRRD that may run through space.
 SPATIAL_KINDS = frozenset({"domain", "space", "none", "???"})
-# zlib's number for a gzip stream.
-GZIP = 31
 # The largest label of the programs whose images are read (TotalSegmentator has 117).
 MOST_LABEL = 255
 # A CT has more values than this, or neighbours inside it that differ: noise.
@@ -93,20 +89,21 @@ def read_segmentation(path: Path) -> Segmentation:
             f"{path.name}: has {n_layers} layers of {math.prod(shape)} voxels: at most "
             f"{MAX_SEGMENTS} layers and {MAX_VOXELS} voxels are read"
         )
-    width = BYTES.get(fields.get("type", "").lower(), 0)
-    if width not in LABEL_TYPES or fields["type"].lower() in {"float", "double"}:
+    kind = TYPES.get(fields.get("type", "").lower(), "")
+    if not kind or kind[0] == "f" or kind[1] == "8":
         raise ImageInputError(f"{path.name}: type is {fields.get('type')!r}: labels are needed")
-    axes = len(fields["sizes"].split())
-    affine, _, findings = nrrd_affine(path, fields, axes)
-    if affine is None:
+    affine, findings = nrrd_affine(path, fields, len(sizes))
+    if fields.get("space", "").lower() not in SPACES:
         raise ImageInputError(f"{path.name}: states no space: save it from 3D Slicer again")
-    order = ">" if fields.get("endian", "little").lower() == "big" else "<"
-    voxels = _voxels(path, fields, begin, math.prod(sizes) * width)
-    stored = np.frombuffer(voxels, order + LABEL_TYPES[width]).reshape(sizes, order="F")
+    if "data file" in fields:
+        raise ImageInputError(
+            f"{path.name}: its voxels are in another file: save it as one .seg.nrrd"
+        )
+    stored, more = nrrd_voxels(path, {"endian": "little", **fields}, begin, sizes)
     labels = stored[None] if across is None else np.moveaxis(stored, across, 0)
     with path.open("rb") as file:
         head = file.read(begin)
-    return Segmentation(labels, affine, _segments(path, head, labels), findings)
+    return Segmentation(labels, affine, _segments(path, head, labels), (*findings, *more))
 
 
 def are_labels(values: NDArray[Any]) -> bool:
@@ -205,38 +202,6 @@ def _layer_axis(path: Path, fields: Mapping[str, str]) -> int:
             '"none" and the kind "list"'
         )
     return without[0]
-
-
-def _voxels(path: Path, fields: Mapping[str, str], begin: int, needed: int) -> bytes:
-    packing = fields.get("encoding", "raw").lower()
-    if "data file" in fields or packing not in {"raw", "gzip", "gz"}:
-        raise ImageInputError(
-            f"{path.name}: its voxels are in another file, or packed as {packing!r}: save it as "
-            "one .seg.nrrd"
-        )
-    with path.open("rb") as file:
-        file.seek(begin)
-        raw = file.read()
-    if packing != "raw":
-        raw = _unpacked(path, raw, needed)
-    if len(raw) != needed:
-        what = "is cut short" if len(raw) < needed else "is longer than its header states"
-        raise ImageInputError(f"{path.name}: {what}: {len(raw)} of {needed} bytes of voxels")
-    return raw
-
-
-def _unpacked(path: Path, raw: bytes, needed: int) -> bytes:
-    """The voxels of a gzip stream, whose checksum stands at its end."""
-    unpacker = zlib.decompressobj(GZIP)
-    try:
-        voxels = unpacker.decompress(raw, needed + 1)
-        if len(voxels) == needed and not unpacker.eof:
-            voxels += unpacker.decompress(unpacker.unconsumed_tail, 1)
-    except zlib.error as error:
-        raise ImageInputError(f"{path.name}: is damaged ({error}): copy it again") from error
-    if len(voxels) == needed and not unpacker.eof:
-        raise ImageInputError(f"{path.name}: is cut short: its packed voxels do not end")
-    return voxels
 
 
 def _segments(path: Path, head: bytes, labels: NDArray[Any]) -> tuple[Segment, ...]:

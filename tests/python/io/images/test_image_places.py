@@ -6,7 +6,7 @@ from header_files import SHAPE, SHEARED, VALUES, codes, refused, write_meta, wri
 
 from cmfsim.io.images.image_files import read_image, read_image_file
 from cmfsim.io.images.nifti import read_nifti
-from cmfsim.io.images.nrrd import meta_header, nrrd_header
+from cmfsim.io.images.nrrd import read_meta, read_nrrd
 
 sitk = pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 
@@ -152,9 +152,69 @@ def test_our_reading_of_a_header_is_that_of_itk(tmp_path, suffix, degrees):
     image.SetDirection(turn.ravel().tolist())
     path = tmp_path / f"a{suffix}"
     sitk.WriteImage(image, str(path))
-    # Disagreement would be an error.
-    readers = {".nrrd": nrrd_header, ".mha": meta_header}
-    affine = readers[suffix](path).affine if suffix in readers else read_nifti(path)[1]
+    read = {".nrrd": read_nrrd, ".mha": read_meta}.get(suffix, read_nifti)
+    values, affine, _ = read(path)
+    np.testing.assert_array_equal(values, VALUES)
     expected = np.column_stack([turn * [0.5, 0.75, 2.0], [-20.0, 7.0, 100.0]])
     np.testing.assert_allclose(affine, expected, atol=1e-5)
     read_image(path)
+
+
+@pytest.mark.parametrize("kind", ["int", "float", "uchar"])
+@pytest.mark.parametrize("how", ["text", "hex", "raw, from its end", "behind two lines"])
+@pytest.mark.parametrize(
+    "lines",
+    [
+        (),
+        ("spacings: 1 2 3",),
+        ("spacings: 1 nan 3",),
+        ("spacings: 1 2 3", "axis mins: 5 6 7"),
+        ("spacings: 1 2 3", "axis mins: 5 6 7", "centerings: node node node"),
+        ("space: scanner-xyz", "space directions: (1,0,0) (0,0,2) (0,3,0)"),
+        ("space dimension: 3", "space directions: (1,0,0) (0,0,2) (0,3,0)", "space origin: (1,2,3)"),  # noqa: E501
+    ],
+)  # fmt: skip
+def test_a_nrrd_without_a_frame_is_read_as_itk_reads_it(tmp_path, lines, how, kind):
+    bare = {"space": None, "space directions": None, "space origin": None, "type": kind}
+    values = VALUES.astype({"int": "<i4", "float": "<f4", "uchar": "u1"}[kind])
+    more = {"text": {"encoding": "text"}, "hex": {"encoding": "hex"}}.get(how, {})
+    more |= {"raw, from its end": {"byte skip": "-1"}, "behind two lines": {"line skip": "2"}}.get(
+        how, {}
+    )
+    path = write_nrrd(tmp_path / "a.nrrd", *lines, data=False, **bare, **more)
+    raw = values.T.tobytes()
+    written = {
+        "text": " ".join(str(v) for v in values.T.ravel()).encode(),
+        "hex": raw.hex().encode(),
+        "raw, from its end": b"before" + raw,
+        "behind two lines": b"one\ntwo\n" + raw,
+    }
+    path.write_bytes(path.read_bytes() + written[how])
+    known = sitk.ReadImage(str(path))
+    found, affine, findings = read_nrrd(path)
+    np.testing.assert_array_equal(found, sitk.GetArrayFromImage(known).T)
+    direction = np.reshape(known.GetDirection(), (3, 3))
+    expected = np.column_stack([direction * known.GetSpacing(), known.GetOrigin()])
+    np.testing.assert_allclose(affine, expected)
+    assert [f.code for f in findings] == ["frame-unstated"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "dtype"),
+    [
+        ({"ElementType": "MET_LONG"}, "<i4"),
+        ({"ElementType": "MET_ULONG_LONG"}, "<u8"),
+        ({"ElementType": "MET_USHORT", "BinaryDataByteOrderMSB": "True"}, ">u2"),
+        ({"ElementType": "MET_DOUBLE", "BinaryDataByteOrderMSB": "True"}, ">f8"),
+        ({"HeaderSize": "-1"}, "<i2"),
+        ({"BinaryData": "False"}, "text"),
+    ],
+)
+def test_a_meta_image_of_any_type_is_read_as_itk_reads_it(tmp_path, fields, dtype):
+    values = VALUES if dtype == "text" else VALUES.astype(dtype)
+    path = write_meta(tmp_path / "a.mha", data=False, **fields)
+    text = " ".join(map(str, values.T.ravel())).encode() + b"\n"
+    path.write_bytes(path.read_bytes() + (text if dtype == "text" else values.T.tobytes()))
+    found = read_meta(path)[0]
+    np.testing.assert_array_equal(found, VALUES)
+    np.testing.assert_array_equal(found, sitk.GetArrayFromImage(sitk.ReadImage(str(path))).T)
