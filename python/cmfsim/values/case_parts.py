@@ -4,7 +4,7 @@ Nothing here is read from disk: the files that a case names may be missing, whic
 says. `cmfsim.Case` holds the whole.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cmfsim._core import PRESETS
 from cmfsim.errors import CaseInputError
 from cmfsim.values.checks import (
     Floats,
@@ -24,7 +25,7 @@ from cmfsim.values.checks import (
     check_one_of,
 )
 from cmfsim.values.moduli import TissueModuli
-from cmfsim.values.tissue_data import DEFAULT_PRESET
+from cmfsim.values.tissue_data import DEFAULT_PRESET, MIXINGS
 
 # Distance of the posterior plane behind the roots of the zygomatic arches, mm: behind the whole
 # ramus and its joint, so that the jaw moves inside tissue, and before the mastoid and neck.
@@ -68,6 +69,38 @@ LIP_SEAMS = ("auto", "landmarks")
 LIP_DEPTH = 8.0
 # How far from it a lip reaches, mm: over its red, and inside to the roots of the front teeth.
 LIP_HEIGHT = 13.0
+# How far the seam between the lips may go on past the teeth, and lips may reach from it, mm.
+MOST_LIP_DEPTH = 20.0
+LIP_HEIGHTS = (3.0, 30.0)
+# Wider, mm, than any muscle of the face is thick.
+MOST_BLUR = 30.0
+# Points in a tet that a muscle's surface crosses.
+SAMPLES = (1, 100_000)
+# Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
+EDGE_LENGTHS = (0.3, 30.0)
+MOST_CLEFT = 20.0
+# Coverages of a band that a calibration of up to a thousand cases can give.
+COVERAGES = (0.001, 0.999)
+# CT values of thresholds; those above the last are clipped, HU.
+TISSUE_HU, METAL_HU = (-1024.0, 3071.0), (-1024.0, 4000.0)
+# Grid spacings that a head can be worked on at, mm.
+WORKING_SPACINGS = (0.2, 5.0)
+
+
+# A field that a case file states under its name (`Table.part`): any text, flag or file.
+PLAIN: Mapping[str, Any] = MappingProxyType({"unit": "", "range": (None, None), "choices": ()})
+
+
+def stated(
+    default: Any,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: Iterable[str] = (),
+) -> Any:
+    """Such a field with a default, a unit, a range or choices."""
+    metadata = {"unit": unit, "range": (low, high), "choices": tuple(choices)}
+    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +137,9 @@ class Region:
     """
 
     posterior_plane: Plane | None = None
-    posterior_depth: float | None = None
-    lower: float | None = None
-    upper: float | None = None
+    posterior_depth: float | None = stated(None, "mm", -200.0, 200.0)
+    lower: float | None = stated(None, "mm")
+    upper: float | None = stated(None, "mm")
 
     def __post_init__(self) -> None:
         if self.lower is not None and self.upper is not None and self.lower >= self.upper:
@@ -147,11 +180,11 @@ class CaseImage:
     rescale: Slope and intercept from the image's values to HU, where they are not HU.
     """
 
-    file: Path
-    skin_threshold: float | None = None
-    bone_threshold: float | None = None
-    working_spacing: float | None = None
-    metal_threshold: float | None = None
+    file: Path = field(metadata=PLAIN)
+    skin_threshold: float | None = stated(None, "HU", *TISSUE_HU)
+    bone_threshold: float | None = stated(None, "HU", *TISSUE_HU)
+    working_spacing: float | None = stated(None, "mm", *WORKING_SPACINGS)
+    metal_threshold: float | None = stated(None, "HU", *METAL_HU)
     series: str | None = None
     rescale: tuple[float, float] | None = None
 
@@ -165,10 +198,10 @@ class CaseSurfaces:
         LPS where it states none.
     """
 
-    skin: Path
+    skin: Path = field(metadata=PLAIN)
     bones: Mapping[str, Path]
-    units: str = "mm"
-    frame: str | None = None
+    units: str = stated("mm", choices=UNITS)
+    frame: str | None = stated(None, choices=FRAMES)
 
     def __post_init__(self) -> None:
         check_one_of("units", self.units, tuple(UNITS))
@@ -191,9 +224,9 @@ class CaseLandmarks:
     templates: Folders of heads whose landmarks are known, for finding them; see docs/landmarks.md.
     """
 
-    skull: Path | None = None
-    skin: Path | None = None
-    frame: str | None = None
+    skull: Path | None = stated(None)
+    skin: Path | None = stated(None)
+    frame: str | None = stated(None, choices=FRAMES)
     automatic: bool | str = True
     templates: tuple[Path, ...] = ()
 
@@ -225,11 +258,11 @@ class CaseMesh:
     file: Tets from elsewhere; edge length, refinement and cleft are then not used.
     """
 
-    edge_length: float = EDGE_LENGTH
-    refine: bool = True
-    cleft: float = CLEFT
+    edge_length: float = stated(EDGE_LENGTH, "mm", *EDGE_LENGTHS)
+    refine: bool = stated(default=True)
+    cleft: float = stated(CLEFT, "mm", 0.0, MOST_CLEFT)
     parting: Path | None = None
-    file: Path | None = None
+    file: Path | None = stated(None)
 
 
 @dataclass(frozen=True)
@@ -244,10 +277,10 @@ class CaseLips:
     height: mm. How far from the seam the lips reach.
     """
 
-    contact: bool = LIP_CONTACT
+    contact: bool = stated(LIP_CONTACT)
     seam: Path | str = "auto"
-    depth: float = LIP_DEPTH
-    height: float = LIP_HEIGHT
+    depth: float = stated(LIP_DEPTH, "mm", 0.0, MOST_LIP_DEPTH)
+    height: float = stated(LIP_HEIGHT, "mm", *LIP_HEIGHTS)
 
 
 @dataclass(frozen=True)
@@ -261,9 +294,9 @@ class CaseBand:
     """
 
     asked: bool = False
-    calibration: Path | None = None
-    coverage: float = BAND_COVERAGE
-    group: str | None = None
+    calibration: Path | None = stated(None)
+    coverage: float = stated(BAND_COVERAGE, "", *COVERAGES)
+    group: str | None = stated(None)
 
 
 @dataclass(frozen=True)
@@ -375,14 +408,14 @@ class CaseMuscles:
     """
 
     template: Path | str = "default"
-    smoothing: float = 0.0
-    preset: str = DEFAULT_PRESET
-    mixing: str = "moduli"
-    samples: int = 64
-    seed: int = 0
+    smoothing: float = stated(0.0, "", 0.0, 1e6)
+    preset: str = stated(DEFAULT_PRESET, choices=PRESETS)
+    mixing: str = stated("moduli", choices=MIXINGS)
+    samples: int = stated(64, "", *SAMPLES)
+    seed: int = stated(0, "", 0, 2**63 - 1)
     moduli: TissueModuli = field(default_factory=TissueModuli)
-    fit: bool = False
-    blur: float = 4.0
+    fit: bool = stated(default=False)
+    blur: float = stated(4.0, "mm", 0.0, MOST_BLUR)
 
 
 @dataclass(frozen=True)
@@ -395,10 +428,10 @@ class CasePhoto:
     units: Of the photo and its landmarks.
     """
 
-    file: Path
-    landmarks: Path | None = None
-    aligned: bool = False
-    units: str = "mm"
+    file: Path = field(metadata=PLAIN)
+    landmarks: Path | None = stated(None)
+    aligned: bool = stated(default=False)
+    units: str = stated("mm", choices=UNITS)
 
     def __post_init__(self) -> None:
         check_one_of("units", self.units, tuple(UNITS))
@@ -420,15 +453,15 @@ class CasePostoperative:
         it is another face, or the face before, are then warnings, not errors.
     """
 
-    skin: Path | None = None
-    image: Path | None = None
-    landmarks: Path | None = None
+    skin: Path | None = stated(None)
+    image: Path | None = stated(None)
+    landmarks: Path | None = stated(None)
     bones: Mapping[str, Path] = field(default_factory=dict)
-    aligned: bool = True
-    units: str = "mm"
-    frame: str | None = None
+    aligned: bool = stated(default=True)
+    units: str = stated("mm", choices=UNITS)
+    frame: str | None = stated(None, choices=FRAMES)
     series: str | None = None
-    verified: bool = False
+    verified: bool = stated(default=False)
 
     def __post_init__(self) -> None:
         if self.image is not None and (self.skin is not None or self.bones):

@@ -2,13 +2,17 @@
 
 import os
 import re
+from dataclasses import MISSING, fields
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import cmfsim
 import cmfsim.values.case_parts
+from cmfsim.io.files.reading_writing import toml_module
 from cmfsim.io.files.toml_lines import line_of, toml_lines
+from cmfsim.values import case_parts
 
 HEAD = 'format = "cmfsim-case"\nversion = 1\n'
 SURFACES = '[surfaces]\nskin = "skin.ply"\n[surfaces.bones]\nmandible = "jaw.stl"\n'
@@ -434,3 +438,45 @@ def test_wrong_values_of_the_lips_name_their_line(tmp_path, line, message):
     with pytest.raises(cmfsim.CaseError, match=message) as error:
         load(tmp_path, HEAD + SURFACES + "[lips]\n" + line + "\n")
     assert "lips" in str(error.value)
+
+
+DOCUMENTED = {
+    "image": case_parts.CaseImage,
+    "surfaces": case_parts.CaseSurfaces,
+    "landmarks": case_parts.CaseLandmarks,
+    "region": case_parts.Region,
+    "mesh": case_parts.CaseMesh,
+    "lips": case_parts.CaseLips,
+    "band": case_parts.CaseBand,
+    "muscles": case_parts.CaseMuscles,
+    "photo": case_parts.CasePhoto,
+    "postoperative": case_parts.CasePostoperative,
+}
+# What a reader of the page would have no use for.
+LARGEST_SHOWN = 1e9
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_the_page_states_each_key_with_its_unit_range_and_default(name, tmp_path):
+    page = Path(__file__).parents[3].joinpath("docs", "formats.md").read_text(encoding="utf-8")
+    section = page.split("## Case: `case.toml`")[1]
+    table = re.search(rf"(?ms)^\[{name}\](.*?)(?:^\[\[?[a-z]|^```)", section)[1]
+    # What the page has as a comment is shown by another value than its default.
+    rows = {key: (mark, text) for mark, key, text in re.findall(r"(?m)^(# )?(\w+) = (.*)$", table)}
+    # No field is a key that the page does not have, such as "asked" of a band.
+    for key in ("nothing", "asked"):
+        lines = "" if name in {"surfaces", "image"} else SURFACES
+        with pytest.raises(cmfsim.CaseError, match=f"{key} is unknown"):
+            load(tmp_path, f"{HEAD}{lines}[{name}]\n{key} = true\n")
+    for one in fields(DOCUMENTED[name]):
+        if not one.metadata:
+            continue
+        mark, text = rows[one.name]
+        value, _, comment = text.partition("  #")
+        low, high = one.metadata["range"]
+        assert one.metadata["unit"] in comment
+        if high is not None and high < LARGEST_SHOWN:
+            ends = [f"{end:g}".replace("e+0", "e") for end in (low, high)]
+            assert " to ".join(ends) in comment
+        if one.default not in {None, MISSING} and not mark:
+            assert toml_module().loads(f"x = {value}")["x"] == one.default

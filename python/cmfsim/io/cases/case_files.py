@@ -13,7 +13,6 @@ from typing import Any, TypeAlias
 from cmfsim.errors import CaseInputError
 from cmfsim.io.cases.case_plans import is_achieved, osteotomies_of, plan_of
 from cmfsim.io.cases.case_tables import (
-    band_of,
     image_of,
     landmarks_of,
     lips_of,
@@ -269,7 +268,7 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
         if "surfaces" in document
         else None,
         landmarks=landmarks_of(document.table("landmarks"), folder),
-        region=region_of(document.table("region")),
+        region=region_of(document.table("region"), folder),
         mesh=mesh_of(document.table("mesh"), folder),
         lips=lips_of(document, folder),
         osteotomies=osteotomies_of(document),
@@ -279,7 +278,7 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
         tissue=tissue_of(document.table("tissue")),
         muscles=muscles_of(document.table("muscles"), folder) if "muscles" in document else None,
         solver=solver_of(document.table("solver")),
-        band=band_of(document, folder),
+        band=replace(document.table("band").part(CaseBand, folder), asked="band" in document),
         postoperative=(
             postoperative_of(document.table("postoperative"), folder)
             if "postoperative" in document

@@ -10,8 +10,6 @@ from cmfsim.io.files.reading_writing import is_there
 from cmfsim.values.case_parts import (
     FRAMES,
     LIP_SEAMS,
-    UNITS,
-    CaseBand,
     CaseImage,
     CaseLandmarks,
     CaseLips,
@@ -25,29 +23,13 @@ from cmfsim.values.case_parts import (
 )
 from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE, MuscleModuli, TissueModuli
 from cmfsim.values.solver_options import CONTACTS, SolverOptions
-from cmfsim.values.tissue_data import MIXINGS, TissueData
+from cmfsim.values.tissue_data import TissueData
 
 # What [muscles] and each table below [muscles.moduli] may set, as `MuscleModuli` has it.
 MODULI = ("young_along", "young_across", "poisson")
-# Wider, mm, than any muscle of the face is thick.
-MOST_BLUR = 30.0
-# Points in a tet that a muscle's surface crosses.
-SAMPLES = (1, 100_000)
-# Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
-EDGE_LENGTHS = (0.3, 30.0)
-MOST_CLEFT = 20.0
-# How far the seam between the lips may go on past the teeth, and lips may reach from it, mm.
-MOST_LIP_DEPTH = 20.0
-LIP_HEIGHTS = (3.0, 30.0)
-# Coverages of a band that a calibration of up to a thousand cases can give.
-COVERAGES = (0.001, 0.999)
-# CT values above this are clipped, HU.
-MOST_HU = 4000.0
 # What takes the values of an image to HU: images from 0 to 1 have a slope of some 4000.
 MOST_SLOPE = 1e5
 MOST_INTERCEPT = 1e5
-# Grid spacings that a head can be worked on at, mm.
-WORKING_SPACINGS = (0.2, 5.0)
 
 
 def stated_frame(table: Table) -> str | None:
@@ -58,16 +40,6 @@ def stated_frame(table: Table) -> str | None:
 def file_of(table: Table, key: str, folder: Path) -> Path:
     """A path to read; the case is its owner's, so that it may lead to images kept elsewhere."""
     return table.path(key, folder)
-
-
-def _stated(**values: Any) -> dict[str, Any]:
-    """Those of some values that the table states; the others have their defaults."""
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def file_or_none(table: Table, key: str, folder: Path) -> Path | None:
-    """The file that a key names, or None where the key is missing."""
-    return file_of(table, key, folder) if key in table else None
 
 
 def output_folder(table: Table, folder: Path) -> Path:
@@ -89,23 +61,16 @@ def output_folder(table: Table, folder: Path) -> Path:
 
 def image_of(table: Table, folder: Path) -> CaseImage:
     """The image of [image], with how its values become HU."""
-    thresholds = ("skin_threshold", "bone_threshold", "metal_threshold")
-    table.only("file", *thresholds, "working_spacing", "series", "rescale")
-    skin = table.number("skin_threshold", "HU", -1024.0, 3071.0)
-    bone = table.number("bone_threshold", "HU", -1024.0, 3071.0)
-    metal = table.number("metal_threshold", "HU", -1024.0, MOST_HU)
-    if skin is not None and bone is not None and skin >= bone:
-        table.fail(
-            "skin_threshold", f"is {skin:g}, bone_threshold is {bone:g}: the former must be smaller"
-        )
-    if bone is not None and metal is not None and bone >= metal:
-        table.fail(
-            "bone_threshold",
-            f"is {bone:g}, metal_threshold is {metal:g}: the former must be smaller",
-        )
-    spacing = table.number("working_spacing", "mm", *WORKING_SPACINGS)
-    path = file_of(table, "file", folder)
-    return CaseImage(path, skin, bone, spacing, metal, _dicom_series(table), _rescale(table))
+    series, rescale = _dicom_series(table), _rescale(table)
+    image = table.part(CaseImage, folder, series=series, rescale=rescale)
+    for low, high in (("skin", "bone"), ("bone", "metal")):
+        small, large = (getattr(image, f"{name}_threshold") for name in (low, high))
+        if small is not None and large is not None and small >= large:
+            table.fail(
+                f"{low}_threshold",
+                f"is {small:g}, {high}_threshold is {large:g}: the former must be smaller",
+            )
+    return image
 
 
 def _rescale(table: Table) -> tuple[float, float] | None:
@@ -137,20 +102,19 @@ def _dicom_series(table: Table) -> str | None:
 
 def surfaces_of(table: Table, folder: Path) -> CaseSurfaces:
     """The skin and the bones of [surfaces], with their unit and frame."""
-    table.only("skin", "bones", "units", "frame")
-    bones = table.table("bones")
-    names = list(bones)
-    if not names:
+    table.only(*CaseSurfaces.__dataclass_fields__)
+    if not list(table.table("bones")):
         table.fail(
             "bones" if "bones" in table else None,
             'names no bone: add a line such as cranium = "file.ply"',
         )
-    return CaseSurfaces(
-        skin=file_of(table, "skin", folder),
-        bones={checked_name(bones, name, name): file_of(bones, name, folder) for name in names},
-        units=table.text("units", "mm", tuple(UNITS)),
-        frame=stated_frame(table),
-    )
+    return table.part(CaseSurfaces, folder, bones=_bones(table, folder))
+
+
+def _bones(table: Table, folder: Path) -> dict[str, Path]:
+    """The files of bones by name."""
+    bones = table.table("bones")
+    return {checked_name(bones, name, name): file_of(bones, name, folder) for name in bones}
 
 
 def checked_name(table: Table, key: str, name: str) -> str:
@@ -164,14 +128,8 @@ def checked_name(table: Table, key: str, name: str) -> str:
 
 def landmarks_of(table: Table, folder: Path) -> CaseLandmarks:
     """The files of [landmarks], and whether missing ones are to be found."""
-    table.only("skull", "skin", "frame", "automatic", "templates")
-    return CaseLandmarks(
-        file_or_none(table, "skull", folder),
-        file_or_none(table, "skin", folder),
-        stated_frame(table),
-        _automatic(table),
-        _template_folders(table, folder),
-    )
+    automatic, templates = _automatic(table), _template_folders(table, folder)
+    return table.part(CaseLandmarks, folder, automatic=automatic, templates=templates)
 
 
 def _automatic(table: Table) -> bool | str:
@@ -202,60 +160,31 @@ def plane_of(table: Table, key: str) -> Plane:
         return Plane(point, normal)
 
 
-def region_of(table: Table) -> Region:
+def region_of(table: Table, folder: Path) -> Region:
     """The part of the head that is meshed, from [region]."""
-    table.only("posterior_plane", "posterior_depth", "lower", "upper")
     if "posterior_plane" in table and "posterior_depth" in table:
         table.fail("posterior_depth", "is given together with posterior_plane: give one of them")
     plane = plane_of(table, "posterior_plane") if "posterior_plane" in table else None
-    with table.at("lower"):
-        return Region(
-            plane,
-            table.number("posterior_depth", "mm", -200.0, 200.0),
-            table.number("lower", "mm"),
-            table.number("upper", "mm"),
-        )
+    return table.part(Region, folder, at="lower", posterior_plane=plane)
 
 
 def mesh_of(table: Table, folder: Path) -> CaseMesh:
     """The edge lengths of [mesh], or its own mesh."""
-    table.only("edge_length", "refine", "cleft", "parting", "file")
-    given = _stated(
-        edge_length=table.number("edge_length", "mm", *EDGE_LENGTHS),
-        cleft=table.number("cleft", "mm", 0.0, MOST_CLEFT),
-        file=file_or_none(table, "file", folder),
-    )
+    parting = None
     if "parting" in table:
-        given["parting"] = file_of(table.table("parting").only("surface"), "surface", folder)
-    return CaseMesh(refine=table.flag("refine", default=CaseMesh().refine), **given)
+        parting = file_of(table.table("parting").only("surface"), "surface", folder)
+    return table.part(CaseMesh, folder, parting=parting)
 
 
 def lips_of(document: Table, folder: Path) -> CaseLips:
     """Whether and where lips are separated; a seam is a way to find it, or a surface."""
-    table = document.table("lips").only("contact", "seam", "depth", "height")
-    given = _stated(
-        contact=table.flag("contact", default=CaseLips().contact),
-        depth=table.number("depth", "mm", 0.0, MOST_LIP_DEPTH),
-        height=table.number("height", "mm", *LIP_HEIGHTS),
-    )
-    if "seam" in table:
-        given["seam"] = table.text("seam")
-        if given["seam"] not in LIP_SEAMS:
-            given["seam"] = file_of(table, "seam", folder)
-            if "parting" in document.table("mesh"):
-                table.fail("seam", "is a surface, as is parting in [mesh]: give one of them")
-    return CaseLips(**given)
-
-
-def band_of(document: Table, folder: Path) -> CaseBand:
-    """Whether a band is asked for, and by which calibration."""
-    table = document.table("band").only("calibration", "coverage", "group")
-    given = _stated(
-        calibration=file_or_none(table, "calibration", folder),
-        coverage=table.number("coverage", "", *COVERAGES),
-        group=table.text("group") if "group" in table else None,
-    )
-    return CaseBand(asked="band" in document, **given)
+    table = document.table("lips")
+    seam: Path | str | None = table.text("seam") if "seam" in table else None
+    if seam is not None and seam not in LIP_SEAMS:
+        seam = file_of(table, "seam", folder)
+        if "parting" in document.table("mesh"):
+            table.fail("seam", "is a surface, as is parting in [mesh]: give one of them")
+    return table.part(CaseLips, folder, seam=seam)
 
 
 def node_kinds_of(table: Table) -> dict[str, Any]:
@@ -289,25 +218,11 @@ def tissue_of(table: Table) -> TissueData | None:
 
 def muscles_of(table: Table, folder: Path) -> CaseMuscles:
     """A template's name is that of one in the package; a path leads to a folder."""
-    settings = ("template", "smoothing", "fit", "blur", "preset", "mixing", "samples", "seed")
-    table.only(*settings, *MODULI, "moduli")
-    default = CaseMuscles()
-    template: Path | str = table.text("template", str(default.template))
-    if template != default.template:
+    template: Path | str = table.text("template", str(CaseMuscles().template))
+    if template != CaseMuscles().template:
         template = file_of(table, "template", folder)
-    return CaseMuscles(
-        template,
-        preset=table.text("preset", default.preset, PRESETS),
-        mixing=table.text("mixing", default.mixing, MIXINGS),
-        samples=table.whole("samples", default.samples, *SAMPLES),
-        seed=table.whole("seed", default.seed, 0, 2**63 - 1),
-        moduli=_muscle_moduli(table),
-        fit=table.flag("fit", default=default.fit),
-        **_stated(
-            smoothing=table.number("smoothing", "", 0.0, 1e6),
-            blur=table.number("blur", "mm", 0.0, MOST_BLUR),
-        ),
-    )
+    moduli = _muscle_moduli(table)
+    return table.part(CaseMuscles, folder, MODULI, template=template, moduli=moduli)
 
 
 def _muscle_moduli(table: Table) -> TissueModuli:
@@ -329,27 +244,20 @@ def _muscle_moduli(table: Table) -> TissueModuli:
 
 def photo_of(table: Table, folder: Path) -> CasePhoto:
     """The 3D photo of [photo]."""
-    table.only("file", "landmarks", "aligned", "units")
-    aligned = table.flag("aligned", default=False)
-    if aligned == ("landmarks" in table):
+    photo = table.part(CasePhoto, folder)
+    if photo.aligned == (photo.landmarks is not None):
         table.fail(
-            "aligned" if aligned else None,
+            "aligned" if photo.aligned else None,
             "needs landmarks = a file with three skin landmarks or more on the photo, or aligned = "
             "true if it lies in the frame of the other data already; not both",
         )
-    return CasePhoto(
-        file_of(table, "file", folder),
-        file_or_none(table, "landmarks", folder),
-        aligned,
-        table.text("units", "mm", tuple(UNITS)),
-    )
+    return photo
 
 
 def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
     """The face and bones after the operation, from [postoperative]."""
-    flags = ("aligned", "verified")
-    table.only("skin", "image", "landmarks", "bones", "units", "frame", "series", *flags)
-    bones = table.table("bones")
+    table.only(*CasePostoperative.__dataclass_fields__)
+    bones = _bones(table, folder)
     if "skin" in table and "image" in table:
         table.fail("image", "is given together with skin: give one of them")
     if "image" in table and "bones" in table:
@@ -359,19 +267,9 @@ def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
         )
     if "series" in table and "image" not in table:
         table.fail("series", "chooses among the DICOM series of an image, but there is no image")
-    if "skin" not in table and "image" not in table and not list(bones):
+    if "skin" not in table and "image" not in table and not bones:
         table.fail(None, "needs skin, image or bones")
-    return CasePostoperative(
-        file_or_none(table, "skin", folder),
-        file_or_none(table, "image", folder),
-        file_or_none(table, "landmarks", folder),
-        {checked_name(bones, name, name): file_of(bones, name, folder) for name in bones},
-        table.flag("aligned", default=True),
-        table.text("units", "mm", tuple(UNITS)),
-        stated_frame(table),
-        _dicom_series(table),
-        table.flag("verified", default=False),
-    )
+    return table.part(CasePostoperative, folder, bones=bones, series=_dicom_series(table))
 
 
 def solver_of(table: Table) -> SolverOptions:

@@ -7,10 +7,10 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -185,6 +185,9 @@ def _merge(
             continue
         _forget(lines, place)
         into[key] = copy.deepcopy(dict(value)) if isinstance(value, Mapping) else value
+
+
+Part = TypeVar("Part")
 
 
 class Table:
@@ -408,6 +411,43 @@ class Table:
                 "a code for one; write the path with slashes, or in single quotes",
             )
         return path
+
+    def part(
+        self,
+        kind: type[Part],
+        folder: Path,
+        also: tuple[str, ...] = (),
+        at: str | None = None,
+        **given: Any,
+    ) -> Part:
+        """A value of a class whose fields are `stated` by the keys of the table, and no others.
+
+        also: Keys of the table that are read otherwise.
+        at: The key that an error of the value as a whole is about.
+        given: Fields that are read otherwise; None leaves the default.
+        """
+        hints = get_type_hints(kind)
+        found = {f.name: f for f in fields(kind) if f.metadata}  # type: ignore[arg-type]
+        self.only(*found, *given, *also)
+        values = {name: value for name, value in given.items() if value is not None}
+        for name, one in found.items():
+            if name in self or one.default is MISSING:
+                values[name] = self._stated(one, hints[name], folder)
+        with self.at(at):
+            return kind(**values)
+
+    def _stated(self, one: "Field[Any]", hint: Any, folder: Path) -> Any:
+        """The value of a field, by its type and what it may be."""
+        low, high = one.metadata["range"]
+        if hint in {Path, Path | None}:
+            return self.path(one.name, folder)
+        if hint is bool:
+            return self.flag(one.name, default=False)
+        if hint is int:
+            return self.whole(one.name, 0, low, high)
+        if hint in {float, float | None}:
+            return self.number(one.name, one.metadata["unit"], low, high)
+        return self.text(one.name, choices=one.metadata["choices"])
 
     def table(self, key: str) -> "Table":
         """A table below this one; empty where it is absent."""
