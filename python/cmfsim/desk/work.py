@@ -15,7 +15,7 @@ from cmfsim.pipeline.building.inputs import (
     read_case_landmarks,
     read_placed_sites,
 )
-from cmfsim.pipeline.building.stages import BuildOptions, OnMuscles
+from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions
 from cmfsim.pipeline.outputs.landmark_page import head_content
 from cmfsim.pipeline.outputs.results import write_chart_page, write_results
 from cmfsim.pipeline.planning import make_planning_page
@@ -139,8 +139,9 @@ def report(case_file: str) -> dict[str, Any]:
         before, planning = _held[case_file]
         built = before, planning.patient
 
-    def predicted(on_muscles: OnMuscles) -> Iterator[Prediction]:
-        options = BuildOptions(observer=told, on_muscles=on_muscles)
+    def predicted(early: BuildKeywords) -> Iterator[Prediction]:
+        early["observer"] = told
+        options = BuildOptions(**early)
         return predictions_of(case, (MODEL,), options, built=built)
 
     written = write_results(case.output, predicted, (MODEL,), stage=_stage)

@@ -32,6 +32,7 @@ from cmfsim.pictures.canvas import (
 )
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import plan_lines
+from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData
 
@@ -206,19 +207,22 @@ def picture_plan(
     >>> import cmfsim.pictures
     >>> cmfsim.pictures.picture_plan("plan.png", prediction)  # doctest: +SKIP
     """
-    plan_picture(prediction, size=size)(path)
+    motions = prediction.summary.get("plan", {})
+    plan_picture(prediction.patient, motions, size=size)(path)
 
 
-def plan_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> Picture:
-    """The picture that `picture_plan` writes, to be drawn later."""
-    after = prediction.bones
-    plan = {name: m["clinical"] for name, m in prediction.summary.get("plan", {}).items()}
+def plan_picture(
+    patient: PatientModel, motions: Mapping[str, Any], *, size: tuple[int, int] = SIZE
+) -> Picture:
+    """The picture that `picture_plan` writes, to be drawn later; `motions` as in a summary."""
+    after = patient.planned_bones
+    plan = {name: m["clinical"] for name, m in motions.items()}
     return partial(
         picture_motions,
-        before={s.name: s.surface for s in prediction.patient.segments},
+        before={s.name: s.surface for s in patient.segments},
         after={
-            s.name: SurfaceData(after[s.name][1], after[s.name][0].triangles)
-            for s in prediction.patient.segments
+            name: SurfaceData(vertices, surface.triangles)
+            for name, (surface, vertices) in after.items()
         },
         still=[
             name

@@ -212,6 +212,7 @@ def predictions_of(
     patient = patient or build_patient(case, models, options)
     if patient.muscles is not None:
         options.observer.muscles(patient.muscles, patient.segments)
+    options.observer.built(patient)
     known = set(patient.findings)
     # By tissue: models of the same tissue differ in their conditions alone.
     kept: dict[str, MassTensors] = {}

@@ -136,7 +136,7 @@ def solved_patient(
         **patient.summary,
         "model": model,
         "case_key": _case_key(patient, scene),
-        "plan": {name: _motion(patient, scene, name) for name in scene.plan},
+        "plan": planned_motions(patient, scene),
         "plan_digits": plan_digits({n: _entries(motion) for n, motion in scene.plan.items()}),
         "skin": {
             "mean": float(moved.mean()),
@@ -187,6 +187,11 @@ def _entries(motion: NDArray[Any] | MovedSurface) -> NDArray[np.float64]:
     if isinstance(motion, MovedSurface):
         return np.asarray(motion.moved_vertices - motion.surface.vertices, dtype=np.float64)
     return np.asarray(motion, dtype=np.float64)
+
+
+def planned_motions(patient: PatientModel, scene: Scene) -> dict[str, dict[str, Any]]:
+    """The motions of a scene by segment, in a planner's numbers and in a surgeon's."""
+    return {name: _motion(patient, scene, name) for name in scene.plan}
 
 
 def _motion(patient: PatientModel, scene: Scene, name: str) -> dict[str, Any]:

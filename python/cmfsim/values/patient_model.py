@@ -273,6 +273,25 @@ class PatientModel(Frozen):
         scene = replace(self.scene, plan=plan_given, fixed=fixed, segments=segments)
         return replace(self, scene=scene, findings=findings, summary=summary)
 
+    @property
+    def planned_bones(self) -> dict[str, tuple[SurfaceData, Floats]]:
+        """Each bone segment with its vertices after the operation, (v, 3) mm, by name.
+
+        A segment whose motion is known vertex by vertex has the surface on which it is known; a
+        segment of which only the joined nodes have motions stays where it was.
+        """
+        found = {}
+        for segment in self.segments:
+            surface, motion = segment.surface, self.scene.plan.get(segment.name)
+            vertices = surface.vertices
+            if isinstance(motion, MovedSurface):
+                surface = motion.surface
+                vertices = motion.moved_vertices
+            elif motion is not None and motion.shape == (4, 4) and (motion != np.eye(4)).any():
+                vertices = vertices @ motion[:3, :3].T + motion[:3, 3]
+            found[segment.name] = (surface, vertices)
+        return found
+
     def segment_vertices(self, name: str) -> Floats:
         """The vertices that state a segment's motion, (v, 3) mm: of a given bone that is not cut.
 

@@ -175,22 +175,8 @@ class Prediction(Frozen):
 
     @property
     def bones(self) -> dict[str, tuple[SurfaceData, Floats]]:
-        """Each bone segment with its vertices after the operation, (v, 3) mm, by name.
-
-        A segment whose motion is known vertex by vertex has the surface on which it is known; a
-        segment of which only the joined nodes have motions stays where it was.
-        """
-        found = {}
-        for segment in self.patient.segments:
-            surface, motion = segment.surface, self.scene.plan.get(segment.name)
-            vertices = surface.vertices
-            if isinstance(motion, MovedSurface):
-                surface = motion.surface
-                vertices = motion.moved_vertices
-            elif motion is not None and motion.shape == (4, 4) and (motion != np.eye(4)).any():
-                vertices = vertices @ motion[:3, :3].T + motion[:3, 3]
-            found[segment.name] = (surface, vertices)
-        return found
+        """The bone segments after the operation: `planned_bones` of the patient."""
+        return self.patient.planned_bones
 
     @property
     def parts(self) -> dict[str, dict[str, tuple[SurfaceData, Floats]]]:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     # A case without muscles loads nothing of them.
     from cmfsim.values.anatomy import BoneSegment
     from cmfsim.values.musculature import Musculature
+    from cmfsim.values.patient_model import PatientModel
 Progress = Callable[[str], None]
 # What public functions take: True shows a bar.
 ProgressOrBar = Progress | bool | None
@@ -67,6 +68,9 @@ class Observer:
 
     def muscles(self, muscles: "Musculature", segments: "Sequence[BoneSegment]") -> None:
         """Muscles and segments of bone are known: before a model is solved, perhaps repeatedly."""
+
+    def built(self, patient: "PatientModel") -> None:
+        """The patient is built: models are solved next."""
 
     def failed(self, model: str, error: CmfsimError) -> None:
         """A model cannot be solved: the other models continue unless this raises the error."""

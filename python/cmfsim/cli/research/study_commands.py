@@ -77,9 +77,7 @@ def predict(options: argparse.Namespace) -> int:
         )
         written = write_results(
             case.output,
-            lambda on_muscles: _timed(
-                _at_least_one(predicted(on_muscles=on_muscles), notices.failures), before
-            ),
+            lambda early: _timed(_at_least_one(predicted(**early), notices.failures), before),
             models,
             stage=progress.stage,
             with_report=not options.no_report,

@@ -15,9 +15,7 @@ from cmfsim.values.progress import Observer, ProgressOrBar, shown_progress
 if TYPE_CHECKING:
     # A case without muscles loads nothing of them.
     from cmfsim.values.musculature import Musculature
-
-# What is called with the muscles of a patient and the segments of the bones.
-OnMuscles = Callable[["Musculature", Sequence[BoneSegment]], None]
+    from cmfsim.values.patient_model import PatientModel
 
 
 class _Callbacks(Observer):
@@ -38,7 +36,8 @@ class BuildKeywords(TypedDict, total=False):
     after: Postoperative | None
     progress: ProgressOrBar
     on_findings: OnFindings | None
-    on_muscles: OnMuscles | None
+    on_muscles: Callable[["Musculature", Sequence[BoneSegment]], None] | None
+    on_built: Callable[["PatientModel"], None] | None
     failed: dict[str, CmfsimError] | None
 
 
@@ -64,8 +63,8 @@ class BuildOptions:
     progress : callable or bool, optional
         Called in place of the method `stage` of the observer; True shows a bar (tqdm), where a
         function is given it.
-    on_findings, on_muscles : callable, optional
-        Called in place of the methods `found` and `muscles` of the observer.
+    on_findings, on_muscles, on_built : callable, optional
+        Called in place of the methods `found`, `muscles` and `built` of the observer.
     failed : dict, optional
         If given, a model that cannot be solved (for example, because contact does not converge) is
         recorded here with its error, and the others continue.
@@ -78,14 +77,16 @@ class BuildOptions:
     after: Postoperative | None = None
     progress: InitVar[ProgressOrBar] = None
     on_findings: InitVar[OnFindings | None] = None
-    on_muscles: InitVar[OnMuscles | None] = None
+    on_muscles: InitVar[Callable[["Musculature", Sequence[BoneSegment]], None] | None] = None
+    on_built: InitVar[Callable[["PatientModel"], None] | None] = None
     failed: InitVar[dict[str, CmfsimError] | None] = None
 
     def __post_init__(
         self,
         progress: ProgressOrBar,
         on_findings: OnFindings | None,
-        on_muscles: OnMuscles | None,
+        on_muscles: Callable[["Musculature", Sequence[BoneSegment]], None] | None,
+        on_built: Callable[["PatientModel"], None] | None,
         failed: dict[str, CmfsimError] | None,
     ) -> None:
         record = None if failed is None else failed.__setitem__
@@ -94,6 +95,7 @@ class BuildOptions:
             stage=progress if callable(progress) else None,
             found=on_findings,
             muscles=on_muscles,
+            built=on_built,
             failed=record,
         )
         object.__setattr__(self, "observer", observer)

@@ -55,7 +55,7 @@ from cmfsim.pictures import (
 from cmfsim.pictures.canvas import Painter
 from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.faces import animate_face
-from cmfsim.pipeline.building.stages import OnMuscles
+from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.face_regions import face_motion
 from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, page_state
@@ -64,16 +64,18 @@ from cmfsim.planning.face_view import face_view
 from cmfsim.planning.occlusion import ContactMap, planned_contacts
 from cmfsim.report import Document, Figure, case_document, findings_of, render_page
 from cmfsim.report.chart_page import A4, draw_chart_page
+from cmfsim.solving.models import planned_motions
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.musculature import Musculature
+from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
 from cmfsim.values.surface_data import joined_surface
 
 _log = logging.getLogger(__name__)
 
-# Predictions, or what gives them and calls a function with the muscles before it solves any.
-Predictions = Iterable[Prediction] | Callable[[OnMuscles], Iterable[Prediction]]
+# Predictions, or what gives them and calls functions with what is known before it solves any.
+Predictions = Iterable[Prediction] | Callable[[BuildKeywords], Iterable[Prediction]]
 
 # Pictures of a case's report, in the folder of its prediction and in its own.
 PREDICTION_PICTURES = ("prediction", "band", "plan", "contacts", "muscles")
@@ -153,36 +155,49 @@ class _Drawing:
     ) -> None:
         self._painter, self._fresh = painter, fresh
         self._models, self._wanted = models, wanted
-        self._early: dict[str, Future[None]] = {}
+        self._begun: dict[tuple[str, str], Future[None]] = {}
+        self._contacts: dict[PatientModel, ContactMap | dict[str, Any]] = {}
 
     def place(self, model: str) -> str:
         """The folder of a model's prediction."""
         return "" if len(self._models) == 1 else model
 
-    def begin_early(self, muscles: Musculature, segments: Sequence[BoneSegment]) -> None:
-        """Begins the muscles of the first model that shows them, once: they need no solution."""
-        model = next((m for m in self._models if m.startswith("M") and self._wanted(m)), None)
-        if model is not None and model not in self._early:
-            folder = self._fresh / self.place(model)
-            folder.mkdir(exist_ok=True)
-            picture = _muscles_picture(muscles, segments)
-            self._early[model] = self._painter.begin(picture, folder / MUSCLES)
+    def contacts(self, patient: PatientModel) -> ContactMap | dict[str, Any]:
+        """The contacts of the planned tooth rows, or why they are not known."""
+        if patient not in self._contacts:
+            try:
+                self._contacts[patient] = planned_contacts(patient)
+            except CmfsimError as error:
+                self._contacts[patient] = {"absent": str(error)}
+        return self._contacts[patient]
 
-    def begin(
-        self, prediction: Prediction, contacts: ContactMap | None
-    ) -> dict[str, "Future[None]"]:
-        """The pictures of a prediction by name, with the one that was begun early."""
-        model = prediction.model
+    def begin_muscles(self, muscles: Musculature, segments: Sequence[BoneSegment]) -> None:
+        """Begins the muscles of the first model that shows them: they need no solution."""
+        model = next((m for m in self._models if m.startswith("M") and self._wanted(m)), None)
+        if model is not None:
+            self._start(model, MUSCLES, _muscles_picture(muscles, segments))
+
+    def begin_planned(self, patient: PatientModel) -> None:
+        """Begins what the first model shows without its solution, while it is solved."""
+        model = next(filter(self._wanted, self._models), None)
+        if model is not None:
+            for name, picture in _pictures_of(patient, self.contacts(patient)):
+                self._start(model, name, picture)
+
+    def begin(self, prediction: Prediction) -> dict[str, "Future[None]"]:
+        """The pictures of a prediction by name, with those that were begun early."""
+        model, patient = prediction.model, prediction.patient
         if not self._wanted(model):
             return {}
-        begun = {}
-        for name, picture in _pictures_of(prediction, contacts):
-            if name == MUSCLES and model in self._early:
-                begun[name] = self._early[model]
-            else:
-                path = self._fresh / self.place(model) / name
-                begun[name] = self._painter.begin(picture, path)
-        return begun
+        pictures = _pictures_of(patient, self.contacts(patient), prediction)
+        return {name: self._start(model, name, picture) for name, picture in pictures}
+
+    def _start(self, model: str, name: str, picture: Picture) -> "Future[None]":
+        if (model, name) not in self._begun:
+            folder = self._fresh / self.place(model)
+            folder.mkdir(exist_ok=True)
+            self._begun[model, name] = self._painter.begin(picture, folder / name)
+        return self._begun[model, name]
 
 
 def write_results(
@@ -200,7 +215,7 @@ def write_results(
 
     output: The case's output folder: predictions of several models lie in a folder for each.
     predictions: or callable. Written one by one, as each is solved. A callable gives them; it takes
-        a function to be called with the muscles before any is solved, which begins their picture.
+        the functions to be called with what is known before any is solved, which begin pictures.
     models: That were asked for, whether or not all could be predicted.
     stage: Called with the name of each stage as it begins.
     evaluation: Gives the comparison, once the predictions are there.
@@ -214,7 +229,10 @@ def write_results(
 
     def fill(fresh: Path) -> list[str]:
         drawing = _Drawing(painter, fresh, models, pictures)
-        given = predictions(drawing.begin_early) if callable(predictions) else predictions
+        early: BuildKeywords = {
+            "on_muscles": drawing.begin_muscles, "on_built": drawing.begin_planned
+        }  # fmt: skip
+        given = predictions(early) if callable(predictions) else predictions
         for prediction in given:
             stage(f"writing {prediction.model}")
             written.predictions.append(
@@ -267,26 +285,18 @@ def _fill_model(
     """The files of one prediction in its folder, with the pictures that are wanted."""
     summary = prediction.summary
     skin = {**summary["skin"], **face_motion(prediction)}
-    clinical, contacts = clinical_figures(prediction), _contacts(prediction)
+    clinical, contacts = clinical_figures(prediction), drawing.contacts(prediction.patient)
     clinical["contacts"] = contacts if isinstance(contacts, dict) else contacts.as_dict()
     figures = {"skin": skin, "clinical": clinical}
     prediction = replace(prediction, summary={**summary, **figures})
     place = drawing.place(prediction.model)
     (fresh / place).mkdir(exist_ok=True)
-    begun = drawing.begin(prediction, None if isinstance(contacts, dict) else contacts)
+    begun = drawing.begin(prediction)
     more = partial(_more_files, prediction, begun, clock, slicer=slicer)
     clock.begin(place, prediction.summary["timings"])
     with clock.timed("writing the files"):
         names = fill_prediction(fresh / place, prediction, more)
     return WrittenPrediction(place, names, prediction.summary)
-
-
-def _contacts(prediction: Prediction) -> ContactMap | dict[str, Any]:
-    """The contacts of the planned tooth rows, or why they are not known."""
-    try:
-        return planned_contacts(prediction)
-    except CmfsimError as error:
-        return {"absent": str(error)}
 
 
 def _older(output: Path, places: Iterable[str]) -> list[str]:
@@ -355,16 +365,20 @@ def _drawn(begun: Mapping[str, "Future[None]"]) -> list[str]:
 
 
 def _pictures_of(
-    prediction: Prediction, contacts: ContactMap | None
+    patient: PatientModel,
+    contacts: ContactMap | dict[str, Any],
+    prediction: Prediction | None = None,
 ) -> Iterator[tuple[str, Picture]]:
-    if prediction.muscles is not None:
-        yield MUSCLES, _muscles_picture(prediction.muscles, prediction.patient.segments)
-    yield "plan.png", plan_picture(prediction)
-    yield "prediction.png", prediction_picture(prediction)
-    if contacts is not None:
+    """The pictures of a prediction; before there is one, those of its plan."""
+    if prediction is not None and prediction.muscles is not None:
+        yield MUSCLES, _muscles_picture(prediction.muscles, patient.segments)
+    yield "plan.png", plan_picture(patient, planned_motions(patient, patient.scene))
+    if prediction is not None:
+        yield "prediction.png", prediction_picture(prediction)
+    if not isinstance(contacts, dict):
         upper = contacts.upper.surface, contacts.upper_gaps
         yield "contacts.png", contacts_picture(upper, (contacts.lower.surface, contacts.lower_gaps))
-    if prediction.band is not None:
+    if prediction is not None and prediction.band is not None:
         yield "band.png", band_picture(prediction)
 
 

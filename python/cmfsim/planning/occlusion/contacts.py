@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.planning.occlusion.rows import ToothRow, patient_rows, rigid_of
 from cmfsim.surfaces.topology import connected_labels
 from cmfsim.values.checks import Floats, as_rows
-from cmfsim.values.prediction import Prediction
+from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.surface_data import SurfaceData
 
 # Crowns nearer than this touch, mm: bites planned on scans are accurate to some tenths.
@@ -103,15 +103,15 @@ def contact_map(upper: ToothRow, lower: ToothRow) -> ContactMap:
     return ContactMap(upper, lower, _gaps(upper, lower), _gaps(lower, upper))
 
 
-def planned_contacts(prediction: Prediction) -> ContactMap:
-    """The contacts of the tooth rows of a prediction, as planned.
+def planned_contacts(patient: PatientModel) -> ContactMap:
+    """The contacts of the tooth rows of a patient, as planned.
 
     Raises
     ------
     CaseError
         (also `ValueError`) The case has no tooth rows, or doubtful ones.
     """
-    plan, rows = prediction.scene.plan, patient_rows(prediction.patient)
+    plan, rows = patient.scene.plan, patient_rows(patient)
     return contact_map(*(row.moved(rigid_of(plan.get(row.segment))) for row in rows))
 
 
