@@ -3,9 +3,11 @@
 import logging
 import os
 import threading
+from concurrent.futures import Future
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import cast
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +47,8 @@ class _OneAtATime:
 # their meshes without an error. Version 0.2.0 holds Python's lock while it works, but does not
 # promise to.
 _DECIMATING = _OneAtATime()
+# The detailed surfaces of levels that are in use.
+_MADE: WeakKeyDictionary[ImageData, Future[SurfaceData]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -125,11 +129,22 @@ def surface_of_level(
 
 
 def detailed_surface(name: str, level: ImageData) -> SurfaceData | None:
-    """The surface of a level as `surface_of_level` has it; None where scikit-image is missing."""
+    """The surface of a level as `surface_of_level` has it; None where scikit-image is missing.
+
+    It is made once for each level: who asks while it is being made waits for it.
+    """
     if find_spec("skimage") is None:
         _log.info("no detailed %s: scikit-image is not installed", name)
         return None
-    return surface_of_level(name, level)
+    mine: Future[SurfaceData] = Future()
+    made = _MADE.setdefault(level, mine)
+    if made is mine:
+        try:
+            mine.set_result(surface_of_level(name, level))
+        except BaseException as error:
+            mine.set_exception(error)
+            raise
+    return made.result()
 
 
 def contact_surface(segment: BoneSegment, *, relief: float = CONTACT_RELIEF) -> SurfaceData:
