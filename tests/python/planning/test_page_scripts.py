@@ -113,7 +113,7 @@ def test_occlusion_follows_the_moves_of_the_page_as_in_python(has_teeth, tmp_pat
     found = answers(
         tmp_path,
         'import { measure } from "./measures.js";'
-        f"const measures = {json.dumps(occlusal_measures(sites, segments))};"
+        f"const measures = {json.dumps(occlusal_measures(sites, segments, {}))};"
         f"console.log(JSON.stringify({json.dumps([*rows, None])}"
         ".map((m) => measure(measures, {}, m))));",
     )

@@ -17,13 +17,14 @@ from cmfsim.planning.face_measures.cephalometry import (
 )
 from cmfsim.planning.face_measures.definitions import MEASURES, Measure, measure_sites
 from cmfsim.planning.face_measures.occlusion import (
+    FOUND_MOLARS,
     OCCLUSAL_MEASURES,
     missing_for_occlusion,
     occlusion,
 )
-from cmfsim.planning.occlusion import bite_sites, patient_rows
+from cmfsim.planning.occlusion import bite_sites, first_molars, patient_rows
 from cmfsim.values.anatomy import BoneSegment
-from cmfsim.values.landmark_sites import profile_sites
+from cmfsim.values.landmark_sites import profile_sites, tooth_of
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 
@@ -69,7 +70,7 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
             OCCLUSAL_MEASURES,
             occlusion(before),
             occlusion(after, before),
-            missing_for_occlusion(before),
+            missing_for_occlusion(before, unfound_molars(patient)),
         ),
         "cephalometry": _rows(
             CEPHALOMETRIC_MEASURES,
@@ -92,7 +93,7 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
 
 
 def bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
-    """The sites of the skull on their segments, and the cusps that the bone shows."""
+    """The sites of the skull on their segments, and the cusps and molars that the bone shows."""
     skull = patient.landmarks.get("skull", {}) if patient.segments else {}
     sites = {}
     for name, place in skull.items():
@@ -103,11 +104,36 @@ def bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
 
         sites[name] = face.BoneSite(place, min(patient.segments, key=away).name)
     with suppress(CaseInputError):
-        given = profile_sites(skull)
-        for name, (place, segment) in bite_sites(*patient_rows(patient)).items():
+        given, rows = profile_sites(skull), patient_rows(patient)
+        for name, (place, segment) in bite_sites(*rows).items():
             if name not in given:
                 sites[name] = face.BoneSite(place, segment)
+        teeth = {tooth_of(name) for name in skull}
+        for name, tooth in FOUND_MOLARS.items():
+            row = rows["UL".index(tooth[0][0])]
+            found = first_molars(row)[tooth[1]]
+            if tooth not in teeth and not isinstance(found, str):
+                sites[name] = face.BoneSite(found, row.segment)
     return sites
+
+
+def unfound_molars(patient: PatientModel) -> dict[str, str]:
+    """Why first molars of a side were not found, by the key of the molar relation."""
+    if not patient.segments:
+        return {}
+    try:
+        rows = patient_rows(patient)
+        reasons = [(row.arch.jaw, first_molars(row)) for row in rows]
+    except CaseInputError as error:
+        return dict.fromkeys(("molar_left", "molar_right"), str(error))
+    return {
+        f"molar_{side}": "; ".join(
+            f"{jaw}: {found[side[0].upper()]}"
+            for jaw, found in reasons
+            if isinstance(found[side[0].upper()], str)
+        )
+        for side in ("left", "right")
+    }
 
 
 def _rows(

@@ -27,6 +27,13 @@ MIDLINE = ("supraglabella", "glabella", "nasion", "rhinion")
 # cusps and between the middles of the crowns: the cusp of the upper one meets the groove behind
 # that of the lower one.
 CLASS_I = {"MB": -2.0, "O": -1.0}
+# First molars that were found on the crowns: they do not locate the occlusal plane, which one side
+# alone would tilt.
+FOUND_MOLARS = {
+    f"{tooth}-{side}": (tooth, side[0].upper(), "O")
+    for tooth in ("U6", "L6")
+    for side in ("left", "right")
+}
 OCCLUSAL_MEASURES = (
     Measure("overjet", "Overjet", "mm", "along", ("OP-back", "OP-front", "U1", "L1"),
             "along the occlusal plane, from L1 to U1; positive in front"),
@@ -40,7 +47,8 @@ OCCLUSAL_MEASURES = (
             "line between the upper molars in the view from the front; positive: left side up",
             "0"),
     *(Measure(f"molar_{side}", f"Molar relation, {side}", "mm", "molar", ("U6", "L6"),
-              "upper first molar in front of where it lies in class I, along the occlusal plane",
+              "upper first molar in front of where it lies in class I, along the occlusal plane; "
+              "± 1.5 mm where the molars were found on the crowns",
               "0 ± 2: class I; above: II, below: III", "Angle 1899")
       for side in ("left", "right")),
 )  # fmt: skip
@@ -132,7 +140,8 @@ def occlusal_terms(landmarks: Collection[str]) -> dict[str, OcclusalTerm]:
     unit: dict[str, Floats] = dict(zip(landmarks, np.eye(len(landmarks)), strict=True))
     flat = profile_sites(unit)
     flat |= occlusal_plane(flat)
-    teeth = {known: unit[name] for name in unit if (known := tooth_of(name)) is not None}
+    teeth = {FOUND_MOLARS[name]: unit[name] for name in unit if name in FOUND_MOLARS}
+    teeth |= {known: unit[name] for name in unit if (known := tooth_of(name)) is not None}
     found = {}
     for measure in OCCLUSAL_MEASURES[:2]:
         if all(name in flat for name in measure.sites):
@@ -160,15 +169,23 @@ def occlusal_terms(landmarks: Collection[str]) -> dict[str, OcclusalTerm]:
     return found
 
 
-def missing_for_occlusion(landmarks: Mapping[str, ArrayLike]) -> dict[str, str]:
-    """Why each of `OCCLUSAL_MEASURES` has no value, by its key; empty if it has one."""
+def missing_for_occlusion(
+    landmarks: Mapping[str, ArrayLike], unfound: Mapping[str, str]
+) -> dict[str, str]:
+    """Why each of `OCCLUSAL_MEASURES` has no value, by its key; empty if it has one.
+
+    unfound: Why molars were not found, by the key of their relation.
+    """
     edges = "edges of upper and lower incisors, or the occlusal plane: not given or found"
     middle = "central incisors of both sides, the bone between them, or sites of the cranium"
     reasons = {
         **dict.fromkeys(("overjet", "overbite"), edges),
         **dict.fromkeys(("upper_midline", "lower_midline"), f"{middle}: not given or found"),
         "cant": "upper molars of both sides: not given or found",
-        **dict.fromkeys(("molar_left", "molar_right"), "U6 and L6 of the side: not given"),
+        **{
+            key: f"U6 and L6 of the side: not given, nor found ({unfound.get(key) or 'no bones'})"
+            for key in ("molar_left", "molar_right")
+        },
     }
     values = occlusion(landmarks)
     return {key: "" if values[key] is not None else why for key, why in reasons.items()}

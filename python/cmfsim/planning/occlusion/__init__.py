@@ -1,6 +1,7 @@
 """Occlusion: how the tooth rows meet before and after the operation, and splints between them."""
 
 from cmfsim.planning.occlusion.contacts import ContactMap, contact_map, planned_contacts
+from cmfsim.planning.occlusion.molars import first_molars
 from cmfsim.planning.occlusion.rows import ToothRow, bite_sites, patient_rows, rigid_of, tooth_rows
 from cmfsim.planning.occlusion.splint import THICKNESS, Splint, splint_between
 
@@ -11,6 +12,7 @@ __all__ = [
     "ToothRow",
     "bite_sites",
     "contact_map",
+    "first_molars",
     "patient_rows",
     "planned_contacts",
     "rigid_of",

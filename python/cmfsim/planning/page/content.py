@@ -17,7 +17,7 @@ from cmfsim.planning.face_measures import (
     face_sites,
     midline_profile,
 )
-from cmfsim.planning.face_measures.clinical_figures import bone_sites
+from cmfsim.planning.face_measures.clinical_figures import bone_sites, unfound_molars
 from cmfsim.planning.face_measures.occlusion import (
     bite_frame,
     missing_for_occlusion,
@@ -339,17 +339,20 @@ def _measured(planning: PlanningModel, sites: FaceSites) -> dict[str, Any]:
             }
             for measure in MEASURES
         ]
-        + occlusal_measures(bone_sites(planning.patient), planning.segments),
+        + occlusal_measures(
+            bone_sites(planning.patient), planning.segments, unfound_molars(planning.patient)
+        ),
         "measure_notes": notes,
     }
 
 
 def occlusal_measures(
-    sites: Mapping[str, BoneSite], segments: Sequence[str]
+    sites: Mapping[str, BoneSite], segments: Sequence[str], unfound: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """The measures of occlusion, by points that move with segments, each with its share."""
     before = {name: site.place for name, site in sites.items()}
-    frame, terms, absent = bite_frame(before), occlusal_terms(before), missing_for_occlusion(before)
+    frame, terms = bite_frame(before), occlusal_terms(before)
+    absent = missing_for_occlusion(before, unfound)
     numbers = {name: number for number, name in enumerate(segments)}
     bearers = np.array([numbers.get(site.segment, -1) for site in sites.values()])
     places = np.array([*before.values()]).reshape(-1, 3)
