@@ -3,4 +3,4 @@
 from cmfsim.planning.page.content import PageContent as PageContent
 from cmfsim.planning.page.content import page_content as page_content
 from cmfsim.planning.page.page import page_text as page_text
-from cmfsim.planning.page.tooth_rows import tooth_rows as tooth_rows
+from cmfsim.planning.page.row_overlap import row_overlap as row_overlap

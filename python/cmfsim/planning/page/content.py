@@ -23,8 +23,8 @@ from cmfsim.planning.face_measures.occlusion import (
     missing_for_occlusion,
     occlusal_terms,
 )
+from cmfsim.planning.page.row_overlap import row_overlap
 from cmfsim.planning.page.segment_points import segment_points
-from cmfsim.planning.page.tooth_rows import tooth_rows
 from cmfsim.planning.replanning import (
     ExpectedError,
     Motions,
@@ -403,7 +403,7 @@ def _profile(
 
 def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
     try:
-        rows = tooth_rows(planning.patient)
+        rows = row_overlap(planning.patient)
     except CaseInputError as error:
         return {"occlusion": None, "occlusion_absent": str(error)}
     arrays["occlusion_points"] = _singles(rows.points)

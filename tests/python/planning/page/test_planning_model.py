@@ -11,6 +11,7 @@ import cmfsim
 import cmfsim.planning.page.content
 from cmfsim.cli import main
 from cmfsim.cli.patients.plan_command import _correction_text
+from cmfsim.planning.occlusion import patient_rows
 from cmfsim.planning.replanning import plan_distance
 from cmfsim.planning.replanning.corrected import chosen_plans
 from planning_head import other_plan
@@ -183,9 +184,8 @@ def test_scenes_without_a_linear_rigid_answer_are_refused(planning):
 
 
 def test_tooth_rows_pass_through_each_other_when_the_jaw_closes(planning):
-    rows = cmfsim.planning.page.tooth_rows(planning.patient)
-    maxilla = next(s for s in planning.patient.segments if s.name == "maxilla")
-    surface = cmfsim.Surface(maxilla.surface.vertices, maxilla.surface.triangles)
+    rows = cmfsim.planning.page.row_overlap(planning.patient)
+    surface = patient_rows(planning.patient)[0].surface.searched
     found = []
     for up in (0.0, 4.0, 7.0):
         shift = cmfsim.rigid_motion((0.0, 0.0, up))

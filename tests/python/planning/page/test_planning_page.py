@@ -272,7 +272,7 @@ def test_the_error_is_stated_and_warned_of_beyond_what_was_tried(opened, errors,
 
 
 def test_teeth_that_pass_through_each_other_are_warned_of(opened, planning):
-    rows = cmfsim.planning.page.tooth_rows(planning.patient)
+    rows = cmfsim.planning.page.row_overlap(planning.patient)
     state = opened.locator("#teeth-state")
     assert "do not overlap" in state.inner_text()
     type_number(opened, "up", 8)
