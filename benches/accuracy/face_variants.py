@@ -81,6 +81,8 @@ class Variant:
         The image of the clean one.
     to_variant : callable
         The (4, 4) motion and scale from the clean head to that of the variant, of the clean image.
+    places : callable
+        Where points of the clean face are in the variant before that motion, (n, 3).
     tolerance : float, mm
     causes : frozenset of str
         Codes of findings about what was changed.
@@ -90,6 +92,7 @@ class Variant:
 
     make: Callable[[ImageData], ImageData]
     to_variant: Callable[[ImageData], np.ndarray] = field(default=lambda _: np.eye(4))
+    places: Callable[[np.ndarray], np.ndarray] = field(default=lambda points: points)
     tolerance: float = TOLERANCE
     causes: frozenset[str] = frozenset()
     cut: Mapping[str, float] = field(default_factory=dict)
@@ -110,6 +113,15 @@ def _turned(*angles: float) -> Variant:
     return Variant(
         lambda image: variants.turned(image, (x, y, z))[0],
         lambda image: variants.turned(image, (x, y, z))[1],
+        causes=JAWS,
+    )
+
+
+def _open(degrees: float) -> Variant:
+    return Variant(
+        lambda image: variants.with_mouth_open(image, _landmarks(), degrees),
+        places=lambda points: variants.opened(points, _landmarks(), degrees),
+        tolerance=OPEN_TOLERANCE,
         causes=JAWS,
     )
 
@@ -150,9 +162,7 @@ def _offset(image: ImageData) -> ImageData:
 
 
 VARIANTS: Mapping[str, Variant] = {
-    "mouth open by 15°": Variant(
-        lambda i: variants.with_mouth_open(i, _landmarks()), tolerance=OPEN_TOLERANCE, causes=JAWS
-    ),
+    **{f"mouth open by {degrees:g}°": _open(degrees) for degrees in (5.0, 10.0, 15.0, 25.0)},
     "nodding forwards by 25°": _turned(25.0, 0.0, 0.0),
     "nodding backwards by 25°": _turned(-25.0, 0.0, 0.0),
     "round field of view, 16 cm": Variant(
@@ -313,7 +323,7 @@ def main() -> None:
     ]
     for name in options.only or VARIANTS:
         variant = VARIANTS[name]
-        to_variant = getattr(variant, "to_variant", lambda _: np.eye(4))(image)
+        to_variant = variant.to_variant(image)
         motion = to_variant[:3, :3] @ FORWARDS
         # A smaller head has smaller tets, or its mesh would be compared as well.
         edge = options.edge * float(np.cbrt(np.linalg.det(to_variant[:3, :3])))
@@ -325,7 +335,8 @@ def main() -> None:
 
         row = _kept(options.cache, name, options.edge, make)
         if not row["error"]:
-            row |= compared(row, clean, to_variant)
+            there = {**clean, "points": variant.places(clean["points"])}
+            row |= compared(row, there, to_variant)
         lines.append(_line(name, row, usual))
         print(lines[-1], file=sys.stderr, flush=True)
     publish(options.markdown, NAME, "\n".join(lines))

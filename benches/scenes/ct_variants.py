@@ -1,6 +1,7 @@
 """Variants of a CT: effects of other scanners, patients and exports on an image."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -227,53 +228,82 @@ def turned(image: ImageData, angles: tuple[float, float, float]) -> tuple[ImageD
     return ImageData(seen, step, low), matrix
 
 
-def with_mouth_open(
-    image: ImageData, landmarks: Mapping[str, np.ndarray], degrees: float = 15.0
-) -> ImageData:
-    """The lower jaw turned about its joints, with the skin over it; the mouth is filled with air.
+@dataclass(frozen=True, eq=False)
+class _Opening:
+    """A lower jaw turned about its joints: the axis, the turn, and the occlusal plane."""
 
-    What is below the occlusal plane in front of the spine turns; between it and the rest, tissue is
-    stretched over a few millimetres.
-    """
-    place = landmarks
-    step, origin = np.asarray(image.spacing), np.asarray(image.lowest)
+    joint: np.ndarray
+    turn: np.ndarray
+    bite: np.ndarray
+    up: np.ndarray
+
+    def front(self, places: np.ndarray) -> np.ndarray:
+        """1 in front of the spine, 0 behind, smoothly."""
+        behind = (places[..., 1:2] - self.joint[1] - 4.0) / 4.0
+        return np.asarray(1.0 / (1.0 + np.exp(behind)))
+
+
+def _opening(place: Mapping[str, np.ndarray], degrees: float) -> _Opening:
     joint = 0.5 * (place["supraglenoid_L"] + place["supraglenoid_R"]) + [0.0, 3.0, -12.0]
+    turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    return _Opening(joint, turn, *_occlusal_plane(place))
+
+
+def _occlusal_plane(place: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     bite = 0.5 * (place["supradentale"] + place["infradentale"])
     left, right = place["occlusal_line_L"], place["occlusal_line_R"]
     up = np.cross(left - right, bite - 0.5 * (left + right))
-    up *= np.sign(up[2]) / np.linalg.norm(up)
-    turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+    return bite, up * np.sign(up[2]) / np.linalg.norm(up)
+
+
+def opened(
+    points: np.ndarray, landmarks: Mapping[str, np.ndarray], degrees: float = 15.0
+) -> np.ndarray:
+    """Where `with_mouth_open` moves points of the face, mm."""
+    by = _opening(landmarks, degrees)
+    turned_points = (points - by.joint) @ by.turn.T + by.joint
+    low = ((points - by.bite) @ by.up < 0.0)[:, None]
+    share = by.front(turned_points) * low
+    return np.asarray(points + share * (turned_points - points))
+
+
+def with_mouth_open(
+    image: ImageData, landmarks: Mapping[str, np.ndarray], degrees: float = 15.0
+) -> ImageData:
+    """The lower jaw turned about its joints, with the skin over it; air between the lips.
+
+    What is below the occlusal plane in front of the spine turns; between it and the rest, tissue is
+    stretched over a few millimetres beside the mouth.
+    """
+    by = _opening(landmarks, degrees)
+    step, origin = np.asarray(image.spacing), np.asarray(image.lowest)
+    middle, back = float(landmarks["nasion"][0]), float(landmarks["occlusal_line_L"][1])
     points = origin + step * np.moveaxis(np.indices(image.values.shape), 0, -1)
-    middle, back = float(place["nasion"][0]), float(left[1])
     # Where turned tissue comes from.
-    source = (points - joint) @ turn + joint
+    source = (points - by.joint) @ by.turn + by.joint
     aside = np.abs(source[..., 0] - middle)
     behind = np.clip((points[..., 1] - back - 2.0) / 8.0, 0.0, 1.0)
-    low = (source - bite) @ up < 0.0
+    low = (source - by.bite) @ by.up < 0.0
     low |= (behind > 0.5) & (aside > 30.0)
-    low &= source[..., 2] < joint[2] + 4.0
-    front = 1.0 / (1.0 + np.exp((points[..., 1] - joint[1] - 4.0) / 4.0))
-    share = (front * low)[..., None]
-    index = ((points + share * (source - points)) - origin) / step
+    low &= source[..., 2] < by.joint[2] + 4.0
+    front = by.front(points)
+    index = ((points + front * low[..., None] * (source - points)) - origin) / step
     values = np.asarray(image.values, dtype=np.float32)
-    opened = ndimage.map_coordinates(
+    changed = ndimage.map_coordinates(
         values, np.moveaxis(index, -1, 0), order=1, mode="constant", cval=-1000.0
     )
-    gap = ((points - bite) @ up < 0.0) & ~low & (front > 0.5)
-    body = ndimage.binary_erosion(ndimage.binary_fill_holes(values > -300.0), iterations=3)
-    mouth = gap & body & (np.abs(points[..., 0] - middle) < 24.0) & (points[..., 1] < back + 5.0)
-    opened[gap & (opened > 200.0)] = 40.0
-    opened[mouth] = -1000.0
-    return image.with_values(np.round(opened).clip(-1024, 3071).astype(np.int16))
+    gap = ((points - by.bite) @ by.up < 0.0) & ~low & (front[..., 0] > 0.5)
+    changed[gap & (changed > 200.0)] = 40.0
+    # To the outside: tissue left there would be a skin that closes the mouth.
+    mouth = gap & (np.abs(points[..., 0] - middle) < 24.0) & (points[..., 1] < back + 5.0)
+    changed[mouth] = -1000.0
+    return image.with_values(np.round(changed).clip(-1024, 3071).astype(np.int16))
 
 
 def without_teeth(image: ImageData, landmarks: Mapping[str, np.ndarray]) -> ImageData:
     """Crowns and necks of both rows replaced by soft tissue."""
-    place = landmarks
-    bite = 0.5 * (place["supradentale"] + place["infradentale"])
-    left, right = place["occlusal_line_L"], place["occlusal_line_R"]
-    up = np.cross(left - right, bite - 0.5 * (left + right))
-    up *= np.sign(up[2]) / np.linalg.norm(up)
+    bite, up = _occlusal_plane(landmarks)
+    left = landmarks["occlusal_line_L"]
     x, y, z = (a - b for a, b in zip(image.axes(), bite, strict=True))
     height = x * up[0] + y * up[1] + z * up[2]
     row = (np.abs(height) < 10.0) & (np.abs(x) < 34.0) & (y + bite[1] < left[1] - 2.0)

@@ -212,7 +212,7 @@ def _jaw_angle(view: SideView, half: Floats, found: Sites) -> None:
 
 
 # Between the upper incisors and the front of the ramus, the second molar stands at this share.
-MOLAR_SHARE = 0.815
+MOLAR_SHARE = 0.803
 # From the plane where the molars meet up and down to the sites, and how far back the lower is, mm.
 OVER_MOLARS, UNDER_MOLARS, LOWER_BEHIND = 13.0, 19.5, 3.8
 # How far upper and lower incisors are apart in a closed mouth at most, mm, and how much of an
@@ -255,9 +255,9 @@ def _teeth_line(view: SideView, found: Sites) -> None:
 
 
 def _ramus_front(jaw: DepthMap, level: float) -> float | None:
-    """Where the outer face of the ramus begins at a height, 2.5 mm behind its front border."""
+    """Where the outer face of the ramus begins at a height, 3.3 mm behind its front border."""
     y, _, depth = jaw.window((-80.0, 5.0), (level - 1.0, level + 1.0))
     if not len(depth):
         return None
     outside = -depth > np.quantile(-depth, 0.9) - 8.0
-    return float(y[outside].min()) + 2.5
+    return float(y[outside].min()) + 3.3

@@ -21,6 +21,10 @@ MOUTH_CORNER = 25.3
 # A lip stands out from the dent beside it by this, mm.
 LEAST_LIP = 0.15
 
+# The borders of the vermilion lie beyond the foremost points of the lips, up and down, and the
+# corner under the nose above the deepest point of its profile, mm.
+VERMILION, CORNER_ABOVE = (1.5, -0.75), 1.5
+
 Sites = dict[str, Floats]
 
 
@@ -79,7 +83,8 @@ def _below_nose(front: DepthMap, tip: Floats, skull: Mapping[str, Floats], found
     corner = _bulge(z, line, lip_z, float(tip[2]), -1.0)
     if corner is None:
         return
-    found["subnasale"] = np.array([lean, line[corner], z[corner]])
+    above = corner + round(CORNER_ABOVE / STEP)
+    found["subnasale"] = np.array([lean, line[above], z[above]])
     _wings(front, tip, float(z[corner]), found)
     _lips(front, lean, (chin_z, float(z[corner])), found)
     if "labiale_superius" in found and "labiale_inferius" in found:
@@ -111,8 +116,11 @@ def _lips(front: DepthMap, lean: float, ends: tuple[float, float], found: Sites)
         return
     # The two that stand out most, from above.
     first, second = sorted(sorted(peaks, key=lambda k: -out[k])[:2])
-    for name, k in (("labiale_superius", first), ("labiale_inferius", second)):
-        found[name] = np.array([lean, line[inside[k]], z[inside[k]]])
+    names = ("labiale_superius", "labiale_inferius")
+    for name, k, beyond in zip(names, (first, second), VERMILION, strict=True):
+        at = inside[k] + round(beyond / STEP)
+        if np.isfinite(line[at]):
+            found[name] = np.array([lean, line[at], z[at]])
 
 
 def _peaks(values: Floats) -> list[int]:
