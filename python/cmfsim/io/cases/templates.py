@@ -7,7 +7,7 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -83,7 +83,7 @@ def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
     if gathered.has_error:
         template = None
     elif template is not None and gathered.findings:
-        template = _with_findings(template, gathered.findings)
+        template = replace(template, findings=(*template.findings, *gathered.findings))
     return TemplateSurvey(template, tuple(gathered.findings))
 
 
@@ -117,26 +117,20 @@ def write_template(
 
 
 class _Gathered:
-    """Findings in the order in which they turn up."""
+    """Findings in the order in which they turn up: a context that makes them of errors."""
 
     def __init__(self, where: str) -> None:
         self.findings: list[Finding] = []
-        self.where = where
+        self._where, self._fix = where, ""
 
     @property
     def has_error(self) -> bool:
         return any(finding.severity == "error" for finding in self.findings)
 
-    def at(self, fix: str) -> "_Attempt":
-        """A context that turns an error into a finding with its place, and goes on."""
-        return _Attempt(self, fix)
-
-
-class _Attempt:
-    """The context of `_Gathered.at`."""
-
-    def __init__(self, gathered: _Gathered, fix: str) -> None:
-        self._gathered, self._fix = gathered, fix
+    def at(self, fix: str) -> "_Gathered":
+        """The context for a place with this remedy; what comes after it goes on."""
+        self._fix = fix
+        return self
 
     def __enter__(self) -> None:
         pass
@@ -150,18 +144,13 @@ class _Attempt:
         if not isinstance(error, CmfsimError | OSError | ValueError):
             return False
         found = PLACE.fullmatch(str(error))
-        where, what = (found[1], found[2]) if found else (self._gathered.where, str(error))
-        self._gathered.findings.append(
+        where, what = (found[1], found[2]) if found else (self._where, str(error))
+        self.findings.append(
             Finding(MISSING, what, where=where)
             if isinstance(error, FileNotFoundError)
             else Finding("template-unusable", what, where=where, fix=self._fix)
         )
         return True
-
-
-def _with_findings(template: TemplateData, findings: list[Finding]) -> TemplateData:
-    given = {name: getattr(template, name) for name in TemplateData.__dataclass_fields__}
-    return TemplateData(**{**given, "findings": (*template.findings, *findings)})
 
 
 def _survey_folder(folder: Path, gathered: _Gathered) -> TemplateData | None:

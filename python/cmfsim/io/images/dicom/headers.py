@@ -66,25 +66,18 @@ Tags = Mapping[str, str | int]
 
 
 @dataclass(frozen=True)
-class Frame:
-    """What a multi-frame image states of one frame, by the names of `DicomHeader.tags`."""
-
-    tags: Tags
-
-
-@dataclass(frozen=True)
 class DicomHeader:
     """What a DICOM file states before its pixels.
 
     tags: By name; absent where the file does not state it.
-    frames: Of an enhanced multi-frame image, in the order of its pixels.
+    frames: What an enhanced multi-frame image states of each frame, in the order of its pixels.
     odd: The first byte of each private element of no known kind, and that after its last.
     """
 
     path: Path
     tags: Tags
     has_pixels: bool = False
-    frames: tuple[Frame, ...] = ()
+    frames: tuple[Tags, ...] = ()
     odd: tuple[tuple[int, int], ...] = ()
 
     def for_reader(self) -> bytes | None:
@@ -365,10 +358,10 @@ class _Reader:
             raise EOFError(message)
 
 
-def _frames(found: _Found) -> list[Frame]:
+def _frames(found: _Found) -> list[Tags]:
     """The frames of an enhanced image: what all share, and what each states itself."""
     shared = _flat(found.sequences.get("shared", []))
-    return [Frame({**shared, **_flat([item])}) for item in found.sequences.get("per_frame", [])]
+    return [{**shared, **_flat([item])} for item in found.sequences.get("per_frame", [])]
 
 
 def _flat(items: list[_Found]) -> dict[str, str | int]:
@@ -433,7 +426,7 @@ def slices_of(header: DicomHeader) -> list[Slice]:
             f"{header.path.name}: has {count} frames and states the places of "
             f"{len(header.frames)}: export the series as one file per slice"
         )
-    return [Slice(header, n, frame.tags) for n, frame in enumerate(header.frames)]
+    return [Slice(header, n, tags) for n, tags in enumerate(header.frames)]
 
 
 def _placed_by_the_first(header: DicomHeader) -> list[Slice]:
