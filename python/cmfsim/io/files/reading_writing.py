@@ -13,10 +13,9 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path, PurePosixPath
-from pyexpat import XMLParserType
 from types import MappingProxyType
 from typing import Any, BinaryIO
 from xml.parsers import expat
@@ -374,23 +373,54 @@ def check_version(version: object) -> None:
         raise CaseInputError(f"version is {version}, this cmfsim reads {FORMAT_VERSION}; {hint}")
 
 
-def strict_parser(text: bytes, separator: str | None = None) -> XMLParserType:
-    """A parser for a text that refuses zero bytes, document types and entities.
+def walk_xml(
+    text: bytes,
+    most: tuple[int, int],
+    start: Callable[[str, dict[str, str]], object],
+    end: Callable[[], object] = lambda: None,
+    words: Callable[[str], object] | None = None,
+    *,
+    separator: str | None = None,
+) -> None:
+    """Calls back for each element of a text that begins and ends, and for its words.
 
     The encoding is UTF-8 whatever the text states: nothing hides behind another one. Entities could
     grow without bound.
 
-    text: What will be parsed.
+    most: Elements, and how deeply they are nested.
     separator: Between namespace and name; without one, namespaces are not resolved.
-    Raises `CaseError`: The text holds zero bytes; while parsing, a document type or an entity.
+    Raises `CaseError`: Not XML in UTF-8, zero bytes, a document type, entities, or more
     """
     if b"\0" in text:
         raise CaseInputError("is not XML in UTF-8: it holds zero bytes")
     parser = expat.ParserCreate("UTF-8", separator)
+    parser.buffer_text, parser.buffer_size = True, 2**20
+    left, depth = most
 
     def refuse(*_: object) -> None:
         raise CaseInputError("XML with a document type or entities is not read")
 
-    parser.StartDoctypeDeclHandler = refuse
-    parser.EntityDeclHandler = refuse
-    return parser
+    def begun(name: str, attributes: dict[str, str]) -> None:
+        nonlocal left, depth
+        left, depth = left - 1, depth - 1
+        if min(left, depth) < 0:
+            raise CaseInputError(
+                f"is nested too deeply, or has too many elements: at most {most[0]}, {most[1]} deep"
+            )
+        start(name, attributes)
+
+    def ended(_: str) -> None:
+        nonlocal depth
+        depth += 1
+        end()
+
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    parser.StartElementHandler, parser.EndElementHandler = begun, ended
+    if words is not None:
+        parser.CharacterDataHandler = words
+    try:
+        parser.Parse(text, True)  # noqa: FBT003 (its signature)
+    except expat.ExpatError as error:
+        raise CaseInputError(
+            f"is not XML in UTF-8, or is cut short ({error}); it begins with {text[:20]!r}"
+        ) from error

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from urllib.parse import unquote
-from xml.parsers import expat
 
 import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.files.reading_writing import check_readable, is_below, is_there, named, strict_parser
+from cmfsim.io.files.reading_writing import check_readable, is_below, is_there, named, walk_xml
 from cmfsim.io.slicer.transforms import motion_in_lps, read_transform_file
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix
@@ -239,28 +238,8 @@ def _file(name: str, folder: Path) -> tuple[Path | None, str]:
 
 def _elements(text: bytes) -> list[tuple[str, dict[str, str]]]:
     """Name and attributes of each element of a scene."""
-    parser = strict_parser(text)
     found: list[tuple[str, dict[str, str]]] = []
-    depth = 0
-
-    def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > MAX_DEPTH or len(found) > MAX_ELEMENTS:
-            raise CaseInputError("is nested too deeply, or has too many elements, for a scene")
-        found.append((name, attributes))
-
-    def end(name: str) -> None:
-        nonlocal depth
-        del name
-        depth -= 1
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    try:
-        parser.Parse(text, True)  # noqa: FBT003 (its signature)
-    except expat.ExpatError as error:
-        raise CaseInputError(f"is not XML in UTF-8, or is cut short ({error})") from error
+    walk_xml(text, (MAX_ELEMENTS, MAX_DEPTH), lambda name, given: found.append((name, given)))
     if found[0][0] != "MRML":
         raise CaseInputError(f"begins with {found[0][0][:40]!r}: a scene of 3D Slicer with MRML")
     return found

@@ -11,14 +11,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.reading_writing import strict_parser
-from cmfsim.io.files.text_numbers import real_numbers, shown, whole_numbers
+from cmfsim.io.files.reading_writing import walk_xml
+from cmfsim.io.files.text_numbers import real_numbers, whole_numbers
 from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, cells_by_type, stated_in_field
 from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
 from cmfsim.io.meshes.vtk.writing import UNPACKERS
@@ -409,38 +408,16 @@ def _parsed(data: bytes) -> tuple[_Element, _Arrays]:
 
 
 def _tree(text: bytes) -> _Element:
-    parser = strict_parser(text, " ")
-    parser.buffer_text = True
-    parser.buffer_size = 2**20
     top = _Element("", {})
     stack = [top]
-    count = 0
 
     def start(name: str, attributes: dict[str, str]) -> None:
-        nonlocal count
-        count += 1
-        if len(stack) > MAX_DEPTH or count > MAX_ELEMENTS:
-            raise CaseInputError("is nested too deeply, or has too many elements, for VTK")
-        element = _Element(name, attributes)
-        stack[-1].children.append(element)
-        stack.append(element)
+        stack[-1].children.append(_Element(name, attributes))
+        stack.append(stack[-1].children[-1])
 
-    def end(name: str) -> None:
-        del name
-        stack.pop()
-
-    def text_of(part: str) -> None:
+    def words(part: str) -> None:
         if stack[-1].name in {"DataArray", "Array"}:
             stack[-1].text.append(part)
 
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.CharacterDataHandler = text_of
-    try:
-        parser.Parse(text, True)  # noqa: FBT003 (its signature)
-    except expat.ExpatError as error:
-        begins = shown(text[:20])
-        raise CaseInputError(
-            f"is not XML in UTF-8, or is cut short ({error}); it begins with {begins}"
-        ) from error
+    walk_xml(text, (MAX_ELEMENTS, MAX_DEPTH), start, stack.pop, words, separator=" ")
     return top.children[0]
