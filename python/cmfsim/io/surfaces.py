@@ -19,9 +19,9 @@ from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
 from cmfsim.io.meshes.ply import write_ply
 from cmfsim.io.meshes.polygons import triangles_of
 from cmfsim.io.meshes.stl import write_stl
-from cmfsim.io.meshes.vtk.writing import data_array, write_vtk
+from cmfsim.io.meshes.vtk.writing import write_triangles
 from cmfsim.values.case_parts import FRAMES, UNITS
-from cmfsim.values.checks import check_one_of
+from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
@@ -285,20 +285,8 @@ def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
         WRITERS[path.suffix](file, vertices, surface.triangles)
 
 
-def _write_vtp(
-    file: BinaryIO, vertices: NDArray[np.float64], triangles: NDArray[np.integer]
-) -> None:
-    n = len(triangles)
-    polys = data_array("connectivity", triangles.reshape(-1).astype(np.int64)) + data_array(
-        "offsets", 3 * np.arange(1, n + 1, dtype=np.int64)
-    )
-    write_vtk(
-        file,
-        "PolyData",
-        f'<Piece NumberOfPoints="{len(vertices)}" NumberOfVerts="0" NumberOfLines="0" '
-        f'NumberOfStrips="0" NumberOfPolys="{n}"><Points>{data_array("points", vertices)}</Points>'
-        f"<Polys>{polys}</Polys></Piece>",
-    )
+def _write_vtp(file: BinaryIO, vertices: Floats, triangles: NDArray[np.integer]) -> None:
+    write_triangles(file, vertices, triangles, {})
 
 
 WRITERS: Mapping[str, Callable[[BinaryIO, NDArray[np.float64], NDArray[np.integer]], None]] = (
