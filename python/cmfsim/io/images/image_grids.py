@@ -2,13 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.errors import ImageInputError
+from cmfsim.errors import ImageError, ImageInputError, third_party
 from cmfsim.io.images.image_headers import MOST_VOXELS
 from cmfsim.values.image_data import ImageData
 
@@ -84,7 +83,7 @@ def upright(values: NDArray[Any], affine: NDArray[np.float64], name: str) -> Ima
 
     Raises `ImageError`: The grid would have too many voxels.
     """
-    itk = import_module("SimpleITK")
+    itk = third_party("SimpleITK", "oblique images are resampled", "imaging", ImageError)
     image = itk.GetImageFromArray(values.T)
     last = np.array(values.shape) - 1.0
     corners = np.array(

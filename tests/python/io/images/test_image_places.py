@@ -1,9 +1,12 @@
 """Where the voxels of image files lie: axes, spaces and units of their headers, against ITK's."""
 
+import sys
+
 import numpy as np
 import pytest
 from header_files import SHAPE, SHEARED, VALUES, codes, refused, write_meta, write_nifti, write_nrrd
 
+import cmfsim
 from cmfsim.io.images.image_files import read_image, read_image_file
 from cmfsim.io.images.nifti import read_nifti
 from cmfsim.io.images.nrrd import read_meta, read_nrrd
@@ -218,3 +221,11 @@ def test_a_meta_image_of_any_type_is_read_as_itk_reads_it(tmp_path, fields, dtyp
     found = read_meta(path)[0]
     np.testing.assert_array_equal(found, VALUES)
     np.testing.assert_array_equal(found, sitk.GetArrayFromImage(sitk.ReadImage(str(path))).T)
+
+
+def test_images_along_the_patients_axes_need_no_extra_and_others_name_it(tmp_path, monkeypatch):
+    straight, sheared = write_nrrd(tmp_path / "a.nrrd"), write_nifti(tmp_path / "b.nii")
+    monkeypatch.setitem(sys.modules, "SimpleITK", None)
+    np.testing.assert_array_equal(read_image(straight).values, VALUES)
+    with pytest.raises(cmfsim.ImageError, match=r"oblique images are resampled.*\[imaging\]"):
+        read_image(sheared)
