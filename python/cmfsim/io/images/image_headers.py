@@ -7,6 +7,7 @@ has its own file beside this one.
 
 import bz2
 import math
+import os
 import re
 import zlib
 from collections.abc import Mapping, Sequence
@@ -71,6 +72,25 @@ def check_shape(name: str, size: list[int], components: int = 1) -> None:
         )
 
 
+def check_memory(name: str, needed: int) -> None:
+    """Refuses voxels for which, and for one copy, this machine has no memory; the system, if asked.
+
+    A few MB may unpack to more than that, and the system would end the process.
+
+    needed: Bytes.
+    Raises `ImageError`: With both numbers.
+    """
+    try:
+        there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):  # Windows
+        return
+    if 2 * needed > there:
+        raise ImageInputError(
+            f"{name}: has {needed} bytes of voxels, and this machine {there} of memory, of which "
+            "twice as many are needed: crop the image, or save it with larger voxels"
+        )
+
+
 def stored_voxels(
     data: Path, start: int, dtype: np.dtype[Any], sizes: Sequence[int], packing: str = ""
 ) -> tuple[NDArray[Any], tuple[Finding, ...]]:
@@ -83,6 +103,7 @@ def stored_voxels(
     """
     needed, layer = (math.prod(n) * dtype.itemsize for n in (sizes, sizes[:2]))
     there, left = data.stat().st_size, 0
+    check_memory(data.name, needed)
     with data.open("rb") as file:
         file.seek(max(0, there - needed) if start < 0 else start)
         if packing in {"zlib", "bzip2"}:

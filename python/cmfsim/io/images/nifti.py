@@ -22,6 +22,7 @@ from cmfsim.io.images.image_headers import (
     MOST_PACKED,
     apart,
     check_affine,
+    check_memory,
     check_shape,
     unstated,
 )
@@ -222,6 +223,7 @@ def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> tuple[
             f"{path.name}: is cut short: {there} bytes, and its header asks for {needed} of "
             "voxels; copy it again"
         )
+    check_memory(path.name, needed)
     stream.seek(header.start)
     values = np.empty(header.size, dtype=header.dtype, order="F")
     room = memoryview(values.reshape(-1, order="F").view(np.uint8).data)

@@ -285,3 +285,16 @@ def test_an_image_is_read_by_its_content_whatever_its_name(tmp_path):
     write_image(image, tmp_path / "a.nrrd")
     os.rename(tmp_path / "a.nrrd", tmp_path / "a.nii")  # noqa: PTH104
     np.testing.assert_array_equal(read_image(tmp_path / "a.nii").values, VALUES)
+
+
+@pytest.mark.skipif(not hasattr(os, "sysconf"), reason="Windows does not tell its memory so")
+@pytest.mark.parametrize("suffix", [".nrrd", ".nii.gz", ".mha"])
+def test_voxels_beyond_the_memory_of_the_machine_are_refused_before_they_are_unpacked(
+    tmp_path, monkeypatch, suffix
+):
+    """Some MB unpack to many GB: the system would end the process."""
+    path = tmp_path / f"a{suffix}"
+    write_image(ImageData(VALUES, (1.0, 1.0, 2.0)), path)
+    np.testing.assert_array_equal(read_image(path).values, VALUES)
+    monkeypatch.setattr(os, "sysconf", lambda name: {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": 479}[name])
+    refused(path, "240 bytes of voxels", "479 of memory")
