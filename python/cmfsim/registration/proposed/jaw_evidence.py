@@ -78,8 +78,8 @@ def _impossible(sites: Mapping[str, Floats], volume: float, size: float) -> Iter
     distance = jaw_distance({n: p for n, p in sites.items() if not n.startswith("_")})
     if distance > FAR_JAW:
         yield (
-            f"its sites are {size * distance:.0f} mm from those of a closed mouth (up to "
-            f"{size * FAR_JAW:.0f} mm for an open one)"
+            f"its sites are {size * distance:.0f} mm from those of a jaw that opens (up to "
+            f"{size * FAR_JAW:.0f} mm expected)"
         )
     opening = _opening(sites)
     if opening < -DEEPEST_BITE:

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from cmfsim.registration.proposed.shape_model.model import HINGE
+from cmfsim.registration.proposed.shape_model.state import rotation_of
 from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES, REFERENCE_PLACES
@@ -11,9 +13,10 @@ from cmfsim.values.landmark_sites import JAW_SITES, REFERENCE_PLACES
 # The distance at which a site counts half in the fit, mm.
 HALF_DISTANCE = 5.0
 LEAST_SITES = 5
-# A jaw whose sites lie farther from where the cranium puts those of a closed mouth is none, mm of
-# the average head: an open mouth moves the chin by 30 mm, and the middle of all sites by 20.
+# A jaw whose sites lie farther from where the cranium puts those of a jaw that opens is none, mm of
+# the average head: condyles slide forwards by 10 mm. And how far mouths open, radians.
 FAR_JAW = 24.0
+OPENINGS = np.radians(np.arange(0.0, 36.0, 5.0))
 
 
 def misfits(skull: Mapping[str, Floats], skin: Mapping[str, Floats]) -> dict[str, dict[str, float]]:
@@ -29,7 +32,7 @@ def misfits(skull: Mapping[str, Floats], skin: Mapping[str, Floats]) -> dict[str
     of_cranium = _fit(upper, REFERENCE_PLACES["skull"])
     if of_cranium is not None:
         found.update(_distances(upper, REFERENCE_PLACES["skull"], of_cranium))
-        away = _distances(lower, REFERENCE_PLACES["skull"], of_cranium)
+        away = _from_jaw(lower, of_cranium)
         if away and float(np.median(list(away.values()))) > FAR_JAW:
             return {"skull": {**found, **away}, "skin": _own(skin, "skin")}
     found.update(_own(lower, "skull"))
@@ -37,7 +40,7 @@ def misfits(skull: Mapping[str, Floats], skin: Mapping[str, Floats]) -> dict[str
 
 
 def jaw_distance(skull: Mapping[str, Floats]) -> float:
-    """How far the sites of a jaw lie from where the cranium puts those of a closed mouth.
+    """How far the sites of a jaw lie from where the cranium puts those of one that opens.
 
     The median, average-head mm; 0 where too few sites are known.
     """
@@ -46,11 +49,20 @@ def jaw_distance(skull: Mapping[str, Floats]) -> float:
     of_cranium = _fit(upper, REFERENCE_PLACES["skull"])
     if of_cranium is None or not lower:
         return 0.0
-    away = _distances(lower, REFERENCE_PLACES["skull"], of_cranium)
-    return float(np.median(list(away.values())))
+    return float(np.median([*_from_jaw(lower, of_cranium).values()]))
 
 
 Similarity = tuple[Floats, Floats, float]
+
+
+def _from_jaw(lower: Mapping[str, Floats], of_cranium: Similarity) -> dict[str, float]:
+    """How far the sites of a jaw lie from those of an average one, as open as fits them best."""
+    tried = []
+    for angle in OPENINGS:
+        turn = rotation_of(np.array([angle, 0.0, 0.0]))
+        opened = {n: turn @ (p - HINGE) + HINGE for n, p in REFERENCE_PLACES["skull"].items()}
+        tried.append(_distances(lower, opened, of_cranium))
+    return min(tried, key=lambda away: float(np.median([*away.values()])) if away else 0.0)
 
 
 def _own(sites: Mapping[str, Floats], kind: str) -> dict[str, float]:
