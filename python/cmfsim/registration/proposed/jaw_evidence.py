@@ -47,10 +47,17 @@ class JawEvidence:
 
     impossible: Why it cannot be a lower jaw; empty where it can.
     doubts: Why its sites, and those of the upper tooth row, may be wrong.
+    is_open: Whether the rows are too far apart to tell of each other.
     """
 
     impossible: str
     doubts: tuple[str, ...]
+    is_open: bool = False
+
+    @property
+    def is_only_open(self) -> bool:
+        """Whether nothing but an open mouth speaks against it: rows apart are easy to separate."""
+        return self.is_open and not self.impossible and len(self.doubts) == 1
 
     @property
     def reason(self) -> str:
@@ -71,7 +78,8 @@ def jaw_evidence(
     """
     volume = _volume(lower) / pose.size**3
     impossible = "; ".join(_impossible(sites, volume, pose.size))
-    return JawEvidence(impossible, tuple(_doubts(sites, volume, pose.size, left_out)))
+    doubts = tuple(_doubts(sites, volume, pose.size, left_out))
+    return JawEvidence(impossible, doubts, _opening(sites) > WIDE)
 
 
 def _impossible(sites: Mapping[str, Floats], volume: float, size: float) -> Iterator[str]:
@@ -97,13 +105,14 @@ def _impossible(sites: Mapping[str, Floats], volume: float, size: float) -> Iter
 def _doubts(
     sites: Mapping[str, Floats], volume: float, size: float, left_out: Mapping[str, float]
 ) -> Iterator[str]:
-    rise = _rise(sites)
+    opening = _opening(sites)
+    # The rows of an open mouth have a plane each.
+    rise = None if opening > WIDE else _rise(sites)
     if rise is not None and not RISE[0] <= rise <= RISE[1]:
         yield (
             f"the tooth rows rise by {rise:.0f}° to the back against the Frankfort plane "
             f"({RISE[0]:g}° to {RISE[1]:g}° expected)"
         )
-    opening = _opening(sites)
     if opening > WIDE:
         yield f"the tooth rows are {size * opening:.0f} mm apart at the incisors"
     low, high = VOLUMES

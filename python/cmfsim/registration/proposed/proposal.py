@@ -158,7 +158,7 @@ def landmarks_from(
         fitted = _fitted(parts)
         pose = refined_pose(fitted.pose, parts.upper, average.bones["cranium"])
         drawn.result()
-    pose, found = _levelled_sites(parts, pose, average)
+    pose, found = _levelled_sites(parts, pose, average, fitted.jaw)
     likeness = [_likeness(template, parts.upper, pose, templates) for template in templates]
     found = _corrected(found, templates, likeness)
     skull = _evened({name: p for name, p in found.skull.items() if not name.startswith("_")})
@@ -195,7 +195,7 @@ def landmarks_from(
         missing_skin,
         evidence.impossible,
         evidence.reason,
-        separation_points(sites, pose, average.skull),
+        {} if evidence.is_only_open else separation_points(sites, pose, average.skull),
     )
 
 
@@ -240,22 +240,24 @@ def _template_sites(template: TemplateHead, average: TemplateHead) -> tuple[Pose
     """The pose of a template, and the sites that its definitions find."""
     parts = _template_surfaces(template)
     if template is average:
-        pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
+        pose, jaw = Pose(np.zeros(3), np.eye(3), 1.0, 0.0), np.eye(4)
     else:
-        pose = refined_pose(_fitted(parts).pose, parts.upper, average.bones["cranium"])
-    return _levelled_sites(parts, pose, average)
+        fitted = _fitted(parts)
+        pose = refined_pose(fitted.pose, parts.upper, average.bones["cranium"])
+        jaw = fitted.jaw
+    return _levelled_sites(parts, pose, average, jaw)
 
 
 def _levelled_sites(
-    parts: HeadSurfaces, pose: Pose, average: TemplateHead
+    parts: HeadSurfaces, pose: Pose, average: TemplateHead, jaw: Floats
 ) -> tuple[Pose, Detected]:
     """The pose in which the sites that are found level the head, and the sites in it."""
     seen = []
     for _ in range(LEVEL_ROUNDS):
-        skull = detect(parts, pose, skin=False).skull
+        skull = detect(parts, pose, jaw, skin=False).skull
         seen.append((pose, skull))
         pose = levelled(pose, skull, average.skull)
-    last = detect(parts, pose)
+    last = detect(parts, pose, jaw)
     means = dict(last.skull)
     for name, place in last.skull.items():
         places = [

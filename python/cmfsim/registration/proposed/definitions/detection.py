@@ -16,6 +16,7 @@ from cmfsim.registration.proposed.definitions.skull_sites import (
 )
 from cmfsim.registration.proposed.pose import Pose, surface_samples
 from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.surface_data import SurfaceData
 
 # Points on a surface per mm² for depth maps: some four in a cell.
@@ -66,13 +67,22 @@ class HeadSurfaces:
             points.setflags(write=False)
 
 
-def detect(head: HeadSurfaces, pose: Pose, *, skin: bool = True) -> Detected:
-    """The sites of a head that lies in a known pose: of cranium, mandible and, if asked, skin."""
+def detect(head: HeadSurfaces, pose: Pose, jaw: Floats, *, skin: bool = True) -> Detected:
+    """The sites of a head that lies in a known pose: of cranium, mandible and, if asked, skin.
+
+    jaw: (4, 4). The motion that opens the jaw of the average head as the patient's is: sites of
+        bone are looked for with the mouth closed.
+    """
 
     def placed(points: Floats) -> Floats:
         return pose.into(points) / pose.size
 
-    skull = find_skull_sites(skull_views(placed(head.upper_points), placed(head.lower_points)))
+    turn, shift = jaw[:3, :3], jaw[:3, 3]
+    lower = (placed(head.lower_points) - shift) @ turn
+    skull = find_skull_sites(skull_views(placed(head.upper_points), lower))
+    for name in skull:
+        if name.startswith((*JAW_SITES, "_lower_edge")):
+            skull[name] = turn @ skull[name] + shift
     if head.skin is None or not skin:
         return Detected(skull, {})
     front = depth_map(placed(head.skin_points), (0, 2, 1), 1.0, FRONT_REACH)

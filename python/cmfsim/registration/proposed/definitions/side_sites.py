@@ -215,20 +215,14 @@ def _jaw_angle(view: SideView, half: Floats, found: Sites) -> None:
 MOLAR_SHARE = 0.803
 # From the plane where the molars meet up and down to the sites, and how far back the lower is, mm.
 OVER_MOLARS, UNDER_MOLARS, LOWER_BEHIND = 13.0, 19.5, 3.8
-# How far upper and lower incisors are apart in a closed mouth at most, mm, and how much of an
-# opening beyond it there is at the molars.
-CLOSED, MOLAR_OPENING = 2.0, 0.6
-# From the upper incisors back to the second molar on average, mm.
-TO_MOLAR = 41.7
 # Where molars stand across, mm.
 MOLAR_ROW = (12.0, 32.0)
 
 
 def _teeth_line(view: SideView, found: Sites) -> None:
     """Sites beside the second molars, and on the ramus at the height of the teeth."""
-    upper, lower = found.get("_upper_edge"), found.get("_lower_edge")
-    neck = found.get("supradentale")
-    if upper is None or lower is None or neck is None:
+    lower, neck = found.get("_lower_edge"), found.get("supradentale")
+    if lower is None or neck is None:
         return
     across = np.abs(view.mandible[:, 0])
     teeth = view.mandible[(across > MOLAR_ROW[0]) & (across < MOLAR_ROW[1])]
@@ -245,11 +239,8 @@ def _teeth_line(view: SideView, found: Sites) -> None:
             return
         level = float(np.quantile(row[:, 2], 0.995)) - 0.8
     view.put(found, "occlusal_line", np.array([-view.jaw.at(border, level), border, level]))
-    opening = max(float(upper[2] - lower[2]) - CLOSED, 0.0)
-    high = level + MOLAR_OPENING * opening + OVER_MOLARS
-    # The ramus of an open mouth does not show how far back the upper teeth go.
-    above = molar if opening == 0.0 else float(neck[1]) + TO_MOLAR
-    view.put(found, "supra_m2", np.array([-view.outer.at(above, high), above, high]))
+    high = level + OVER_MOLARS
+    view.put(found, "supra_m2", np.array([-view.outer.at(molar, high), molar, high]))
     back, low = molar + LOWER_BEHIND, level - UNDER_MOLARS
     view.put(found, "sub_m2", np.array([-view.jaw.at(back, low), back, low]))
 

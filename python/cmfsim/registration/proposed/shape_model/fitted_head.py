@@ -18,6 +18,7 @@ from cmfsim.registration.proposed.shape_model.fitting import (
 )
 from cmfsim.registration.proposed.shape_model.model import (
     CRANIUM,
+    HINGE,
     MANDIBLE,
     SITES,
     SKIN,
@@ -31,6 +32,7 @@ from cmfsim.registration.proposed.shape_model.state import (
     JAW_DEVIATIONS,
     POSE_UNITS,
     State,
+    jaw_rotation,
     rotation_of,
 )
 from cmfsim.registration.similarity import robust_similarity
@@ -42,6 +44,8 @@ OPENED = ((5.0, 20), (4.0, 40), (3.0, 40), (3.0, 80))
 LATER = ((2.5, 80), (2.0, 80), (2.0, 160), (1.5, 160), (1.5, 400), (1.0, 400))
 LAST = ((1.0, 400), (0.7, 400))
 OPENINGS = tuple(np.radians((0.0, 8.0, 16.0, 25.0)))
+# A jaw that is fitted as turned by less is closed, radians: the fit is good to some 3°.
+OPEN = np.radians(6.0)
 COARSE_POINTS = 1200
 # Number of starts and openings that are tried concurrently.
 TRIED_AT_ONCE = 2
@@ -185,6 +189,19 @@ class FittedHead:
         linear, offset, scale = robust_similarity(fitted, goal, area, FRAME_DISTANCE, FRAME_ROUNDS)
         origin: Floats = -np.linalg.solve(linear, offset).astype(np.float64)
         return Pose(origin, linear / scale, 1.0 / scale, self.gap)
+
+    @property
+    def jaw(self) -> Floats:
+        """The motion that opens the average head's jaw as the patient's is, (4, 4), mm.
+
+        The identity where the mouth may as well be closed.
+        """
+        motion = np.eye(4)
+        turn = jaw_rotation(self.state.jaw)
+        if np.trace(turn) < 1.0 + 2.0 * np.cos(OPEN):
+            shift = (self.state.jaw * JAW_DEVIATIONS)[3:]
+            motion[:3, :3], motion[:3, 3] = turn, HINGE + shift - turn @ HINGE
+        return motion
 
     def conditioned(self, points: Mapping[tuple[str, str], Floats], error: float) -> "FittedHead":
         """The fit with some sites known: they are kept, and the others follow.
