@@ -179,6 +179,7 @@ from cmfsim.pipeline.evaluating import evaluate as evaluate
 from cmfsim.pipeline.outputs.model import build_case as build_case
 from cmfsim.pipeline.outputs.planning_page import write_planning_page as write_planning_page
 from cmfsim.pipeline.outputs.splint import make_splint as make_splint
+from cmfsim.pipeline.outputs.splint import plan_for_bite as plan_for_bite
 from cmfsim.pipeline.planning import PlanningPage as PlanningPage
 from cmfsim.pipeline.planning import make_planning_page as make_planning_page
 from cmfsim.pipeline.predicting import predict as predict
@@ -203,9 +204,11 @@ from cmfsim.planning.face_planning import PointTarget as PointTarget
 from cmfsim.planning.face_planning import SurfaceTarget as SurfaceTarget
 from cmfsim.planning.face_planning import plan_for_face as plan_for_face
 from cmfsim.planning.occlusion import ContactMap as ContactMap
+from cmfsim.planning.occlusion import FinalBite as FinalBite
 from cmfsim.planning.occlusion import Splint as Splint
 from cmfsim.planning.occlusion import ToothRow as ToothRow
 from cmfsim.planning.occlusion import contact_map as contact_map
+from cmfsim.planning.occlusion import final_bite as final_bite
 from cmfsim.planning.occlusion import splint_between as splint_between
 from cmfsim.planning.occlusion import tooth_rows as tooth_rows
 from cmfsim.planning.page import PageContent as PageContent

@@ -12,7 +12,7 @@ from cmfsim.cli.patients import (
     scene_commands,
     template_commands,
 )
-from cmfsim.cli.patients.plan_command import add_splint
+from cmfsim.cli.patients.plan_command import add_bite, add_splint
 from cmfsim.cli.research import lab_commands, study_commands
 from cmfsim.cli.research.lab_commands import add_population_commands
 from cmfsim.io import result_suffixes
@@ -84,6 +84,7 @@ def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
 
     _add_study_commands(commands, common, changed)
     add_splint(commands, named)
+    add_bite(commands, named)
 
     _add_phantom(commands, common)
 

@@ -1,4 +1,4 @@
-"""`cmfsim plan` and `cmfsim splint` of a case; `cmfsim desk`: from a scan to a plan."""
+"""`cmfsim plan`, `cmfsim splint` and `cmfsim bite` of a case; `cmfsim desk`: scan to plan."""
 
 import argparse
 import json
@@ -18,13 +18,14 @@ from cmfsim.cli.options import band_options
 from cmfsim.cli.patients.case_commands import case_of, checked
 from cmfsim.cli.terminal import Notices, StageProgress, can_open, escaped, open_page
 from cmfsim.errors import CaseInputError
-from cmfsim.io import write_surface
-from cmfsim.pipeline.building.inputs import check_output
+from cmfsim.io import Case, read_surface, write_plan, write_surface
+from cmfsim.pipeline.building.inputs import check_output, plan_key
 from cmfsim.pipeline.outputs.planning_page import PLAN_FILE
 from cmfsim.pipeline.planning import TARGET_STD, PlanningPage, make_planning_page
 from cmfsim.planning.face_planning import FacePlan
 from cmfsim.planning.replanning import USUAL, ExpectedError, PlanCorrection
 from cmfsim.planning.server import open_port, serve_planning
+from cmfsim.values.dental_arch import JAWS
 from cmfsim.values.progress import BUILDING, PLANNING
 
 
@@ -194,9 +195,7 @@ def add_splint(commands: Any, named: argparse.ArgumentParser) -> None:
         help="open the lower jaw about its joint heads (default 0)",
     )
     splint.add_argument("--label", metavar="TEXT", default="", help="raised letters on the front")
-    splint.add_argument(
-        "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
-    )
+    _add_plan(splint)
     splint.add_argument(
         "-o",
         "--out",
@@ -209,15 +208,25 @@ def add_splint(commands: Any, named: argparse.ArgumentParser) -> None:
     splint.set_defaults(run=splint_case, edge_length=None, output=None)
 
 
+def _add_plan(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
+    )
+
+
+def _free_path(case: Case, out: Path | None, name: str) -> Path:
+    """The file to write, by default among the results; it replaces no input of the case."""
+    path: Path = out or case.output / name
+    place = case if out is None else replace(case, output=path.parent)
+    check_output(place, lambda name: name == path.name)
+    return path
+
+
 def splint_case(options: argparse.Namespace) -> int:
     """Makes a splint and writes it."""
     case = case_of(options)
     kind = "intermediate" if options.intermediate else "final"
-    path = options.out or case.output / f"splint-{kind}.stl"
-    if options.out is None:
-        check_output(case, lambda name: name == path.name)
-    else:
-        check_output(replace(case, output=path.parent), lambda name: name == path.name)
+    path = _free_path(case, options.out, f"splint-{kind}.stl")
     notices = Notices(quiet=options.quiet)
     findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     more = {} if options.thickness is None else {"thickness": options.thickness}
@@ -251,4 +260,53 @@ def splint_case(options: argparse.Namespace) -> int:
     )
     if made.opening:
         print(f"       the lower jaw is opened by {made.opening:g}° about its joint heads")
+    return DONE
+
+
+def add_bite(commands: Any, named: argparse.ArgumentParser) -> None:
+    """Adds the command and its options."""
+    bite = commands.add_parser(
+        "bite",
+        parents=[named],
+        help="write the plan in which the lower jaw follows the upper one into the final bite",
+        epilog="Both scans of the teeth are exported in occlusion, in one frame: any. They are "
+        "registered to the tooth rows of the case, which must have the teeth.",
+    )
+    for jaw in JAWS:
+        bite.add_argument(
+            f"--{jaw}", metavar="SCAN", type=Path, required=True, help=f"{jaw} teeth, such as STL"
+        )
+    _add_plan(bite)
+    bite.add_argument(
+        "-o",
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help="file to write (default: bite.toml among the results of the case)",
+    )
+    bite.add_argument("--no-doctor", action="store_true", help="skip the checks of the case")
+    bite.set_defaults(run=bite_case, edge_length=None, output=None)
+
+
+def bite_case(options: argparse.Namespace) -> int:
+    """Finds the final bite and writes the plan."""
+    case = case_of(options)
+    path = _free_path(case, options.out, "bite.toml")
+    scans = read_surface(options.upper), read_surface(options.lower)
+    notices = Notices(quiet=options.quiet)
+    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
+        bite, plan = import_module("cmfsim.pipeline.outputs.splint").plan_for_bite(
+            case, *scans, progress=progress.stage, check=False, findings=findings, observer=notices
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_plan(path, plan, made_for=plan_key(case))
+    if options.json:
+        print(json.dumps({"case": case.name, "file": str(path), **bite.as_dict()}))
+        return DONE
+    print(f"plan   {escaped(str(path))}: cmfsim predict --plan")
+    print(
+        f"       scans fit to {bite.upper_error:.2f} mm (upper) and {bite.lower_error:.2f} mm "
+        f"(lower); rows overlap by {bite.overlap:.2f} mm, {bite.gap:.2f} mm apart"
+    )
     return DONE

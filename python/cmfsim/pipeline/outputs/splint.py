@@ -1,4 +1,4 @@
-"""The splint of a case: its jaws as planned, and what lies between their tooth rows."""
+"""The teeth of a case as planned: the splint between their rows, and the final bite of scans."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -10,10 +10,19 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.pipeline.building.case_model import planned_head
 from cmfsim.pipeline.building.stages import BuildKeywords, build_options
-from cmfsim.planning.occlusion import THICKNESS, Splint, rigid_of, splint_between, tooth_rows
+from cmfsim.planning.occlusion import (
+    THICKNESS,
+    FinalBite,
+    Splint,
+    final_bite,
+    rigid_of,
+    splint_between,
+    tooth_rows,
+)
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.dental_arch import JAWS
+from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -86,6 +95,62 @@ def make_splint(
         return splint_between(
             upper, lower, hinge, thickness=thickness, opening=opening, label=label
         )
+
+
+def plan_for_bite(
+    case: CaseOrPath,
+    upper_scan: SurfaceData,
+    lower_scan: SurfaceData,
+    **options: "Unpack[BuildKeywords]",
+) -> tuple[FinalBite, dict[str, Floats]]:
+    """The final bite of two intraoral scans, and the plan in which the lower jaw follows into it.
+
+    The plan is that of the case but for the segment with the lower teeth.
+
+    Parameters
+    ----------
+    case : Case, or path of its file or folder
+    upper_scan, lower_scan : SurfaceData
+        As for `final_bite`.
+    **options
+        Those of `BuildOptions`.
+
+    Returns
+    -------
+    FinalBite
+    dict of str to (4, 4) float64, mm
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) As for `final_bite`; a plan that is not rigid.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> scans = [cmfsim.read_surface(f"{jaw}.stl") for jaw in ("upper", "lower")]  # doctest: +SKIP
+    >>> bite, plan = cmfsim.plan_for_bite("patient", *scans)  # doctest: +SKIP
+    >>> cmfsim.write_plan("bite.toml", plan)  # doctest: +SKIP
+    """
+    case = as_case(case)
+    with build_options(options, {}) as asked:
+        head, bones, findings = planned_head(case, asked)
+        upper, lower = tooth_rows(head.anatomy, bones.segments, head.skull, findings)
+        plan = {}
+        for name, motion in bones.motions.items():
+            if isinstance(motion, MovedSurface) or motion.shape != (4, 4):
+                raise CaseInputError(
+                    f"the plan bends {name} (bite-plan-bends): a rigid motion is needed"
+                )
+            plan[name] = np.asarray(motion, dtype=np.float64)
+        if upper.segment == lower.segment:
+            raise CaseInputError(
+                f"both rows are on {upper.segment} (bite-one-segment): separate the jaws"
+            )
+        asked.observer.stage("finding the final bite")
+        bite = final_bite(upper, lower, upper_scan, lower_scan)
+        plan[lower.segment] = bite.following(plan.get(upper.segment, np.eye(4)))
+        return bite, plan
 
 
 def _hinge(segments: Sequence[BoneSegment]) -> tuple[Floats, Floats]:

@@ -1,0 +1,179 @@
+"""The final bite: two intraoral scans in occlusion, and where the lower jaw lies by them.
+
+Both scans are in one frame of their own. Each is registered to the crowns of its row; so the motion
+that brings the lower row into the bite of the scans follows, whatever the frame of the scans is.
+"""
+
+import contextlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmfsim._core import IcpFit
+from cmfsim.errors import CaseInputError, RegistrationError
+from cmfsim.planning.occlusion.contacts import contact_map
+from cmfsim.planning.occlusion.rows import ToothRow
+from cmfsim.registration import icp
+from cmfsim.values.checks import Floats
+from cmfsim.values.motion import carried, rigid_motion
+from cmfsim.values.surface_data import SurfaceData
+
+# A scan fits a row if such a share of its crowns lie on it, to this far, mm: the crowns of a CT are
+# blurred by some tenths; scans of the other jaw fit to 0.48 mm on the synthetic head, 0.64 mm on a
+# real skull. Pairs that are trimmed do not count in the share.
+MOST_ERROR, LEAST_SHARE = 0.35, 0.65
+# Crowns farther from the scan are no partners, mm, and the share left out: braces, and gaps.
+FAR, TRIM = 2.0, 0.2
+# How much better the best position is than another one, as a ratio of errors.
+CLEARER = 1.5
+# Positions farther apart than this are others, mm.
+OTHER = 3.0
+# Crowns that are compared, and the sizes of a scan against its row that are plausible.
+MOST_POINTS, SIZES = 3000, (0.6, 1.7)
+# Overlap and gap of the rows in the final bite beyond which they are in no bite, mm.
+MOST_OVERLAP, MOST_GAP = 3.0, 2.0
+# Turns of a scan about the axis of the bite from which its position is sought, degrees.
+TURNS = (0.0, 90.0, 180.0, 270.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FinalBite:
+    """The final bite of two scans, on the rows of a head.
+
+    Attributes
+    ----------
+    motion : (4, 4) float64, mm
+        Of the lower jaw into the bite, where the upper jaw stays.
+    upper_error, lower_error : float, mm
+        Root mean square distance of the crowns from their scan.
+    overlap, gap : float, mm
+        How deep the rows lie in one another then, and their least distance.
+    """
+
+    motion: Floats
+    upper_error: float
+    lower_error: float
+    overlap: float
+    gap: float
+
+    def following(self, upper: ArrayLike) -> Floats:
+        """The motion of the lower jaw if the upper one moves by `upper`, (4, 4) mm."""
+        return np.asarray(np.asarray(upper, dtype=np.float64) @ self.motion)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return {
+            "motion": self.motion.tolist(),
+            "upper_error_mm": self.upper_error,
+            "lower_error_mm": self.lower_error,
+            "overlap_mm": self.overlap,
+            "gap_mm": self.gap,
+        }
+
+
+def final_bite(
+    upper: ToothRow, lower: ToothRow, upper_scan: SurfaceData, lower_scan: SurfaceData
+) -> FinalBite:
+    """The final bite that two intraoral scans show.
+
+    Parameters
+    ----------
+    upper, lower : ToothRow
+        Before the operation.
+    upper_scan, lower_scan : SurfaceData
+        Of the teeth, mm, in occlusion in one frame: any. They may be open.
+
+    Raises
+    ------
+    CaseError
+        (also `ValueError`) A scan that does not fit its row, or fits in several ways; scans that
+        are in no occlusion.
+
+    Examples
+    --------
+    >>> import cmfsim
+    >>> upper, lower = cmfsim.tooth_rows(anatomy, segments, landmarks)  # doctest: +SKIP
+    >>> scans = [cmfsim.read_surface(f"{jaw}.stl") for jaw in ("upper", "lower")]  # doctest: +SKIP
+    >>> bite = cmfsim.final_bite(upper, lower, *scans)  # doctest: +SKIP
+    >>> plan["mandible_body"] = bite.following(plan["maxilla"])  # doctest: +SKIP
+    """
+    towards = upper_scan.vertices.mean(axis=0) - lower_scan.vertices.mean(axis=0)
+    upper_fit = _fitted(upper, upper_scan, towards)
+    lower_fit = _fitted(lower, lower_scan, -towards)
+    motion = np.asarray(np.linalg.inv(upper_fit.matrix) @ lower_fit.matrix, dtype=np.float64)
+    contacts = contact_map(upper, lower.moved(motion))
+    overlap, gap = contacts.greatest_overlap, max(0.0, contacts.least_gap)
+    if overlap > MOST_OVERLAP or gap > MOST_GAP:
+        raise CaseInputError(
+            f"the scans are in no bite (bite-not-closed): the rows would overlap by {overlap:.1f} "
+            f"mm and lie {gap:.1f} mm apart, {MOST_OVERLAP:g} and {MOST_GAP:g} mm are allowed; "
+            "export both scans in occlusion, in one frame"
+        )
+    return FinalBite(motion, upper_fit.rms, lower_fit.rms, overlap, gap)
+
+
+def _fitted(row: ToothRow, scan: SurfaceData, out: Floats) -> IcpFit:
+    """The motion of a row onto its scan; `out`: roughly from the bite to the roots of the scan."""
+    jaw = row.arch.jaw
+    points = row.surface.vertices[row.crowns]
+    points = points[:: -(-len(points) // MOST_POINTS)]
+    size = _spread(scan.vertices) / _spread(points)
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise CaseInputError(
+            f"the {jaw} scan is {size:.2g} times as large as the {jaw} tooth row (bite-scan-size), "
+            f"{SIZES[0]:g} to {SIZES[1]:g} times is allowed: check its units (mm) and its file"
+        )
+    turned = _frame(scan.vertices, out)
+    roots = row.arch.out
+    across = row.arch.axes()[0]
+    across = across - (across @ roots) * roots
+    across = across / np.linalg.norm(across)
+    ours = np.stack([across, np.cross(roots, across), roots])
+    centre, target = points.mean(axis=0), scan.vertices.mean(axis=0)
+    fits = []
+    for degrees in TURNS:
+        start = np.eye(4)
+        start[:3, :3] = rigid_motion(angle=degrees, axis=turned[2])[:3, :3] @ turned.T @ ours
+        start[:3, 3] = target - start[:3, :3] @ centre
+        # Elsewhere, too few crowns lie near the scan.
+        with contextlib.suppress(RegistrationError):
+            near = icp(points, scan, initial=start, trim=TRIM, max_iterations=60, keep_border=True)
+            fits.append(icp(points, scan, initial=near.matrix, trim=TRIM, max_distance=FAR))
+    if not fits:
+        raise CaseInputError(f"the {jaw} scan fits the {jaw} teeth nowhere (bite-scan-poor)")
+    fits.sort(key=_quality)
+    best = fits[0]
+    if best.rms > MOST_ERROR or best.kept_fraction < LEAST_SHARE:
+        raise CaseInputError(
+            f"the {jaw} scan does not fit the {jaw} teeth (bite-scan-poor): "
+            f"{best.kept_fraction:.0%} of the crowns lie on it, to {best.rms:.2f} mm; "
+            f"{LEAST_SHARE:.0%} and {MOST_ERROR:g} mm are needed; check that upper and lower scan "
+            "are not exchanged, and that the teeth are those of the CT"
+        )
+    places = carried(best.matrix, points)
+    for other in fits[1:]:
+        apart = np.linalg.norm(carried(other.matrix, points) - places, axis=1).max()
+        if apart > OTHER and _quality(other) < CLEARER * _quality(best):
+            raise CaseInputError(
+                f"the {jaw} scan fits the {jaw} teeth in two ways (bite-scan-ambiguous), to "
+                f"{best.rms:.2f} and {other.rms:.2f} mm: give scans of the whole row"
+            )
+    return best
+
+
+def _quality(fit: IcpFit) -> float:
+    """The error of a fit, mm, larger where fewer crowns lie on the scan."""
+    return fit.rms / max(fit.kept_fraction, 1e-3) ** 2
+
+
+def _spread(points: Floats) -> float:
+    return float(np.linalg.norm(points.std(axis=0)))
+
+
+def _frame(points: Floats, out: Floats) -> Floats:
+    """Unit vectors of a horseshoe of points, as rows: two in its plane, and one along `out`."""
+    along = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    normal = along[2] * np.sign(along[2] @ out)
+    return np.stack([along[0], np.cross(normal, along[0]), normal])

@@ -1,0 +1,101 @@
+"""The final bite of scans made from a head, moved by known motions."""
+
+import json
+
+import numpy as np
+import pytest
+import tooth_row_heads as heads
+
+import cmfsim
+import phantom_case
+import shared_values
+from cmfsim.cli import main
+from cmfsim.values.motion import carried
+
+pytest.importorskip("skimage")
+
+# The lower jaw goes forwards and turns; the scans are in a frame of their own.
+BITE = cmfsim.rigid_motion((1.0, -2.5, 1.0), 3.0, (0.2, 1.0, 0.3), centre=(0.0, -60.0, -45.0))
+FRAME = cmfsim.rigid_motion((120.0, 40.0, -33.0), 140.0, (1.0, 2.0, -0.5))
+# Height of a scan from its cusps, mm: with gum.
+HEIGHT = 9.0
+
+
+def scan_of(row, motion):
+    """An open surface of the teeth of a row, moved."""
+    vertices, triangles = row.surface.vertices, row.surface.triangles
+    across, ahead, out = ((vertices - row.arch.middle) @ row.arch.axes().T).T
+    near = (np.abs(across) < row.arch.half_width + 9) & (ahead > -8)
+    near &= -out > (-out)[[*row.cusps.values()]].mean() - HEIGHT
+    kept = triangles[near[triangles].all(axis=1)]
+    used, numbers = np.unique(kept, return_inverse=True)
+    return cmfsim.SurfaceData(carried(motion, vertices[used]), numbers.reshape(-1, 3))
+
+
+@pytest.fixture(scope="module")
+def scans():
+    """Scans of the same head in finer voxels: other vertices than those of the rows."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(heads, "SPACING", 0.6)
+        upper, lower = heads.rows_of(cmfsim.make_head())
+    return scan_of(upper, FRAME), scan_of(lower, FRAME @ BITE)
+
+
+def moved(surface, motion):
+    return cmfsim.SurfaceData(carried(motion, surface.vertices), surface.triangles)
+
+
+def test_the_lower_jaw_goes_where_the_scans_have_it(scans):
+    rows = heads.closed_rows()
+    bite = cmfsim.final_bite(*rows, *scans)
+    crowns = rows[1].surface.vertices[rows[1].crowns]
+    off = np.linalg.norm(carried(bite.motion, crowns) - carried(BITE, crowns), axis=1)
+    assert off.max() < 0.1
+    assert max(bite.upper_error, bite.lower_error) < 0.05
+    shift = cmfsim.rigid_motion((0.0, -4.0, 1.0), 2.0)
+    np.testing.assert_allclose(bite.following(shift), shift @ bite.motion, atol=1e-12)
+    contacts = cmfsim.contact_map(rows[0], rows[1].moved(bite.motion))
+    assert bite.overlap == contacts.greatest_overlap
+
+
+def test_exchanged_scans_another_frame_and_other_units_are_refused_by_name(scans):
+    upper, lower = scans
+    apart = FRAME @ cmfsim.rigid_motion((0, 0, -8)) @ np.linalg.inv(FRAME)
+    narrow = cmfsim.SurfaceData(upper.vertices * [1.0, 0.8, 1.1], upper.triangles)
+    metres = cmfsim.SurfaceData(upper.vertices / 1000, upper.triangles)
+    for pair, code in (
+        ((lower, upper), "bite-scan-poor"),
+        ((narrow, lower), "bite-scan-poor"),
+        ((upper, moved(lower, apart)), "bite-not-closed"),
+        ((metres, lower), "bite-scan-size"),
+    ):
+        with pytest.raises(cmfsim.CaseError, match=code):
+            cmfsim.final_bite(*heads.closed_rows(), *pair)
+
+
+def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
+    scans, tmp_path, tmp_path_factory, capsys
+):
+    levels = shared_values.drawn_levels(tmp_path_factory, 2.0)
+    case = phantom_case.surface_case(tmp_path, cmfsim.make_head(), levels)
+    words = ["bite", str(case), "--json", "-q", "--no-doctor"]
+    for jaw, scan in zip(("upper", "lower"), scans, strict=True):
+        cmfsim.write_surface(tmp_path / f"{jaw}_scan.stl", scan)
+        words += [f"--{jaw}", str(tmp_path / f"{jaw}_scan.stl")]
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    before, after = cmfsim.Case.load(case), cmfsim.Case.load(case).with_plan(found["file"])
+    upper = before.plan["maxilla"].matrix
+    np.testing.assert_allclose(after.plan["maxilla"].matrix, upper, atol=1e-9)
+    wanted, lower = upper @ BITE, after.plan["mandible_body"].matrix
+    crowns = heads.closed_rows()[1]
+    places = crowns.surface.vertices[crowns.crowns]
+    # The bones of this case are made of voxels of 2 mm.
+    assert np.linalg.norm(carried(lower, places) - carried(wanted, places), axis=1).max() < 0.3
+    assert found["upper_error_mm"] < 0.35
+    # Exchanged files write no plan.
+    exchanged = [{"--upper": "--lower", "--lower": "--upper"}.get(word, word) for word in words]
+    out = str(tmp_path / "exchanged.toml")
+    assert main([*exchanged, "-o", out]) == 2
+    assert "bite-scan-poor" in json.loads(capsys.readouterr().out)["error"]["text"]
+    assert not (tmp_path / "exchanged.toml").exists()
