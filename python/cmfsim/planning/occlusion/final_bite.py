@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim._core import IcpFit
+from cmfsim._core import IcpFit, icp
 from cmfsim.errors import CaseInputError, RegistrationError
 from cmfsim.planning.occlusion.contacts import contact_map
 from cmfsim.planning.occlusion.rows import ToothRow
-from cmfsim.registration import icp
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import SurfaceData
@@ -32,6 +31,7 @@ CLEARER = 1.5
 OTHER = 3.0
 # Crowns that are compared, and the sizes of a scan against its row that are plausible.
 MOST_POINTS, SIZES = 3000, (0.6, 1.7)
+STEPS = 100
 # Overlap and gap of the rows in the final bite beyond which they are in no bite, mm.
 MOST_OVERLAP, MOST_GAP = 3.0, 2.0
 # Turns of a scan about the axis of the bite from which its position is sought, degrees.
@@ -139,8 +139,8 @@ def _fitted(row: ToothRow, scan: SurfaceData, out: Floats) -> IcpFit:
         start[:3, 3] = target - start[:3, :3] @ centre
         # Elsewhere, too few crowns lie near the scan.
         with contextlib.suppress(RegistrationError):
-            near = icp(points, scan, initial=start, trim=TRIM, max_iterations=60, keep_border=True)
-            fits.append(icp(points, scan, initial=near.matrix, trim=TRIM, max_distance=FAR))
+            near = _registered(points, scan, start, far=None)
+            fits.append(_registered(points, scan, near.matrix, far=FAR))
     if not fits:
         raise CaseInputError(f"the {jaw} scan fits the {jaw} teeth nowhere (bite-scan-poor)")
     fits.sort(key=_quality)
@@ -161,6 +161,23 @@ def _fitted(row: ToothRow, scan: SurfaceData, out: Floats) -> IcpFit:
                 f"{best.rms:.2f} and {other.rms:.2f} mm: give scans of the whole row"
             )
     return best
+
+
+def _registered(points: Floats, scan: SurfaceData, initial: Floats, far: float | None) -> IcpFit:
+    """The motion of points onto a scan; pairs on its border count only where none are too far."""
+    return icp(
+        points,
+        scan.searched,
+        initial=initial,
+        trim=TRIM,
+        method="plane",
+        max_iterations=STEPS,
+        tolerance=1e-9,
+        max_distance=far,
+        max_angle=None,
+        keep_border=far is None,
+        normals=None,
+    )
 
 
 def _quality(fit: IcpFit) -> float:
