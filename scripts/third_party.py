@@ -57,6 +57,7 @@ PYTHON: Mapping[str, str] = {
     "SimpleITK": "Apache-2.0",
     "scikit-image": "BSD-3-Clause",
     "scipy": "BSD-3-Clause",
+    "pydicom": "MIT",
     "fast-simplification": "MIT",
     "meshio": "MIT",
     "pyvista": "MIT",

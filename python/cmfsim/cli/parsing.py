@@ -231,6 +231,12 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     switch(report, "--pdf", "also write report.pdf, one page for the chart")
     file(
         report,
+        "--dicom",
+        "CT",
+        "also write report.dcm, that page as DICOM in the study of the CT, whose folder is given",
+    )
+    file(
+        report,
         "--animation",
         "FILE",
         "also write the face on its way from before to after: .gif, or .mp4 by ffmpeg",

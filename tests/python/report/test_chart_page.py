@@ -2,12 +2,18 @@
 
 import io
 import itertools
+import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import cmfsim
+import dicom_series
 import shared_values
 from cmfsim.cli import main
+from cmfsim.io.results.dicom_pdf import write_dicom_pdf
+from cmfsim.pipeline.building.inputs import input_hash
 from cmfsim.report.chart_page import A4, SITES, draw_chart_page
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -128,3 +134,48 @@ def case_results(tmp_path, tmp_path_factory):
     patient = shared_values.coarse_demo_patient(tmp_path_factory)
     cmfsim.write_prediction(tmp_path / "out", cmfsim.predict_patient(patient, "H"))
     return tmp_path / "out"
+
+
+@pytest.fixture
+def ct_results(tmp_path, tmp_path_factory):
+    """Results as of a case whose image is a folder of DICOM, and that folder."""
+    pytest.importorskip("pydicom")
+    folder = tmp_path / "ct"
+    image = cmfsim.ImageData(np.zeros((4, 4, 3), dtype=np.int16), [1.0] * 3, [0.0] * 3)
+    slices = [one.with_tags(t0010_0010="Smith^Ada") for one in dicom_series.axial(image)]
+    dicom_series.write_series(folder, slices)
+    patient = shared_values.coarse_demo_patient(tmp_path_factory)
+    summary = {**patient.summary, "inputs": {"ct": input_hash(folder)}}
+    prediction = cmfsim.predict_patient(replace(patient, summary=summary), "H")
+    cmfsim.write_prediction(tmp_path / "out", prediction)
+    return tmp_path / "out", folder
+
+
+def test_the_page_as_dicom_is_filed_in_the_study_of_its_ct(ct_results, capsys):
+    results, ct = ct_results
+    assert main(["report", str(results), "--dicom", str(ct)]) == 0
+    assert "report.dcm" in capsys.readouterr().out
+    pydicom = pytest.importorskip("pydicom")
+    page, one = (pydicom.dcmread(f) for f in (results / "report.dcm", next(ct.iterdir())))
+    assert page.file_meta.MediaStorageSOPClassUID.name == "Encapsulated PDF Storage"
+    for name in ("PatientName", "PatientID", "StudyInstanceUID"):
+        assert page[name].value == one[name].value
+    assert page.SeriesInstanceUID != one.SeriesInstanceUID
+    assert page.SOPInstanceUID == page.file_meta.MediaStorageSOPInstanceUID
+    pdf = page.EncapsulatedDocument[: page.EncapsulatedDocumentLength]
+    assert pdf == (results / "report.pdf").read_bytes()
+
+
+def test_the_page_is_filed_under_no_other_patient(ct_results, capsys):
+    results, ct = ct_results
+    image = cmfsim.ImageData(np.ones((4, 4, 3), dtype=np.int16), [1.0] * 3, [0.0] * 3)
+    other = results.parent / "other"
+    dicom_series.write_series(other, dicom_series.axial(image), study="1.9")
+    assert main(["report", str(results), "--dicom", str(other), "--json"]) == 2
+    assert "dicom-other-ct" in json.loads(capsys.readouterr().out)["error"]["text"]
+    # Two studies in one folder, which is that of the case.
+    names = [f"other{k}.dcm" for k in range(3)]
+    dicom_series.write_series(ct, dicom_series.axial(image), uid="1.9.1", names=names, study="1.9")
+    with pytest.raises(cmfsim.ImageError, match="2 patients and studies"):
+        write_dicom_pdf(results / "report.dcm", b"%PDF", ct, "page")
+    assert not (results / "report.dcm").exists()

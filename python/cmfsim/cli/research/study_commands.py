@@ -26,6 +26,7 @@ from cmfsim.pipeline.outputs.results import (
     write_animation,
     write_case_report,
     write_chart_page,
+    write_dicom_page,
     write_results,
 )
 from cmfsim.pipeline.predicting import predict_models, prepare
@@ -316,6 +317,8 @@ def report(options: argparse.Namespace) -> int:
         progress.stage("writing the report")
         name = write_case_report(folder)
         pages = {"pdf": write_chart_page(folder)} if options.pdf else {}
+        if options.dicom is not None:
+            pages["dicom"] = write_dicom_page(folder, options.dicom)
         if options.animation is not None:
             progress.stage("drawing the animation")
             write_animation(folder, options.animation)

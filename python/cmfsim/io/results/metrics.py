@@ -33,7 +33,7 @@ DISTANCE, EVALUATED = "signed_distance_mm", "evaluated"
 
 # Written last, so that a case that has it is finished.
 EVALUATION_FILE = "metrics.json"
-REPORT_FILE, CHART_PAGE_FILE = "report.html", "report.pdf"
+REPORT_FILE, CHART_PAGE_FILE, DICOM_PAGE_FILE = "report.html", "report.pdf", "report.dcm"
 EVALUATION_FILES = re.compile(
     r"metrics\.(json|csv)|errors\.png|error-(H|M|H\+S|M\+S)\.(png|vtp)|report\.(html|pdf)"
 )

@@ -28,6 +28,7 @@ from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
 from cmfsim.io.results.metrics import (
     CHART_PAGE_FILE,
+    DICOM_PAGE_FILE,
     EVALUATION_FILE,
     REPORT_FILE,
     is_evaluation_file,
@@ -273,7 +274,7 @@ def stale_results(folder: Path, key: str) -> list[str]:
     if os.path.lexists(folder / EVALUATION_FILE) and _key_of(read_evaluation, folder) != key:
         stale += sorted(path.name for path in folder.iterdir() if is_evaluation_file(path.name))
     if stale:
-        reports = (REPORT_FILE, CHART_PAGE_FILE)
+        reports = (REPORT_FILE, CHART_PAGE_FILE, DICOM_PAGE_FILE)
         stale += [name for name in reports if os.path.lexists(folder / name)]
     return [*dict.fromkeys(stale)]
 

@@ -179,7 +179,7 @@ def _hashes(paths: Iterable[Path], folder: Path) -> dict[str, str]:
         while key in found:
             number += 1
             key = f"{name} ({number})"
-        found[key] = _sha256(path)
+        found[key] = input_hash(path)
     return dict(sorted(found.items()))
 
 
@@ -289,7 +289,8 @@ def _files(case: Case) -> Iterator[Path]:
     yield from (path for path in optional if path is not None)
 
 
-def _sha256(path: Path) -> str:
+def input_hash(path: Path) -> str:
+    """The SHA-256 of a file, or of the DICOM files in a folder with their names."""
     digest = hashlib.sha256()
     for file in dicom_files(path) if path.is_dir() else [path]:
         if path.is_dir():

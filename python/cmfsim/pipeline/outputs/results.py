@@ -16,12 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.errors import CmfsimError
+from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.evaluation import error_table
 from cmfsim.io import replacing, replacing_files
 from cmfsim.io.files.summaries import hashes_of, write_summary
+from cmfsim.io.results.dicom_pdf import write_dicom_pdf
 from cmfsim.io.results.metrics import (
     CHART_PAGE_FILE,
+    DICOM_PAGE_FILE,
     EVALUATION_FILE,
     REPORT_FILE,
     read_evaluation,
@@ -55,6 +57,7 @@ from cmfsim.pictures import (
 from cmfsim.pictures.canvas import Painter
 from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.faces import animate_face
+from cmfsim.pipeline.building.inputs import input_hash
 from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.face_regions import face_motion
@@ -301,7 +304,7 @@ def _fill_model(
 
 def _older(output: Path, places: Iterable[str]) -> list[str]:
     """Pictures of an earlier run that this one has not drawn, and a report that it has not made."""
-    older = [REPORT_FILE, CHART_PAGE_FILE]
+    older = [REPORT_FILE, CHART_PAGE_FILE, DICOM_PAGE_FILE]
     for place in places:
         folder = output / place
         if folder.is_dir() and (folder / "prediction.json").exists():
@@ -553,6 +556,24 @@ def write_chart_page(folder: Path) -> str:
         lambda page: draw_chart_page(page, found[place], pictures, findings),
     )
     return CHART_PAGE_FILE
+
+
+def write_dicom_page(folder: Path, source: Path) -> str:
+    """The name of the page for the chart as DICOM, in the study of the CT that was planned on.
+
+    source: The CT as the case names it: its folder or file, whose hash is among the results.
+    Raises as the report; `CaseError`: another CT. See also `write_dicom_pdf`.
+    """
+    place, _ = _shown(predictions_of(folder))
+    if input_hash(source) not in predictions_of(folder)[place]["inputs"].values():
+        raise CaseInputError(
+            f"{source} is not the CT of these results (dicom-other-ct), or has changed since: give "
+            "the folder that [image] names in the case file; otherwise the page would be filed "
+            "under another patient"
+        )
+    pdf = (folder / write_chart_page(folder)).read_bytes()
+    write_dicom_pdf(folder / DICOM_PAGE_FILE, pdf, source, "Predicted face, research only")
+    return DICOM_PAGE_FILE
 
 
 def write_animation(folder: Path, path: Path) -> None:
