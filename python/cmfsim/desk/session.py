@@ -94,11 +94,6 @@ class Session:
         """Whether a work runs."""
         return bool(self._kind)
 
-    @property
-    def worker_pid(self) -> int | None:
-        """The process in which the work runs."""
-        return None if self._worker is None else self._worker.pid
-
     def begin(self) -> None:
         """Goes on as far as it can without the user: sets up the case, and opens the head."""
         text = self.text()

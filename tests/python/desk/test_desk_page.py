@@ -39,7 +39,7 @@ class Person:
 
     def computed(self, step):
         """Keeps the processor time of the desk's worker since the step before, s."""
-        stat = Path(f"/proc/{self.session.worker_pid}/stat")
+        stat = Path(f"/proc/{self.session._worker.pid}/stat")
         if stat.exists():
             # After the name in brackets: user and system time are fields 14 and 15 (proc(5)).
             times = stat.read_text(encoding="utf-8").rpartition(")")[2].split()[11:13]

@@ -1,8 +1,9 @@
 """The clinical figures of a prediction: its measures before and as planned, and how sites move."""
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,7 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
     ways = ("forwards_mm", "up_mm", "left_mm")
     return {
         "occlusion": _rows(
-            OCCLUSAL_MEASURES,
+            [_with_error(measure, before) for measure in OCCLUSAL_MEASURES],
             occlusion(before),
             occlusion(after, before),
             missing_for_occlusion(before, unfound_molars(patient)),
@@ -108,11 +109,12 @@ def bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
         for name, (place, segment) in bite_sites(*rows).items():
             if name not in given:
                 sites[name] = face.BoneSite(place, segment)
-        teeth = {tooth_of(name) for name in skull}
+        # One cusp of a tooth is given, or it is found.
+        teeth = {tooth[:2] for name in skull if (tooth := tooth_of(name)) is not None}
         for name, tooth in FOUND_MOLARS.items():
             row = rows["UL".index(tooth[0][0])]
             found = first_molars(row)[tooth[1]]
-            if tooth not in teeth and not isinstance(found, str):
+            if tooth[:2] not in teeth and not isinstance(found, str):
                 sites[name] = face.BoneSite(found, row.segment)
     return sites
 
@@ -134,6 +136,14 @@ def unfound_molars(patient: PatientModel) -> dict[str, str]:
         )
         for side in ("left", "right")
     }
+
+
+def _with_error(measure: Measure, sites: Collection[str]) -> Measure:
+    """A measure that states how far off it is where molars were found."""
+    side = measure.key.removeprefix("molar_")
+    if not any(f"{tooth}-{side}" in sites for tooth in ("U6", "L6")):
+        return measure
+    return replace(measure, source=f"{measure.source}; molars found on the crowns: ± 1.5 mm")
 
 
 def _rows(

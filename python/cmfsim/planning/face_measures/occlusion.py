@@ -183,7 +183,8 @@ def missing_for_occlusion(
         **dict.fromkeys(("upper_midline", "lower_midline"), f"{middle}: not given or found"),
         "cant": "upper molars of both sides: not given or found",
         **{
-            key: f"U6 and L6 of the side: not given, nor found ({unfound.get(key) or 'no bones'})"
+            key: "U6 and L6 of the side, by the same cusp: not given"
+            + (f", nor found ({unfound[key]})" if unfound.get(key) else "")
             for key in ("molar_left", "molar_right")
         },
     }
