@@ -77,6 +77,13 @@ impl BlockMatrix {
         &self.blocks[self.diagonal[j]]
     }
 
+    /// The block of row `j` in `column`, which the pattern holds.
+    pub fn block_mut(&mut self, j: usize, column: u32) -> &mut Block {
+        let first = self.row_start[j];
+        let own = &self.columns[first..self.row_start[j + 1]];
+        &mut self.blocks[first + own.partition_point(|&k| k < column)]
+    }
+
     /// Adds `stiffness` n⊗n to the diagonal block of row `j`.
     pub fn add_to_diagonal(&mut self, j: usize, n: [f64; 3], stiffness: f64) {
         let block = &mut self.blocks[self.diagonal[j]];

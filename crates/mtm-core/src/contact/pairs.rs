@@ -31,7 +31,7 @@ use crate::vector::{add, dot, norm, scaled, sub};
 pub(crate) const NO_ROW: u32 = u32::MAX;
 /// Stiffness of a link over the own stiffness of its node: a larger value makes each round take more
 /// iterations, a smaller one requires more rounds.
-const LINK_STIFFNESS: f64 = 2.0;
+const LINK_STIFFNESS: f64 = 1.0;
 /// Distance to the surface, over its mean edge, below which the continuous normal is used as direction: that to
 /// the closest point jumps from facet to facet, and is undefined at the surface.
 const NEAR_SHARE: f64 = 0.5;

@@ -9,16 +9,17 @@
 use std::sync::Arc;
 
 use crate::boundary::Motion;
+use crate::contact::links::Link;
 use crate::contact::pairs::{Left, Pairs, Round, Touching};
 use crate::contact::planes::Planes;
-use crate::contact::{ContactStart, ContactState, Sliding, SlidingNode};
+use crate::contact::{ContactStart, ContactState, SlidingNode};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
 use crate::mesh::TetMesh;
 use crate::statics::linear::effort::PlanSolve;
-use crate::statics::linear::system::{SolvedRows, System};
+use crate::statics::linear::system::{BodyRows, SolvedRows, System};
 use crate::statics::options::StaticOptions;
-use crate::statics::plans::settling::{ContactSolve, RowLinks, Settled, WarmStart};
+use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart};
 use crate::statics::reduction::Reduction;
 use crate::statics::solution::{Clock, TouchResult};
 use crate::vector::{add, norm, scaled, sub};
@@ -56,6 +57,11 @@ const MOST_ROUNDS_AHEAD: usize = 8;
 const AHEAD_EDGES: f64 = 0.05;
 /// Share of the first residual, in the energy norm, that a round before the last ones may leave.
 const ROUGH_SHARE: f64 = 0.1;
+/// Error of the solves that end a plan, over the distance that counts as touching.
+const SOLVED_SHARE: f64 = 0.01;
+/// Iterations of a round above which the next one gets a hierarchy that knows the links that push: setting one up
+/// takes as long as some twenty iterations.
+const WORN: usize = 25;
 /// Maximum number of nodes listed in an error.
 const NAMED_NODES: usize = 10;
 
@@ -95,7 +101,7 @@ pub(super) struct TouchingPlan<'a> {
     pub body: &'a dyn BoundaryRule,
     pub mesh: &'a TetMesh,
     pub reduction: &'a Reduction,
-    pub sliding: Option<&'a Sliding>,
+    pub rows: BodyRows<'a>,
     pub options: &'a StaticOptions,
     pub system: &'a System,
     pub pairs: &'a Pairs,
@@ -133,10 +139,11 @@ impl TouchingPlan<'_> {
     /// or if a step penetrates however short it is; those of the solves.
     pub fn solve(&self, solve: &mut PlanSolve<'_>) -> Result<(SolvedRows, TouchingParts)> {
         let clock = Clock::new();
-        let sliding = self.sliding;
+        let sliding = self.rows.sliding;
         let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(solve.scale);
         let mut step = 1.0 / (farthest / (STEP_EDGES * self.pairs.mean_edge())).ceil().max(1.0);
         let (mut pose, mut here, mut rounds) = (self.rest(), 0.0, 0);
+        solve.allowed = SOLVED_SHARE * self.close();
         loop {
             let there = if here + 1.5 * step >= 1.0 { 1.0 } else { here + step };
             let shorter = step > SHORTEST_STEP;
@@ -193,6 +200,10 @@ impl TouchingPlan<'_> {
         let ahead =
             self.pairs.planes_ahead(self.mesh, &pose.u, (&before, &motions), &pose.touching)?;
         let contact = self.carried(pose, &before, &motions);
+        // Displacements are nearly proportional to the plan.
+        let more = if from > 0.0 { to / from } else { 1.0 };
+        let mut pose = pose.clone();
+        pose.rows.iter_mut().for_each(|v| *v = scaled(*v, more));
         let (pose, rounds) = self.go_ahead(pose, &ahead, contact, &goal, solve)?;
         let planes = self.pairs.planes(self.mesh, &pose.u, &motions, &pose.touching)?;
         if planes.deepest() > DEEP_EDGES * self.pairs.mean_edge() {
@@ -205,15 +216,14 @@ impl TouchingPlan<'_> {
     /// of their motion, and the number of rounds. Planes are infinite, so nodes cannot pass around them.
     fn go_ahead(
         &self,
-        pose: &PartialState,
+        mut pose: PartialState,
         ahead: &Planes,
         mut contact: Option<ContactStart>,
         goal: &StepTarget<'_>,
         solve: &mut PlanSolve<'_>,
     ) -> Result<(PartialState, usize)> {
         // The targets of prescribed nodes are known before anything is solved.
-        let u = self.reduction.filled(goal.prescribed, &pose.rows);
-        let mut pose = PartialState { u, ..pose.clone() };
+        pose.u = self.reduction.filled(goal.prescribed, &pose.rows);
         let deep = AHEAD_EDGES * self.pairs.mean_edge();
         for round in 1..=MOST_ROUNDS_AHEAD {
             let links = self.pairs.round(ahead, &pose.u, &pose.touching, true);
@@ -293,7 +303,7 @@ impl TouchingPlan<'_> {
 
     /// Positions of the sliding nodes in `pose`.
     fn begun(&self, pose: &PartialState) -> Option<ContactStart> {
-        let (sliding, state) = (self.sliding?, pose.contact.as_ref()?);
+        let (sliding, state) = (self.rows.sliding?, pose.contact.as_ref()?);
         let at = |node: &SlidingNode, place: &[f64; 3]| add(*place, pose.rows[node.row as usize]);
         let places = sliding.nodes().iter().zip(&sliding.positions).map(|(n, x)| at(n, x));
         Some(ContactStart { places: places.collect(), reactions: state.reactions.clone() })
@@ -314,19 +324,26 @@ impl TouchingPlan<'_> {
     ) -> Result<(Vec<[f64; 3]>, Option<ContactState>)> {
         let rows = &pose.rows[..];
         let linked = RowLinks { links: &round.links, share: rough.then_some(ROUGH_SHARE) };
-        let Some(sliding) = self.sliding else {
-            return Ok((self.system.solve_linked(goal.b, linked, rows, solve)?, None));
+        let before = solve.effort.iterations;
+        let (rows, contact) = if let Some(sliding) = self.rows.sliding {
+            let mut options = *self.options;
+            if rough {
+                options.contact.allowed = f64::INFINITY;
+            }
+            let begin = contact.map(|contact| WarmStart { rows, contact });
+            let motions = goal.motions;
+            let settle = ContactSolve { sliding, motions, begin, options: &options, linked };
+            let found = self.system.solve_with_contact(goal.b, &settle, solve)?;
+            (found.rows, Some(found.contact))
+        } else {
+            (self.system.solve_linked(goal.b, linked, rows, solve)?, None)
         };
-        let mut options = *self.options;
-        if rough {
-            options.contact.allowed = f64::INFINITY;
+        if rough && solve.effort.iterations > before + WORN {
+            let pushing = round.links.iter().filter(|link| link.pull(&rows) > 0.0);
+            let links: Vec<Link> = pushing.cloned().collect();
+            solve.multigrid = Some(self.system.multigrid_with(&links, &self.rows)?);
         }
-        let begin = contact.map(|contact| WarmStart { rows, contact });
-        let motions = goal.motions;
-        let settle = ContactSolve { sliding, motions, begin, options: &options, linked };
-        let Settled { rows, contact, .. } =
-            self.system.solve_with_contact(goal.b, &settle, solve)?;
-        Ok((rows, Some(contact)))
+        Ok((rows, contact))
     }
 
     /// Each motion at `share` of the plan.
@@ -370,7 +387,7 @@ impl TouchingPlan<'_> {
         from: &[&Motion],
         to: &[&Motion],
     ) -> Option<ContactStart> {
-        let sliding = self.sliding?;
+        let sliding = self.rows.sliding?;
         let rest = sliding.carried_back(from, pose.contact.as_ref()?)?;
         sliding.carried(to, &rest)
     }
@@ -396,7 +413,8 @@ impl TouchingPlan<'_> {
         let mut met = self.pairs.met(&done.planes, &done.round, &pose.rows);
         // A node that has slid past the border of the other part may have its closest point on the far side.
         let is_inside = |node: u32| inside.binary_search_by_key(&node, |(j, _)| *j).is_ok();
-        met.retain(|m| m.is_bone || m.force > 0.0 || m.gap >= -self.close() || is_inside(m.node));
+        let close = self.close();
+        met.retain(|m| m.is_bone || m.force > 0.0 || m.gap >= -close || is_inside(m.node));
         let mut forces = vec![[0.0; 3]; pose.rows.len()];
         for link in &done.round.links {
             link.add_force(&pose.rows, &mut forces);

@@ -1,5 +1,8 @@
 //! What the solves of one plan share: the reference length of tolerances, the work done, the interrupt.
 
+use std::sync::Arc;
+
+use crate::algebra::multigrid::Multigrid;
 use crate::statics::options::Interrupt;
 
 /// Counters of the linear solves of one plan.
@@ -27,11 +30,15 @@ pub(crate) struct PlanSolve<'a> {
     pub scale: f64,
     pub interrupted: Interrupt<'a>,
     pub effort: Effort,
+    /// Error that the answers of the last rounds of contact may have whatever the tolerance, mm.
+    pub allowed: f64,
+    /// The hierarchy of the body with links that push; none for that of the body alone.
+    pub multigrid: Option<Arc<Multigrid>>,
 }
 
 impl<'a> PlanSolve<'a> {
     /// The record of a solve that has not started.
     pub fn new(scale: f64, interrupted: Interrupt<'a>) -> Self {
-        Self { scale, interrupted, effort: Effort::default() }
+        Self { scale, interrupted, effort: Effort::default(), allowed: 0.0, multigrid: None }
     }
 }

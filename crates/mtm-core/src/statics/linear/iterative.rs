@@ -272,7 +272,7 @@ impl Iterative {
             StartedPreconditioner::new(&self.multigrid, &b).reach(solve.scale)
         });
         let length = conditions.constraints.iter().fold(length, |m, c| m.max(c.offset.abs()));
-        let tolerance = self.tolerance * length;
+        let tolerance = (self.tolerance * length).max(solve.allowed);
         if self.sweeps {
             let system = conditions.applied_to(&self.matrix);
             let rows = self.relax_to_bound(&system, &b, tolerance, solve)?;
@@ -286,13 +286,14 @@ impl Iterative {
             start[k.row] = sub(start[k.row], scaled(k.normal, dot(k.normal, start[k.row])));
         }
         let options = self.options(tolerance);
+        let multigrid = solve.multigrid.clone().unwrap_or_else(|| self.multigrid.clone());
         let mut unheld = Vec::new();
         let mut left_out = Vec::new();
         let (found, solved) = loop {
             let product =
                 ProjectedProduct::new(&self.matrix, &constraints, &springs).with_links(links);
             let confirmed =
-                self.confirmed((&product, &*self.multigrid), &trail.trial, solve.interrupted);
+                self.confirmed((&product, &*multigrid), &trail.trial, solve.interrupted);
             match confirmed.solve(&b, &start, &options, leave.enough, &mut trail.seen)? {
                 Reached::Solution(found) => break (found, true),
                 Reached::Step(found) => break (found, false),
@@ -341,6 +342,7 @@ impl Iterative {
         let mut rows = start;
         rows.resize(b.len(), [0.0; 3]);
         add_offsets(&mut rows, &constraints);
+        let multigrid = solve.multigrid.clone().unwrap_or_else(|| self.multigrid.clone());
         loop {
             if (solve.interrupted)() {
                 return Err(MtmError::Interrupted);
@@ -355,7 +357,7 @@ impl Iterative {
                 forces[*row] = add(forces[*row], scaled(s.axis, pull));
             }
             product.project(&mut forces);
-            let pressed = Pressed { a: &product, preconditioner: &*self.multigrid, links };
+            let pressed = Pressed { a: &product, preconditioner: &*multigrid, links };
             let found = pressed.solve(rows, forces, (share, MOST_PRESSED));
             solve.effort.add(found.history.len(), found.history);
             rows = found.x;

@@ -4,6 +4,7 @@
 //! conjugate to the last one (Polak & Ribière 1969) and followed to the minimum of the energy along it, so that
 //! links may begin or cease to push in any iteration and the iterations never start again.
 
+use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::krylov::{Operator, Preconditioner};
 use crate::algebra::row_sums::{advance, dot};
 use crate::contact::links::Link;
@@ -13,6 +14,41 @@ use crate::vector::{add, scaled};
 const BISECTIONS: usize = 40;
 /// Largest multiple of a direction.
 const FARTHEST: f64 = 1e6;
+
+/// `matrix` with `links`: its pattern grows by the blocks that they couple.
+pub(crate) fn with_links(matrix: &BlockMatrix, links: &[Link]) -> BlockMatrix {
+    let mut more = vec![Vec::new(); matrix.n_rows()];
+    let pairs = |link: &Link| {
+        let (k, ends) = (link.stiffness, link.ends.clone());
+        let with = move |a| ends.clone().into_iter().map(move |b| (k, a, b));
+        link.ends.clone().into_iter().flat_map(with)
+    };
+    for (_, (row, _), (column, _)) in links.iter().flat_map(pairs) {
+        more[row as usize].push(column);
+    }
+    let (mut row_start, mut columns) = (vec![0], Vec::with_capacity(matrix.columns.len()));
+    for (j, more) in more.iter_mut().enumerate() {
+        more.extend_from_slice(matrix.row(j).0);
+        more.sort_unstable();
+        more.dedup();
+        columns.append(more);
+        row_start.push(columns.len());
+    }
+    let mut out = BlockMatrix::from_pattern(row_start, columns);
+    for j in 0..matrix.n_rows() {
+        let (columns, blocks) = matrix.row(j);
+        for (&column, block) in columns.iter().zip(blocks) {
+            *out.block_mut(j, column) = *block;
+        }
+    }
+    for (k, (row, a), (column, b)) in links.iter().flat_map(pairs) {
+        let block = out.block_mut(row as usize, column);
+        for (i, value) in block.iter_mut().enumerate() {
+            *value += k * a[i / 3] * b[i % 3];
+        }
+    }
+    out
+}
 
 /// Such an energy.
 pub(crate) struct Pressed<'a> {
@@ -106,5 +142,30 @@ impl Pressed<'_> {
             }
         }
         0.5 * (low + high)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn matrix_with_links_multiplies_like_matrix_and_links() {
+        let mut matrix = BlockMatrix::from_pattern(vec![0, 2, 4, 5], vec![0, 1, 0, 1, 2]);
+        for (i, value) in matrix.blocks.iter_mut().flatten().enumerate() {
+            *value = (1.3 * i as f64).sin();
+        }
+        let link = |ends, stiffness| Link { ends, stiffness, goal: 0.2 };
+        let one = link(vec![(2, [0.6, 0.8, 0.0]), (0, [-0.3, 0.1, 0.5])], 3.0);
+        let links = [one, link(vec![(1, [0.0, 0.6, 0.8])], 0.7)];
+        let x = [[0.3, -1.1, 0.7], [0.2, 0.9, -0.4], [1.3, 0.8, -0.6]];
+        let mut expected = matrix.multiply(&x);
+        for link in &links {
+            link.add_product(&x, &mut expected);
+        }
+        let found = with_links(&matrix, &links).multiply(&x);
+        for (a, b) in found.iter().flatten().zip(expected.iter().flatten()) {
+            assert!((a - b).abs() < 1e-14, "{found:?} {expected:?}");
+        }
     }
 }

@@ -11,10 +11,12 @@ use crate::algebra::constraints::{Constraint, projected};
 use crate::algebra::krylov::StepAccuracy;
 use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
+use crate::contact::links::Link;
 use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
 use crate::error::{MtmError, Result};
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::{Extremes, Iterative, KeptForNext, SolveMemory, hierarchy};
+use crate::statics::linear::pressed::with_links;
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::plans::frozen::FrozenContact;
@@ -209,6 +211,17 @@ impl System {
             }
             Kept::Matrix(system) => system.settled(b, settle, solve),
         }
+    }
+
+    /// The hierarchy of the `body` of this system with `links`.
+    ///
+    /// # Errors
+    /// Any method except conjugate gradients.
+    pub fn multigrid_with(&self, links: &[Link], body: &BodyRows<'_>) -> Result<Arc<Multigrid>> {
+        let Kept::Matrix(kept) = &self.kept else {
+            return Err(touching_needs_pcg(Method::Cholesky));
+        };
+        Ok(Arc::new(multigrid(&with_links(kept.matrix(), links), body)?))
     }
 
     /// Rows under links if no node slides, starting from displacements `start`.
