@@ -52,19 +52,11 @@ pub struct ContactOptions {
     pub allowed: f64,
     /// Maximum number of Newton steps.
     pub max_iterations: usize,
-    /// How far beyond the border of an open contact surface a node may end, over the mean edge of the surface.
-    pub border_reach: f64,
 }
 
 impl Default for ContactOptions {
     fn default() -> Self {
-        Self {
-            mode: ContactMode::Bilateral,
-            tolerance: 1e-4,
-            allowed: 0.0,
-            max_iterations: 50,
-            border_reach: 0.25,
-        }
+        Self { mode: ContactMode::Bilateral, tolerance: 1e-4, allowed: 0.0, max_iterations: 50 }
     }
 }
 

@@ -36,7 +36,7 @@ const LINK_STIFFNESS: f64 = 1.0;
 /// the closest point jumps from facet to facet, and is undefined at the surface.
 const NEAR_SHARE: f64 = 0.5;
 /// Distance beyond the border of an open surface, over its mean edge, up to which a node may still touch it.
-const BORDER_REACH: f64 = 0.25;
+pub(super) const BORDER_REACH: f64 = 0.25;
 /// Largest decrease of a gap in one round for a node that passes through its surface, over the mean edge: while
 /// bones move, the planes that move with them stop it earlier.
 const JUMP_SHARE: f64 = 1.0;

@@ -54,7 +54,6 @@ pub struct Surface {
 struct Shape {
     vertices: Vec<[f64; 3]>,
     facet_normals: Vec<Vec3>,
-    areas: Vec<f64>,
     /// Unit normal of each smoothing group.
     group_normals: Vec<Vec3>,
     /// Angle-weighted unit normal over all triangles of a vertex, zero if there are none or their normals
@@ -270,11 +269,6 @@ impl Surface {
         self.shape.facet_normals.iter().map(|&n| n.into()).collect()
     }
 
-    /// Area of each triangle, mm².
-    pub fn facet_areas(&self) -> &[f64] {
-        &self.shape.areas
-    }
-
     /// Angle-weighted unit normal of each vertex over all its triangles, creases or not.
     ///
     /// Zero for a vertex that no triangle uses or whose normals cancel.
@@ -440,7 +434,6 @@ impl Shape {
             topology.edges.iter().map(edge_length).sum::<f64>() / topology.edges.len() as f64;
         Self {
             facet_normals: facets.iter().map(|facet| facet.normal).collect(),
-            areas: facets.iter().map(|facet| facet.area).collect(),
             group_normals,
             vertex_normals,
             bvh,

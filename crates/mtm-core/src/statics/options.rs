@@ -149,16 +149,6 @@ impl StaticOptions {
                 kind: ErrorKind::Solver,
             });
         }
-        let reach = self.contact.border_reach;
-        if reach.is_nan() || reach < 0.0 {
-            return Err(MtmError::OutOfRange {
-                what: "border_reach".into(),
-                index: 0,
-                value: reach,
-                allowed: "0 or more (mean edges of the contact surface)",
-                kind: ErrorKind::Solver,
-            });
-        }
         let counts = [
             ("max_iterations", self.max_iterations),
             ("contact_iterations", Some(self.contact.max_iterations)),

@@ -1,5 +1,6 @@
 //! One contact problem: its conditions about a state, its steps, and what a state leaves open.
 
+use crate::contact::pairs::BORDER_REACH;
 use crate::contact::seat::{LocalShape, Seats};
 use crate::contact::{
     Body, Constraints, ContactMode, ContactOptions, ContactRow, ContactStart, ContactState,
@@ -267,7 +268,7 @@ impl ContactProblem<'_> {
             places.iter().enumerate().map(|(i, &x)| self.seats.closest(i, x)).collect();
         for (i, (found, past)) in closest.iter().enumerate().filter(|(i, _)| active[*i]) {
             let s = self.sliding.nodes[i].segment;
-            let reach = self.options.border_reach * self.seats.mean_edge(s);
+            let reach = BORDER_REACH * self.seats.mean_edge(s);
             if let Some(past) = past.filter(|&past| past > reach) {
                 return Err(MtmError::ContactSurface {
                     segment: self.sliding.names[s].clone(),
