@@ -283,7 +283,7 @@ class LocalServer:
 def solved_plan(planning: PlanningModel, plan: Mapping[str, Floats]) -> tuple[Floats, Any]:
     """The exact displacements of the skin's nodes, mm, with a summary of the solution."""
     begun = time.perf_counter()
-    prediction = planning.predict(plan)
+    prediction = planning.solve(plan)
     return prediction.skin_displacements, {
         "seconds": time.perf_counter() - begun,
         "contact_converged": bool(prediction.result.summary["contact_converged"]),

@@ -47,10 +47,8 @@ def test_the_exact_face_of_a_plan_is_that_of_predict(case, predicted):
     """Also of what is lifted off the bone; pages solve contact to 0.01 mm, `predict` further."""
     planning = work._held[str(case)][1]
     plan = {n: m.matrix for n, m in cmfsim.Case.load(case).plan.items()}
-    shift = planning.predict(plan).skin_displacements
+    shift = planning.solve(plan).skin_displacements
     np.testing.assert_allclose(shift, predicted.skin_displacements, atol=1e-3)
-    at_first = planning.solve(plan).skin_displacements
-    assert np.abs(at_first - predicted.skin_displacements).max() > 0.01
     sent = work.solve(str(case), plan_of(case)).arrays["shift"]
     np.testing.assert_array_equal(sent, shift)
 

@@ -123,8 +123,10 @@ def desk(options: argparse.Namespace) -> int:
 
 def _error_text(errors: ExpectedError) -> str:
     """The error of the page as measured by exact solutions, in one line."""
-    if not errors.slides:
-        return "none: no tissue slides, so the page is exact for every plan"
+    if errors.is_exact:
+        return (
+            "none: no tissue slides or is lifted, so the page is exact for every plan"
+        )
     solved = [trial for trial in errors.trials if not trial.failed]
     failed = len(errors.trials) - len(solved)
     if not solved:

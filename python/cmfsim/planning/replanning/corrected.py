@@ -1,33 +1,29 @@
 """A planning model whose operator is corrected by exact solutions of plans around the reference."""
 
-import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.errors import CaseInputError, ContactError, SolverError
+from cmfsim.errors import CaseInputError
 from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction, telling
 from cmfsim.planning.replanning.expected_error import (
     moving_segments,
     plan_distance,
     plan_near,
     segment_boxes,
+    solved_plans,
 )
-from cmfsim.planning.replanning.model import Motions, PlanningModel
+from cmfsim.planning.replanning.model import PlanningModel
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
 CORRECTING = "solving nearby plans to correct the operator"
 # Plans that are solved for a correction.
-CORRECTIONS = 48
+CORRECTIONS = 16
 # Plans that are drawn for each one that is solved.
 DRAWN = 4
 # With fewer solved plans, interpolation between them is meaningless.
 LEAST_PLANS = 8
-# Solutions at once: each takes memory for its own vectors.
-MOST_AT_ONCE = 4
 
 
 def corrected_planning(
@@ -62,8 +58,8 @@ def corrected_planning(
     Returns
     -------
     PlanningModel
-        The same model, unless tissue slides, enough plans could be solved, and the correction
-        helps.
+        The same model, unless its product is not exact, enough plans could be solved, and the
+        correction helps.
 
     Raises
     ------
@@ -81,7 +77,7 @@ def corrected_planning(
     if isinstance(plans, bool) or not isinstance(plans, int) or plans < 0:
         raise CaseInputError(f"plans is {plans!r}: a whole number from 0 on is needed")
     bare = replace(planning, correction=None)
-    if not planning.slides or plans < LEAST_PLANS:
+    if planning.is_exact or plans < LEAST_PLANS:
         return bare
     boxes = segment_boxes(bare)
     numbers = PlanNumbers.about(bare.reference, {n: boxes[n] for n in moving_segments(bare)})
@@ -89,12 +85,12 @@ def corrected_planning(
     places, distances, errors = [], [], []
     with shown_progress(progress, {CORRECTING: PLANNING[CORRECTING]}) as shown:
         shown(f"{CORRECTING} (1 of {plans})")
-        for number, exact in enumerate(_solved(bare, drawn)):
+        for number, solved in enumerate(solved_plans(bare, drawn)):
             shown(f"{CORRECTING} ({min(number + 2, plans)} of {plans})")
-            if exact is not None:
+            if solved.shift is not None:
                 places.append(numbers.of(drawn[number]))
                 distances.append(plan_distance(bare, drawn[number]))
-                errors.append(exact - bare.displacements(drawn[number]))
+                errors.append(solved.shift - bare.displacements(drawn[number]))
     if len(places) < LEAST_PLANS:
         return bare
     correction, pays = fitted_correction(
@@ -111,25 +107,3 @@ def chosen_plans(
     rng = np.random.default_rng((seed, 1))
     drawn = [plan_near(planning, rng, *reach) for _ in range(DRAWN * count)]
     return [drawn[n] for n in telling(np.array([numbers.of(plan) for plan in drawn]), count)]
-
-
-def _solved(planning: PlanningModel, plans: Sequence[Motions]) -> Iterator[Floats | None]:
-    """The exact displacements of each plan, in order; None where it has no answer.
-
-    Several at once: what is serial in a solution leaves the other processors idle.
-    """
-
-    def solved(plan: Motions) -> Floats | None:
-        try:
-            exact, converged = planning.exact(plan)
-        except (ContactError, SolverError):
-            return None
-        # What stopped above its tolerance is no answer to interpolate.
-        return exact if converged else None
-
-    pool = ThreadPoolExecutor(min(MOST_AT_ONCE, os.cpu_count() or 1))
-    try:
-        yield from pool.map(solved, plans)
-    finally:
-        # After Ctrl-C nothing more is begun.
-        pool.shutdown(cancel_futures=True)

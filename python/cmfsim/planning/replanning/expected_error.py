@@ -1,7 +1,9 @@
 """The deviation of the plan operator from exact solutions, away from its reference plan."""
 
+import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +20,8 @@ TRIALS = 6
 TRYING = "solving a nearby plan exactly"
 # Plans are tried at these shares of the range, one after the other.
 SHARES = (1.0, 0.5)
+# Solutions at once: each takes memory for its own vectors.
+MOST_AT_ONCE = 4
 # The usual error is the one that this percentage of the plans stays within.
 USUAL = 90.0
 
@@ -57,8 +61,8 @@ class ExpectedError:
     trials : tuple of PlanTrial
     shift, turn : float, mm and degrees
         The range: along each axis, and about any axis.
-    slides : bool
-        Whether tissue slides; if not, the product is exact.
+    is_exact : bool
+        Whether nothing slides and no plan lifts other tissue: the product is then exact.
     left_out : (n, 3) float64, mm
         Distance, mean and largest error of the plans that correct the operator, each with the
         correction fitted to all others; none where nothing is corrected.
@@ -67,7 +71,7 @@ class ExpectedError:
     trials: tuple[PlanTrial, ...]
     shift: float
     turn: float
-    slides: bool
+    is_exact: bool
     left_out: Floats
 
     @property
@@ -82,14 +86,14 @@ class ExpectedError:
         all plans that were left out of the correction. The error grows faster than the distance,
         so this overestimates near the reference. None beyond `reach`, where no plan was tried.
         """
-        if distance > self.reach and self.slides:
+        if distance > self.reach and not self.is_exact:
             return None
         mean, largest = self._ratios().max(axis=0, initial=0.0)
         return distance * float(mean), distance * float(largest)
 
     def usual(self, distance: float) -> float | None:
         """The error that nine of ten plans stay below at a distance, mm, as in `at`."""
-        if distance > self.reach and self.slides:
+        if distance > self.reach and not self.is_exact:
             return None
         ratios = self._ratios()[:, 1]
         return distance * float(np.percentile(ratios, USUAL)) if len(ratios) else 0.0
@@ -101,7 +105,7 @@ class ExpectedError:
 
     def _ratios(self) -> Floats:
         """Mean and largest error over the distance, (n, 2); none where the product is exact."""
-        found = self._measured() if self.slides else np.zeros((0, 3))
+        found = np.zeros((0, 3)) if self.is_exact else self._measured()
         return found[:, 1:] / found[:, :1]
 
     def as_dict(self) -> dict[str, Any]:
@@ -109,7 +113,7 @@ class ExpectedError:
         return {
             "shift_mm": self.shift,
             "turn_degrees": self.turn,
-            "slides": self.slides,
+            "is_exact": self.is_exact,
             "reach_mm": self.reach,
             "trials": [
                 {
@@ -172,8 +176,8 @@ def expected_error(
 
     Every segment that the reference moves (all, if it moves none) is shifted by up to `shift` along
     each axis and turned by up to `turn` about a random axis through the middle of its surface, each
-    segment independently; every second plan by half of that. Without sliding tissue, one plan is
-    solved as a check.
+    segment independently; every second plan by half of that. A product that is exact is
+    checked at one plan.
 
     Parameters
     ----------
@@ -202,21 +206,21 @@ def expected_error(
     if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
         raise CaseInputError(f"trials is {trials!r}: a whole number of 1 or more is needed")
     rng = np.random.default_rng(seed)
+    shares = [SHARES[n % len(SHARES)] for n in range(1 if planning.is_exact else trials)]
+    plans = [plan_near(planning, rng, share * shift, share * turn) for share in shares]
     found = []
-    count = trials if planning.slides else 1
     with shown_progress(progress, {TRYING: PLANNING[TRYING]}) as shown:
-        for number in range(count):
-            shown(f"{TRYING} ({number + 1} of {count})")
-            share = SHARES[number % len(SHARES)]
-            plan = plan_near(planning, rng, share * shift, share * turn)
-            found.append(_trial(planning, plan))
+        shown(f"{TRYING} (1 of {len(plans)})")
+        for number, solved in enumerate(solved_plans(planning, plans)):
+            shown(f"{TRYING} ({min(number + 2, len(plans))} of {len(plans)})")
+            found.append(_trial(planning, plans[number], solved))
     correction = planning.correction
     left_out = np.zeros((0, 3))
     if correction is not None:
         left_out = np.stack(
             [correction.distances, correction.left_out_mean, correction.left_out], axis=1
         )
-    return ExpectedError(tuple(found), shift, turn, planning.slides, left_out)
+    return ExpectedError(tuple(found), shift, turn, planning.is_exact, left_out)
 
 
 def moving_segments(planning: PlanningModel) -> tuple[str, ...]:
@@ -240,16 +244,52 @@ def plan_near(
     return plan
 
 
-def _trial(planning: PlanningModel, plan: dict[str, Floats]) -> PlanTrial:
-    distance = plan_distance(planning, plan)
-    begun = time.perf_counter()
+@dataclass(frozen=True, eq=False)
+class SolvedPlan:
+    """A plan as `predict` solves it.
+
+    shift: (k, 3), mm. Displacements of the skin; none if `failed` says why there are none.
+    """
+
+    shift: Floats | None
+    failed: str
+    seconds: float
+
+
+def solved_plans(planning: PlanningModel, plans: Sequence[Motions]) -> Iterator[SolvedPlan]:
+    """The solution of each plan, in order.
+
+    Several at once: what is serial in a solution leaves the other processors idle.
+    """
+
+    def solved(plan: Motions) -> SolvedPlan:
+        begun = time.perf_counter()
+        shift, failed = None, ""
+        try:
+            prediction = planning.solve(plan)
+        except (ContactError, SolverError) as error:
+            failed = str(error)
+        else:
+            # What stopped above its tolerance is no answer to measure by, or to interpolate.
+            if prediction.result.summary["contact_converged"]:
+                shift = prediction.skin_displacements
+            else:
+                failed = "contact stopped above its tolerance"
+        return SolvedPlan(shift, failed, time.perf_counter() - begun)
+
+    pool = ThreadPoolExecutor(min(MOST_AT_ONCE, os.cpu_count() or 1))
     try:
-        exact, _ = planning.exact(plan)
-    except (ContactError, SolverError) as error:
-        seconds = time.perf_counter() - begun
-        return PlanTrial(plan, distance, None, None, None, str(error), seconds)
-    seconds = time.perf_counter() - begun
-    away = np.linalg.norm(planning.displacements(plan) - exact, axis=1)
+        yield from pool.map(solved, plans)
+    finally:
+        # After Ctrl-C nothing more is begun.
+        pool.shutdown(cancel_futures=True)
+
+
+def _trial(planning: PlanningModel, plan: dict[str, Floats], solved: SolvedPlan) -> PlanTrial:
+    distance = plan_distance(planning, plan)
+    if solved.shift is None:
+        return PlanTrial(plan, distance, None, None, None, solved.failed, solved.seconds)
+    away = np.linalg.norm(planning.displacements(plan) - solved.shift, axis=1)
     return PlanTrial(
         plan,
         distance,
@@ -257,5 +297,5 @@ def _trial(planning: PlanningModel, plan: dict[str, Floats]) -> PlanTrial:
         float(np.percentile(away, 95)),
         float(away.max()),
         "",
-        seconds,
+        solved.seconds,
     )

@@ -11,7 +11,7 @@ from cmfsim._core import StaticSolver
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.replanning.columns import PlanColumns, plan_columns
 from cmfsim.planning.replanning.correction import PlanCorrection
-from cmfsim.solving.models import model_scene, predict_patient
+from cmfsim.solving.models import model_scene, predict_patient, solved_patient
 from cmfsim.solving.simulation import scene_plan, scene_solver
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix
@@ -34,8 +34,8 @@ class PlanningModel:
 
     A plan can be computed in two ways. `displacements`, `skin`, `face` and `carried` use one
     product with the columns of the plan operator, in which contact is linearised about the
-    reference plan and corrected by `correction`. `solve` is exact. Both agree at the reference, and
-    everywhere if no tissue slides.
+    reference plan, tissue stays lifted off the bone as there, and `correction` corrects the rest.
+    `solve` is exact. Both agree at the reference, and everywhere if the model `is_exact`.
 
     Attributes
     ----------
@@ -65,14 +65,14 @@ class PlanningModel:
         """The segments that a plan may move."""
         return self.columns.segments
 
-    @property
-    def slides(self) -> bool:
-        """Whether tissue slides on a segment; if not, the product is exact for every plan."""
-        return any(np.size(segment.sliding) for segment in self._scene.segments.values())
-
     @cached_property
-    def _scene(self) -> Scene:
-        return model_scene(self.patient, self.model)
+    def is_exact(self) -> bool:
+        """Whether the product is exact for every plan: no tissue slides, or is lifted."""
+        segments = model_scene(self.patient, self.model).segments.values()
+        lifted = self.patient.lifted
+        return not any(np.size(segment.sliding) for segment in segments) and (
+            lifted is None or not len(lifted.nodes)
+        )
 
     @cached_property
     def skin_before(self) -> SurfaceData:
@@ -120,39 +120,11 @@ class PlanningModel:
         vertices = before.vertices
         return SurfaceData(vertices + self.carried(plan, vertices), before.triangles)
 
-    def exact(self, plan: Motions) -> tuple[Floats, bool]:
-        """How the skin moves under a plan, (k, 3) mm, as `solve`; and whether contact converged.
-
-        Nothing is judged, hashed or kept: for many plans, of which only the skin counts.
-
-        Raises
-        ------
-        ContactError, SolverError
-            As `solve`.
-        """
-        found = self.solver.solve(self.whole(plan), loads=self._scene.loads)
-        return self.patient.skin_field(found.displacements), found.contact_converged
-
-    def predict(self, plan: Motions) -> Prediction:
-        """The prediction of `predict` under a plan: `solve`, with tissue lifted as by this plan.
-
-        Where other nodes are lifted off the bone than at the reference, the equations are set up
-        again, and solved as a single plan is.
-        """
-        patient = self.patient.with_plan(self.whole(plan))
-        reference = self.patient.scene
-        is_same = np.array_equal(patient.scene.fixed, reference.fixed) and all(
-            np.array_equal(segment.joined, reference.segments[name].joined)
-            for name, segment in patient.scene.segments.items()
-        )
-        if is_same:
-            return predict_patient(patient, self.model, solver=self.solver)
-        # A factorisation pays for many plans only.
-        once = replace(patient.scene, options=replace(patient.scene.options, method="auto"))
-        return predict_patient(replace(patient, scene=once), self.model)
-
     def solve(self, plan: Motions) -> Prediction:
-        """The prediction under a plan, solved exactly, contact included.
+        """The prediction of `predict` under a plan, solved exactly, contact included.
+
+        Tissue is lifted off the bone as by this plan. Where the reference lifts other nodes, the
+        equations are set up again, and solved as a single plan is.
 
         Raises
         ------
@@ -160,11 +132,17 @@ class PlanningModel:
             Contact does not converge, or the equations are not solved.
         """
         patient = self.patient.with_plan(self.whole(plan))
-        # What is lifted off the bone is as at the reference: the factorisation is of that.
-        reference = self.patient.scene
-        scene = replace(patient.scene, fixed=reference.fixed, segments=reference.segments)
-        patient = replace(patient, scene=scene)
-        return predict_patient(patient, self.model, solver=self.solver)
+        scene, reference = patient.scene, self.patient.scene
+        is_same = np.array_equal(scene.fixed, reference.fixed) and all(
+            np.array_equal(segment.joined, reference.segments[name].joined)
+            for name, segment in scene.segments.items()
+        )
+        if is_same:
+            return predict_patient(patient, self.model, solver=self.solver)
+        # A factorisation pays for many plans only.
+        once = replace(scene, options=replace(scene.options, method="auto"))
+        patient = replace(patient, scene=once)
+        return solved_patient(patient, self.model, tensors=self.solver.tensors).prediction
 
 
 def planning_model(

@@ -58,7 +58,7 @@ def test_a_served_plan_is_solved_exactly(server, planning):
     )
     assert status == 200
     shift = np.frombuffer(body, "<f4").reshape(-1, 3)
-    exact = planning.predict(plan).skin_displacements
+    exact = planning.solve(plan).skin_displacements
     np.testing.assert_allclose(shift, exact, atol=1e-4)
     assert json.loads(headers["X-Solution"])["contact_converged"]
 
@@ -229,7 +229,7 @@ def test_the_served_page_swaps_in_the_exact_face(browser, server, planning):
     type_number(page, "forwards", -5.5)
     until(page, "document.getElementById('error-state').textContent.startsWith('Solved exactly')")
     settle(page)
-    exact = planning.predict(motions_of(page, planning))
+    exact = planning.solve(motions_of(page, planning))
     before = np.array(page.evaluate("[...cmfsimPage.face.before]")).reshape(-1, 3)
     after = np.array(page.evaluate("[...cmfsimPage.after]")).reshape(-1, 3)
     np.testing.assert_allclose(after - before, exact.carried(before), atol=0.01)

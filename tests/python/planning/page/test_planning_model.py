@@ -96,33 +96,42 @@ def test_corrections_are_the_same_each_time(bare, planning):
 def test_corrections_that_cannot_be_fitted_leave_the_operator_alone(bare, planning):
     assert cmfsim.corrected_planning(planning, 0).correction is None
     assert cmfsim.corrected_planning(bare, 4).correction is None
-    assert (
-        cmfsim.corrected_planning(cmfsim.planning_model(bare.patient, "H"), 24).correction is None
-    )
+    patient = dataclasses.replace(bare.patient, lifted=None)
+    assert cmfsim.corrected_planning(cmfsim.planning_model(patient, "H"), 24).correction is None
     with pytest.raises(cmfsim.CaseError, match="plans is -1"):
         cmfsim.corrected_planning(bare, -1)
 
 
-def test_without_sliding_the_product_is_exact_for_every_plan(planning):
-    model = cmfsim.planning_model(planning.patient, "H")
+def test_without_sliding_or_lifting_the_product_is_exact_for_every_plan(planning):
+    patient = dataclasses.replace(planning.patient, lifted=None)
+    model = cmfsim.planning_model(patient, "H")
     plan = other_plan(model, 3.0)
     exact = model.solve(plan).skin_displacements
     assert np.abs(exact).max() > 5.0
     np.testing.assert_allclose(model.displacements(plan), exact, atol=1e-8)
     found = cmfsim.expected_error(model)
-    assert not found.slides
+    assert found.is_exact
     assert len(found.trials) == 1
     assert found.trials[0].largest < 1e-8
     assert found.at(100.0) == (0.0, 0.0)
 
 
+def test_the_error_is_that_of_tissue_lifted_as_predict_lifts_it(planning):
+    """Nothing slides in model H, but other plans lift other tissue off the bone."""
+    model = cmfsim.planning_model(planning.patient, "H")
+    found = cmfsim.expected_error(model, trials=1)
+    assert not found.is_exact
+    trial = found.trials[0]
+    alone = cmfsim.predict_patient(model.patient.with_plan(trial.plan), "H")
+    away = np.linalg.norm(model.displacements(trial.plan) - alone.skin_displacements, axis=1)
+    assert trial.largest == pytest.approx(away.max(), abs=1e-4)
+    assert trial.largest > 0.01
+    assert found.at(trial.distance)[1] == pytest.approx(trial.largest)
+
+
 def test_a_prediction_is_planned_again_as_the_model_solves_it(planning, reference):
     plan = {"maxilla": other_plan(planning)["maxilla"]}
-    # A planning model keeps what its reference lifts off the bone, a new prediction does not.
-    kept = dataclasses.replace(
-        reference, patient=dataclasses.replace(reference.patient, lifted=None)
-    )
-    again, exact = kept.replan(plan), planning.solve(plan)
+    again, exact = reference.replan(plan), planning.solve(plan)
     np.testing.assert_allclose(again.skin_displacements, exact.skin_displacements, atol=1e-6)
     # Segments that are not named stay, and nothing is said of where the case's motions came from.
     np.testing.assert_array_equal(again.scene.plan["mandible_body"], np.eye(4))

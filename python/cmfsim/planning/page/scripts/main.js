@@ -288,7 +288,7 @@ class App {
 
   showError() {
     const box = document.getElementById("error-state");
-    const { slides, reach_mm: reach, trials, left_out: leftOut } = this.page.expected_error;
+    const { is_exact: isExact, reach_mm: reach, trials, left_out: leftOut } = this.page.expected_error;
     const distance = this.face.distance(this.motions);
     const found = this.face.expectedError(this.motions);
     let warned = false;
@@ -297,7 +297,7 @@ class App {
       box.textContent = `Solved exactly on this machine in ${seconds.toFixed(1)} s${converged ? "" : "; contact stopped above its tolerance"}.`;
       warned = !converged;
     } else if (distance <= SAME_PLAN) box.textContent = "The case's plan: this face was solved exactly.";
-    else if (!slides) box.textContent = "No tissue slides in this model: the face equals the exact solution (rounding 0.01 mm).";
+    else if (isExact) box.textContent = "In this model no tissue slides or is lifted off the bone: the face equals the exact solution (rounding 0.01 mm).";
     else if (!found) {
       box.textContent = `This plan is ${distance.toFixed(1)} mm from the case's own, farther than any plan that was tested (${reach.toFixed(1)} mm): the face may be wrong. Solve it exactly.`;
       warned = true;

@@ -137,8 +137,8 @@ export class PatientFace {
 
   /** Errors to expect of the operator, mm: mean, largest at nine of ten plans and at the worst; null beyond what was tried. */
   expectedError(motions) {
-    const { slides, reach_mm: reach, trials, left_out: leftOut } = this.page.expected_error;
-    if (!slides) return { mean: 0, usual: 0, largest: 0 };
+    const { is_exact: isExact, reach_mm: reach, trials, left_out: leftOut } = this.page.expected_error;
+    if (isExact) return { mean: 0, usual: 0, largest: 0 };
     const distance = this.distance(motions);
     if (distance > reach) return null;
     const solved = [...trials.filter((t) => !t.failed), ...leftOut];
