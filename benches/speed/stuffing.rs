@@ -57,7 +57,7 @@ fn meshing(c: &mut Criterion) {
     )
     .expect("a mesh")
     .mesh;
-    let surface = Surface::new(mesh.nodes().to_vec(), mesh.boundary_triangles());
+    let surface = Surface::new(mesh.nodes().to_vec(), mesh.boundary_triangles().to_vec());
     let surface = surface.expect("a surface");
     println!("surface: {} triangles", surface.triangles().len());
     group.bench_function("signed distance of a surface", |b| {

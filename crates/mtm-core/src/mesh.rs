@@ -1,5 +1,7 @@
 //! Tetrahedral mesh: checks at construction, volumes, shape gradients, neighbours, boundary, quality.
 
+use std::sync::OnceLock;
+
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_coordinates};
@@ -26,6 +28,8 @@ pub struct TetMesh {
     tets: Vec<[u32; 4]>,
     volumes: Vec<f64>,
     incident: Incidence,
+    /// Found when first asked for: models of a patient share it.
+    boundary: OnceLock<Vec<[u32; 3]>>,
 }
 
 /// Tets around each node, ascending.
@@ -94,7 +98,7 @@ impl TetMesh {
             return Err(MtmError::UnusedNode { node, count: 1 + unused.count() });
         }
         check_duplicates(&tets, &incident)?;
-        Ok(Self { nodes, tets, volumes, incident })
+        Ok(Self { nodes, tets, volumes, incident, boundary: OnceLock::new() })
     }
 
     /// Node positions, mm.
@@ -157,16 +161,18 @@ impl TetMesh {
     }
 
     /// Triangles that belong to one tet only, outward, in mesh node indices, in order of their tet.
-    pub fn boundary_triangles(&self) -> Vec<[u32; 3]> {
-        (0..self.tets.len())
-            .into_par_iter()
-            .flat_map_iter(|t| {
-                FACES.iter().filter_map(move |face| {
-                    let tri = face.map(|v| self.tets[t][v]);
-                    (self.neighbour_across(t as u32, tri).is_none()).then_some(tri)
+    pub fn boundary_triangles(&self) -> &[[u32; 3]] {
+        self.boundary.get_or_init(|| {
+            (0..self.tets.len())
+                .into_par_iter()
+                .flat_map_iter(|t| {
+                    FACES.iter().filter_map(move |face| {
+                        let tri = face.map(|v| self.tets[t][v]);
+                        (self.neighbour_across(t as u32, tri).is_none()).then_some(tri)
+                    })
                 })
-            })
-            .collect()
+                .collect()
+        })
     }
 
     /// The other tet on the face `tri` of tet `t`.

@@ -96,7 +96,7 @@ impl PyTetMesh {
     /// Triangles of the boundary, outward, (t, 3) uint32 in mesh node indices.
     fn boundary_triangles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<u32>>> {
         let core = self.core.clone();
-        Ok(arrays::table(py, detached(py, move || core.boundary_triangles())?))
+        Ok(arrays::table(py, detached(py, move || core.boundary_triangles().to_vec())?))
     }
 
     /// Nodes on the boundary, (k,) uint32, ascending: vertex i of `surface()` is node i of these.
@@ -137,7 +137,7 @@ impl PyTetMesh {
 }
 
 fn boundary_nodes(mesh: &TetMesh) -> Vec<u32> {
-    let mut nodes: Vec<u32> = mesh.boundary_triangles().into_iter().flatten().collect();
+    let mut nodes: Vec<u32> = mesh.boundary_triangles().as_flattened().to_vec();
     nodes.sort_unstable();
     nodes.dedup();
     nodes

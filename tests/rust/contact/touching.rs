@@ -45,7 +45,7 @@ impl Blocks {
         let (bottom, lid) = (at_height(2.0 + gap, first, n), at_height(4.0 + gap, first, n));
         let faces = |of: &[u32]| -> Vec<[u32; 3]> {
             let all = mesh.boundary_triangles();
-            all.into_iter().filter(|t| t.iter().all(|j| of.contains(j))).collect()
+            all.iter().copied().filter(|t| t.iter().all(|j| of.contains(j))).collect()
         };
         let (above, below) = (faces(&bottom), faces(&top));
         Self { mesh, base, lid, above, below }

@@ -46,7 +46,7 @@ fn strain(m: FibreElastic, fibre: Vec3, e: Vec3, stress: f64) -> Matrix3<f64> {
 /// Loads of the traction σ n on every boundary triangle, a third at each corner (exact for constant σ).
 fn tractions(mesh: &TetMesh, sigma: Matrix3<f64>) -> Vec<[f64; 3]> {
     let mut loads = vec![[0.0; 3]; mesh.n_nodes()];
-    for triangle in mesh.boundary_triangles() {
+    for &triangle in mesh.boundary_triangles() {
         let [a, b, c] = triangle.map(|v| Vec3::from(mesh.nodes()[v as usize]));
         let force = sigma * (b - a).cross(&(c - a)) / 6.0;
         for v in triangle {

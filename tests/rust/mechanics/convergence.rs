@@ -147,7 +147,7 @@ fn thick_sphere_under_pressure_converges_with_order_two() {
     let errors = shells().map(|shape| {
         let mesh = shape.mesh();
         let mut loads = vec![Vec3::zeros(); mesh.n_nodes()];
-        for triangle in mesh.boundary_triangles() {
+        for &triangle in mesh.boundary_triangles() {
             let [a, b, c] = triangle.map(|v| Vec3::from(mesh.nodes()[v as usize]));
             if (a + b + c).norm() / 3.0 > 0.5 * (INNER + OUTER) {
                 continue;

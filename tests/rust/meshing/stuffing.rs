@@ -251,7 +251,7 @@ fn the_mesh_has_the_same_bits_for_any_number_of_threads() {
 fn the_signed_distance_of_a_surface_is_that_of_brute_force() {
     let surface = {
         let mesh = stuff(&ball(15.0), &options(4.0, 0), &Halvings::default()).expect("a mesh").mesh;
-        Surface::new(mesh.nodes().to_vec(), mesh.boundary_triangles()).expect("a surface")
+        Surface::new(mesh.nodes().to_vec(), mesh.boundary_triangles().to_vec()).expect("a surface")
     };
     let grid = Grid::new([25, 24, 26], [2.0, 2.1, 1.9], [0.0; 3]).expect("a grid");
     let level = signed_distance(&surface, grid, 4.0).expect("a level");
