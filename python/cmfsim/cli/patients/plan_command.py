@@ -124,9 +124,7 @@ def desk(options: argparse.Namespace) -> int:
 def _error_text(errors: ExpectedError) -> str:
     """The error of the page as measured by exact solutions, in one line."""
     if errors.is_exact:
-        return (
-            "none: no tissue slides or is lifted, so the page is exact for every plan"
-        )
+        return "none: no tissue slides or is lifted, so the page is exact for every plan"
     solved = [trial for trial in errors.trials if not trial.failed]
     failed = len(errors.trials) - len(solved)
     if not solved:
