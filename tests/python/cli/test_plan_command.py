@@ -63,9 +63,9 @@ def test_plan_writes_the_page_of_the_case(case, answer):
     assert answer["page"] == str(page)
     assert answer["bytes"] == page.stat().st_size < 12e6
     assert page_state(page) == plan_key(cmfsim.Case.load(case))
-    # Nothing slides in model H, but other plans lift other tissue off the bone.
-    assert not answer["expected_error"]["is_exact"]
-    assert len(answer["expected_error"]["trials"]) == 2
+    # Nothing slides or is lifted in model H: the page is exact, as one solution shows.
+    assert answer["expected_error"]["is_exact"]
+    assert answer["expected_error"]["trials"][0]["largest_mm"] < 1e-6
 
 
 def test_python_makes_the_page_of_the_command(case, answer, wished, tmp_path):
