@@ -70,6 +70,8 @@ translation = [{motion}]
 [muscles]
 """
 
+LIPS = "\n[lips]\ncontact = true\n"
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -86,6 +88,9 @@ class Variant:
     tolerance : float, mm
     causes : frozenset of str
         Codes of findings about what was changed.
+    are_lips_apart : bool
+        Whether it is compared with the clean face whose lips are separated: closed lips are one
+        sheet of tissue in a CT.
     cut : mapping of str to float, mm
         Distances of the cut, where they are not those of the clean head.
     """
@@ -95,6 +100,7 @@ class Variant:
     places: Callable[[np.ndarray], np.ndarray] = field(default=lambda points: points)
     tolerance: float = TOLERANCE
     causes: frozenset[str] = frozenset()
+    are_lips_apart: bool = False
     cut: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -123,6 +129,7 @@ def _open(degrees: float) -> Variant:
         places=lambda points: variants.opened(points, _landmarks(), degrees),
         tolerance=OPEN_TOLERANCE,
         causes=JAWS,
+        are_lips_apart=True,
     )
 
 
@@ -201,7 +208,7 @@ VARIANTS: Mapping[str, Variant] = {
 
 
 def predicted(
-    image: ImageData, motion: np.ndarray, edge: float, cut: Mapping[str, float]
+    image: ImageData, motion: np.ndarray, edge: float, cut: Mapping[str, float], more: str = ""
 ) -> dict[str, Any]:
     """Points and displacements of the face, the codes of findings, or the error."""
     import SimpleITK  # noqa: PLC0415
@@ -215,7 +222,7 @@ def predicted(
         SimpleITK.WriteImage(written, str(path / "ct.nii.gz"))
         distances = "\n".join(f"{name} = {value:.6f}" for name, value in cut.items())
         moved = ", ".join(f"{v:.6f}" for v in motion)
-        text = CASE.format(edge=edge, motion=moved, cut=distances)
+        text = CASE.format(edge=edge, motion=moved, cut=distances) + more
         (path / "case.toml").write_text(text, encoding="utf-8")
         try:
             found = cmfsim.predict(cmfsim.Case.load(path / "case.toml"), model="M+S")
@@ -300,12 +307,19 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="folder for rows")
     options = parser.parse_args()
     image = cmfsim.read_image(data_folder() / "ct_phantom" / "ct.nii.gz")
-    clean = _kept(
-        options.cache, "clean", options.edge, lambda: predicted(image, FORWARDS, options.edge, {})
-    )
-    if clean["error"]:
-        raise SystemExit(f"the unmodified CT: {clean['error']}")
-    usual = set(clean["codes"])
+    clean = {
+        apart: _kept(
+            options.cache,
+            f"clean {more}",
+            options.edge,
+            lambda more=more: predicted(image, FORWARDS, options.edge, {}, more),
+        )
+        for apart, more in ((False, ""), (True, LIPS))
+    }
+    for found in clean.values():
+        if found["error"]:
+            raise SystemExit(f"the unmodified CT: {found['error']}")
+    usual = set(clean[False]["codes"])
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"],  # noqa: S607
         cwd=ROOT, check=True, capture_output=True, text=True,
@@ -335,8 +349,8 @@ def main() -> None:
 
         row = _kept(options.cache, name, options.edge, make)
         if not row["error"]:
-            there = {**clean, "points": variant.places(clean["points"])}
-            row |= compared(row, there, to_variant)
+            to = clean[variant.are_lips_apart]
+            row |= compared(row, {**to, "points": variant.places(to["points"])}, to_variant)
         lines.append(_line(name, row, usual))
         print(lines[-1], file=sys.stderr, flush=True)
     publish(options.markdown, NAME, "\n".join(lines))

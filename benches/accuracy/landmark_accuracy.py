@@ -189,8 +189,9 @@ def _origin() -> str:
     ).stdout.strip()
     return (
         f"Commit {commit}, {platform.machine()}, {os.cpu_count()} cores, Python "
-        f"{platform.python_version()}; `python {NAME} --markdown docs/landmarks.md`. Distances "
-        "in mm; seconds are processor time without reading and segmenting the image."
+        f"{platform.python_version()}; `python -m {__spec__.name} --synthetic 6 --markdown "
+        "docs/landmarks.md`. Distances in mm; seconds are processor time without reading and "
+        "segmenting the image."
     )
 
 
