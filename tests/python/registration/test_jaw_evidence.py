@@ -11,6 +11,8 @@ from benches.scenes import ct_variants as variants
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
 from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.proposed.shape_model.model import HINGE
+from cmfsim.registration.proposed.shape_model.state import rotation_of
 
 pytest.importorskip("scipy")
 
@@ -51,6 +53,19 @@ def test_nothing_speaks_against_the_jaw_of_a_sound_head():
     assert not found.impossible_jaw
     assert not found.doubtful_jaw
     assert not any(site.doubt for site in found.skull.values())
+
+
+def test_a_mouth_open_by_28_degrees_has_a_jaw_with_its_sites():
+    turn = rotation_of(np.radians([28.0, 0.0, 0.0]))
+    found = proposed(lambda points: (points - HINGE) @ turn.T + HINGE)
+    assert not found.impossible_jaw
+    assert "apart at the incisors" in found.doubtful_jaw
+    # Rows that are apart are not separated once more.
+    assert not found.separation
+    for name, place in average_head().skull.items():
+        if name.startswith(("sub_m2", "occlusal_line", "infradentale", "menton")):
+            there = turn @ (place - HINGE) + HINGE
+            assert np.linalg.norm(found.skull[name].point - there) < 3.0, name
 
 
 def test_tooth_rows_that_rise_too_steeply_make_their_sites_doubtful():
