@@ -307,15 +307,16 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="folder for rows")
     options = parser.parse_args()
     image = cmfsim.read_image(data_folder() / "ct_phantom" / "ct.nii.gz")
-    clean = {
-        apart: _kept(
+
+    def clean_face(more: str) -> Any:
+        return _kept(
             options.cache,
             f"clean {more}",
             options.edge,
-            lambda more=more: predicted(image, FORWARDS, options.edge, {}, more),
+            lambda: predicted(image, FORWARDS, options.edge, {}, more),
         )
-        for apart, more in ((False, ""), (True, LIPS))
-    }
+
+    clean = {False: clean_face(""), True: clean_face(LIPS)}
     for found in clean.values():
         if found["error"]:
             raise SystemExit(f"the unmodified CT: {found['error']}")
