@@ -68,6 +68,17 @@ def reference(nodes, tets, young, held, moved, pairs):
     return u.reshape(-1, 3), forces
 
 
+def blocks_in_contact(nodes, tets, young, base, lid, pair):
+    """The solver for the blocks: nodes of the underside before the top of the lower block."""
+    bottom, top = pair
+    mesh = cmfsim.TetMesh(nodes, tets)
+    tissue = cmfsim.Tissue.isotropic(young, POISSON)
+    faces = mesh.boundary_triangles()
+    below = faces[np.isin(faces, top).all(axis=1)]
+    boundary = cmfsim.Boundary(fixed=base, joined={"lid": lid}, touching=[(bottom, below)])
+    return cmfsim.StaticSolver(cmfsim.MassTensors(mesh, tissue), boundary, method="pcg")
+
+
 def test_hertz_contact_of_two_soft_blocks(blocks):
     """Force, area of contact, pressure at each node and displacements equal the reference's."""
     nodes, tets, young, first = blocks
@@ -77,12 +88,7 @@ def test_hertz_contact_of_two_soft_blocks(blocks):
     bottom = top - top.min() + first
     assert np.array_equal(nodes[top, :2], nodes[bottom, :2])
     expected, forces = reference(nodes, tets, young, base, lid, np.stack([bottom, top], axis=1))
-    mesh = cmfsim.TetMesh(nodes, tets)
-    tissue = cmfsim.Tissue.isotropic(young, POISSON)
-    faces = mesh.boundary_triangles()
-    below = faces[np.isin(faces, top).all(axis=1)]
-    boundary = cmfsim.Boundary(fixed=base, joined={"lid": lid}, touching=[(bottom, below)])
-    solver = cmfsim.StaticSolver(cmfsim.MassTensors(mesh, tissue), boundary, method="pcg")
+    solver = blocks_in_contact(nodes, tets, young, base, lid, (bottom, top))
     found = solver.solve({"lid": cmfsim.rigid_motion(translation=(0.0, 0.0, -DOWN))})
     assert found.touching_converged
     pressed = np.zeros(len(nodes))
@@ -94,3 +100,18 @@ def test_hertz_contact_of_two_soft_blocks(blocks):
     assert np.abs(found.displacements - expected).max() < 0.01 * np.abs(expected).max()
     # A fifth of the underside touches: neither a point nor all of it.
     assert 0.1 < np.count_nonzero(forces) / len(forces) < 0.4
+
+
+def test_blocks_that_part_by_a_nanometre_move_as_exactly_as_by_a_millimetre(blocks):
+    """What counts as touching is no measure of the error of a motion that is smaller."""
+    nodes, tets, young, first = blocks
+    z = nodes[:, 2]
+    base, lid = np.flatnonzero(z == 0.0), np.flatnonzero(z > 2.0 * HEIGHT - 1e-9)
+    top = np.flatnonzero(z[:first] == HEIGHT)
+    pair = (top - top.min() + first, top)
+    solver = blocks_in_contact(nodes, tets, young, base, lid, pair)
+    # The lid is lifted and widened.
+    way = nodes[lid] * [0.05, 0.05, 0.0] + [0.0, 0.0, 1.0]
+    small, large = (solver.solve({"lid": share * way}) for share in (1e-6, 1.0))
+    assert not np.any(large.touching_forces)
+    assert np.abs(1e6 * small.displacements - large.displacements).max() < 1e-4
