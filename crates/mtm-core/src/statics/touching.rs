@@ -2,7 +2,7 @@
 //! steps.
 //!
 //! Contact is detected by closest points, so no step of the plan may take one part through another: bones move
-//! by a tissue edge at a time. Each step first uses the tangent planes at its start, which move with the bones
+//! by two tissue edges at a time. Each step first uses the tangent planes at its start, which move with the bones
 //! and have no far side, and then the surfaces actually met by the nodes. Intermediate steps do few, approximate
 //! rounds; at the end of the plan the rounds continue until nothing penetrates and nothing changes.
 
@@ -57,8 +57,10 @@ const MOST_ROUNDS_AHEAD: usize = 8;
 const AHEAD_EDGES: f64 = 0.05;
 /// Share of the first residual, in the energy norm, that a round before the last ones may leave.
 const ROUGH_SHARE: f64 = 0.1;
-/// Error of the solves that end a plan, over the distance that counts as touching.
+/// Error of the solves that end a plan, over the distance that counts as touching, which is at most this share of
+/// the motion of the bones here.
 const SOLVED_SHARE: f64 = 0.01;
+const SMALL_SHARE: f64 = 1e-3;
 /// Iterations of a round above which the next one gets a hierarchy that knows the links that push: setting one up
 /// takes as long as some twenty iterations.
 const WORN: usize = 25;
@@ -143,7 +145,7 @@ impl TouchingPlan<'_> {
         let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(solve.scale);
         let mut step = 1.0 / (farthest / (STEP_EDGES * self.pairs.mean_edge())).ceil().max(1.0);
         let (mut pose, mut here, mut rounds) = (self.rest(), 0.0, 0);
-        solve.allowed = SOLVED_SHARE * self.close();
+        solve.allowed = SOLVED_SHARE * self.close().min(SMALL_SHARE * farthest);
         loop {
             let there = if here + 1.5 * step >= 1.0 { 1.0 } else { here + step };
             let shorter = step > SHORTEST_STEP;
