@@ -258,8 +258,8 @@ def lip_seam(
         )
         return _not_found(" and ".join(filter(None, (shows, lacks))))
     sheet = lip_sheet(anatomy, frame, profiles, line, depth)
-    if sheet is None:
-        return _not_found("no teeth or bone lie behind the line where the lips meet")
+    if isinstance(sheet, str):
+        return _not_found(sheet)
     source = "landmarks" if shown is None else "gap" if sheet.opening >= OPEN else "crease"
     from_marks = _from_landmarks(line, frame, marks)
     findings = [*_told(source, way), *_far(from_marks)]

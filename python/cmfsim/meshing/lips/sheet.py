@@ -60,8 +60,8 @@ class LipSheet:
 
 def lip_sheet(
     anatomy: Anatomy, frame: MouthFrame, profiles: SkinProfiles, line: MouthLine, depth: float
-) -> LipSheet | None:
-    """The sheet from the mouth's line to the arches; None if it meets no bone.
+) -> LipSheet | str:
+    """The sheet from the mouth's line to the arches; or why there is none.
 
     Where the skin shows a gap between the lips the sheet is its mid-surface, and goes on behind its
     end at the same height.
@@ -70,13 +70,16 @@ def lip_sheet(
     """
     base = np.column_stack([line.across, line.ahead])
     centre = np.array([0.5 * (line.across[0] + line.across[-1]), line.ahead.max() - CENTRE])
+    behind = float(np.ptp(line.ahead))
+    if behind >= CENTRE:
+        return f"the line where the lips should meet runs {behind:.0f} mm into an open mouth"
     inwards = centre - base
     # Rows beside the centre run straight inwards and do not turn forward again.
     inwards[:, 1] = np.minimum(inwards[:, 1], 0.0)
     inwards = inwards / np.linalg.norm(inwards, axis=1)[:, None]
     met = _bone_met(anatomy, frame, line, base, inwards)
     if met is None:
-        return None
+        return "no teeth or bone lie behind the line where the lips meet"
     thickness, at_height = met
     # Teeth on either side of a gap between them bridge it.
     nearest = smoothed(-_widened(-thickness, BRIDGED), np.ones(len(thickness)), SMOOTH)

@@ -9,6 +9,8 @@ import cmfsim
 import lip_head
 import real_heads
 from cmfsim.errors import CaseError
+from cmfsim.meshing.lips import seam
+from cmfsim.meshing.lips.crease import MouthLine
 
 pytest.importorskip("scipy", reason="needs scipy (pip install '.[imaging]')")
 
@@ -210,3 +212,13 @@ def test_a_mirrored_real_head_has_a_mirrored_seam():
     two = cmfsim.lip_seam(other, {jaw: mirrored_arch(arch) for jaw, arch in arches.items()}).surface
     assert len(one.vertices) == len(two.vertices)
     assert np.abs(height_at(one, np.asarray(two.vertices) * flip)).max() < 0.02
+
+
+def test_a_line_that_runs_into_an_open_mouth_is_no_seam(monkeypatch):
+    """Its rows would start behind the centre that they run to: no direction, and then NaN."""
+    across = np.linspace(-22.0, 22.0, 45)
+    into = MouthLine(across, np.where(np.abs(across) < 5.0, -35.0, 0.0), np.zeros_like(across))
+    monkeypatch.setattr(seam, "_with_corners", lambda *_shown: into)
+    found = cmfsim.lip_seam(lip_head.head(), lip_head.ARCHES, lip_head.landmarks())
+    assert found.surface is None
+    assert "runs 35 mm into an open mouth" in found.findings[0].what

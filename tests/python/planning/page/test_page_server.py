@@ -183,7 +183,7 @@ import time
 from cmfsim.planning import server
 
 class Planning:
-    def predict(self, plan):
+    def solve(self, plan):
         print("solving", flush=True)
         time.sleep(60.0)
 
