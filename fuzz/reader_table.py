@@ -26,7 +26,7 @@ import numpy as np
 import cmfsim
 import oracles
 from cmfsim.io.images.segmentations import read_labels, read_segmentation
-from cmfsim.io.markups import read_curves, write_curves
+from cmfsim.io.slicer.markups import read_curves, write_curves
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.photos import read_photo
 from cmfsim.io.meshes.vtk.writing import write_tets

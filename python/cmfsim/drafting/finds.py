@@ -12,9 +12,9 @@ from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.images.dicom.series import dicom_places
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.images.segmentations import NAMES_FILE, are_labels, read_labels
-from cmfsim.io.landmark_files import LandmarkFile, read_landmark_file
+from cmfsim.io.landmarks import LandmarkFile, read_landmark_file
 from cmfsim.io.meshes.plain_mesh import is_own_file
-from cmfsim.io.surfaces import surface_as_stored
+from cmfsim.io.meshes.surfaces import surface_as_stored
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding

@@ -16,9 +16,9 @@ from cmfsim.drafting.surfaces import Anatomy, Question
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError
 from cmfsim.io import Case, read_surface
 from cmfsim.io.files.reading_writing import toml_module
-from cmfsim.io.landmark_files import read_landmarks, write_landmarks
+from cmfsim.io.landmarks import read_landmarks, write_landmarks
+from cmfsim.io.meshes.surfaces import write_surface
 from cmfsim.io.slicer.transforms import read_transform
-from cmfsim.io.surfaces import write_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import SurfaceData

@@ -2,7 +2,6 @@
 
 import sys
 
-from cmfsim.io import landmark_files
 from cmfsim.io.cases.case_files import Case as Case
 from cmfsim.io.cases.case_files import CaseOrPath as CaseOrPath
 from cmfsim.io.cases.case_files import as_case as as_case
@@ -20,11 +19,16 @@ from cmfsim.io.files.folders import replacing_files as replacing_files
 from cmfsim.io.files.reading_writing import replacing as replacing
 from cmfsim.io.images.image_files import read_image as read_image
 from cmfsim.io.images.image_files import write_image as write_image
-from cmfsim.io.landmark_files import read_landmark_file as read_landmark_file
-from cmfsim.io.landmark_files import read_landmarks as read_landmarks
-from cmfsim.io.landmark_files import write_landmarks as write_landmarks
-from cmfsim.io.meshes import ply
+from cmfsim.io.landmarks import read_landmark_file as read_landmark_file
+from cmfsim.io.landmarks import read_landmarks as read_landmarks
+from cmfsim.io.landmarks import write_landmarks as write_landmarks
+from cmfsim.io.meshes import ply, surfaces
 from cmfsim.io.meshes.mesh_files import read_tet_mesh as read_tet_mesh
+from cmfsim.io.meshes.surfaces import read_bone_pair as read_bone_pair
+from cmfsim.io.meshes.surfaces import read_moved_surface as read_moved_surface
+from cmfsim.io.meshes.surfaces import read_surface as read_surface
+from cmfsim.io.meshes.surfaces import read_surface_file as read_surface_file
+from cmfsim.io.meshes.surfaces import write_surface as write_surface
 from cmfsim.io.results.metrics import write_metrics as write_metrics
 from cmfsim.io.results.predictions import read_parts as read_parts
 from cmfsim.io.results.predictions import write_prediction as write_prediction
@@ -35,12 +39,7 @@ from cmfsim.io.results.result_files import write_result as write_result
 from cmfsim.io.slicer.output import write_slicer_bundle as write_slicer_bundle
 from cmfsim.io.slicer.transforms import read_transform as read_transform
 from cmfsim.io.slicer.transforms import write_transform as write_transform
-from cmfsim.io.surfaces import read_bone_pair as read_bone_pair
-from cmfsim.io.surfaces import read_moved_surface as read_moved_surface
-from cmfsim.io.surfaces import read_surface as read_surface
-from cmfsim.io.surfaces import read_surface_file as read_surface_file
-from cmfsim.io.surfaces import write_surface as write_surface
 
 # Scripts of others import these modules under their former names.
 sys.modules[f"{__name__}.ply"] = ply
-sys.modules[f"{__name__}.landmarks"] = landmark_files
+sys.modules[f"{__name__}.surfaces"] = surfaces

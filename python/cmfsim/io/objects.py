@@ -12,7 +12,7 @@ from cmfsim.io.images.image_files import placed
 from cmfsim.io.images.image_headers import check_affine, check_shape
 from cmfsim.io.meshes.mesh_files import read_tets
 from cmfsim.io.meshes.plain_mesh import NAMES, Cells, PlainMesh, oriented
-from cmfsim.io.surfaces import surface_of
+from cmfsim.io.meshes.surfaces import surface_of
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 

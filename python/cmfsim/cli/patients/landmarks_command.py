@@ -16,7 +16,7 @@ from cmfsim.cli.patients.case_commands import print_findings
 from cmfsim.cli.terminal import StageProgress, escaped, open_page
 from cmfsim.errors import CmfsimError, LandmarkError
 from cmfsim.io import Case
-from cmfsim.io.landmark_files import write_landmarks
+from cmfsim.io.landmarks import write_landmarks
 from cmfsim.pictures import picture_landmarks
 from cmfsim.pipeline.building.inputs import read_anatomy, read_case_landmarks, read_placed_sites
 from cmfsim.pipeline.outputs.landmark_page import PAGE_FILE, head_content, write_landmark_page

@@ -17,8 +17,8 @@ from cmfsim.doctor.surgery.plan import SizedMotion, check_motion_size, check_typ
 from cmfsim.errors import CaseError, CmfsimError, LandmarkError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.meshes.photos import read_photo
+from cmfsim.io.meshes.surfaces import surface_as_stored
 from cmfsim.io.slicer.transforms import motion_in_lps
-from cmfsim.io.surfaces import surface_as_stored
 from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion

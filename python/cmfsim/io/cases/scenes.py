@@ -20,7 +20,7 @@ from cmfsim.io.files.reading_writing import (
     table_of,
 )
 from cmfsim.io.meshes.mesh_files import read_mesh, read_tets
-from cmfsim.io.surfaces import read_moved_surface, read_surface
+from cmfsim.io.meshes.surfaces import read_moved_surface, read_surface
 from cmfsim.values.checks import as_floats
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NODE_KINDS

@@ -22,9 +22,9 @@ from cmfsim.io.cases.template_archives import (
 )
 from cmfsim.io.files.folders import PREFIX, replacing_files
 from cmfsim.io.files.reading_writing import FORMAT_VERSION, beside, is_there, named
-from cmfsim.io.landmark_files import read_landmark_file, write_landmarks
-from cmfsim.io.markups import read_curves, write_curves
-from cmfsim.io.surfaces import read_surface, write_surface
+from cmfsim.io.landmarks import read_landmark_file, write_landmarks
+from cmfsim.io.meshes.surfaces import read_surface, write_surface
+from cmfsim.io.slicer.markups import read_curves, write_curves
 from cmfsim.values.case_parts import FRAMES, UNITS
 from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface, TemplateData

@@ -25,6 +25,7 @@ from cmfsim.io.files.summaries import (
     write_summary,
 )
 from cmfsim.io.meshes.mesh_files import read_mesh
+from cmfsim.io.meshes.surfaces import write_surface
 from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
 from cmfsim.io.results.metrics import (
     CHART_PAGE_FILE,
@@ -36,7 +37,6 @@ from cmfsim.io.results.metrics import (
     read_picture,
 )
 from cmfsim.io.results.result_files import write_result
-from cmfsim.io.surfaces import write_surface
 from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.surface_data import SurfaceData

@@ -15,8 +15,8 @@ from cmfsim.io.cases.scenes import write_scene
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.io.files.folders import replacing_files
 from cmfsim.io.files.reading_writing import named, replacing
+from cmfsim.io.meshes.surfaces import write_surface
 from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
-from cmfsim.io.surfaces import write_surface
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import SceneResult

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.io.landmark_files import read_landmarks
-from cmfsim.io.surfaces import read_surface
+from cmfsim.io.landmarks import read_landmarks
+from cmfsim.io.meshes.surfaces import read_surface
 from cmfsim.muscles.template.bodyparts3d_parts import (
     BONES,
     HASHES,

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from cmfsim._core import ThinPlateSpline
 from cmfsim.errors import CaseInputError, LandmarkError
 from cmfsim.io.cases.templates import write_template
-from cmfsim.io.landmark_files import read_landmark_file
+from cmfsim.io.landmarks import read_landmark_file
 from cmfsim.registration import LandmarkAgreement, LandmarkMatch, leave_one_out, match_landmarks
 from cmfsim.values.checks import Floats, as_number
 from cmfsim.values.finding import Finding

@@ -9,7 +9,7 @@ from box_muscles import BOX, box, strap
 
 import cmfsim
 from cmfsim.io.cases.templates import write_template
-from cmfsim.io.markups import read_curves, write_curves
+from cmfsim.io.slicer.markups import read_curves, write_curves
 from make_default_template import phantom_muscle
 
 MIRROR = np.array([-1.0, 1.0, 1.0])

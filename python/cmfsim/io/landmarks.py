@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import LandmarkInputError
-from cmfsim.io.markups import (
+from cmfsim.io.slicer.markups import (
     as_position,
     frame_name,
     frame_signs,
