@@ -1,6 +1,5 @@
 """The way from a CT to an anatomy, stage by stage, and whether the CT shows the whole head."""
 
-import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -9,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.errors import CaseError, ImageInputError
+from cmfsim.errors import ImageInputError
 from cmfsim.imaging.bones.bone import Bone, bone_level, find_bone, teeth_level
 from cmfsim.imaging.bones.jaw import Jaws, part_jaws
 from cmfsim.imaging.bones.metal import find_metal, metal_within
@@ -22,7 +21,6 @@ from cmfsim.imaging.skins.attached import attached_findings
 from cmfsim.imaging.skins.skin import Skin, find_skin
 from cmfsim.imaging.working_grid import COARSE, Working, working_grid
 from cmfsim.registration.proposed.shape_model.model import head_model
-from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.finding import Finding
@@ -117,7 +115,6 @@ def segment_head(
         # Where the bone is and which of it is the jaw are found without each other.
         level = beside.submit(bone_level, bone, options)
         noticed = beside.submit(_noticed, work, skin, bone, options)
-        outside = beside.submit(_skin_image, work, skin, is_drawn=is_guessed)
         if modelled is not None:
             modelled.result()
         bones, teeth, jaws = _bones(work, bone, skin, points, level, options=options, say=say)
@@ -133,17 +130,7 @@ def segment_head(
             *jaws,
         ]
     air = None if hollow is None else work.image(hollow)
-    return Anatomy(outside.result(), bones, air, teeth, tuple(all_findings))
-
-
-def _skin_image(work: Working, skin: Skin, *, is_drawn: bool) -> ImageData:
-    """The skin's level; its surface is made as well, for the landmarks that are found next."""
-    image = work.image(skin.level)
-    if is_drawn:
-        # What it cannot be made with is refused where the landmarks are found.
-        with contextlib.suppress(CaseError):
-            detailed_surface("skin", image)
-    return image
+    return Anatomy(work.image(skin.level), bones, air, teeth, tuple(all_findings))
 
 
 def _noticed(
