@@ -269,12 +269,7 @@ def compare_skins(
     has_names = isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS)
     parts = _chosen_regions(regions, skin, names if has_names else None)
     asked = _chosen_vertices(mask, skin, parts)
-    chosen, seen = asked & ~skin.covered(), ~other.covered()
-    if not chosen.any():
-        raise RegistrationInputError(
-            f"all {asked.sum()} vertices to evaluate have other skin within 3 mm in front of them: "
-            "check that the predicted skin is one surface whose normals point outwards"
-        )
+    chosen, seen = _uncovered(skin, asked), ~other.covered()
     matches = match_skins(
         skin,
         chosen,
@@ -309,6 +304,16 @@ def compare_skins(
         n_far=matches.n_far,
         findings=(*warps.findings, *found),
     )
+
+
+def _uncovered(skin: Skin, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    chosen = asked & ~skin.covered()
+    if not chosen.any():
+        raise RegistrationInputError(
+            f"all {asked.sum()} vertices to evaluate have other skin within 3 mm in front of them: "
+            "check that the predicted skin is one surface whose normals point outwards"
+        )
+    return chosen
 
 
 @dataclass(frozen=True)

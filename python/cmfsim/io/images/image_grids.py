@@ -152,6 +152,7 @@ def of_slices(
     x, y, z = (low[a] + grid[a] * np.arange(count[a]) for a in range(3))
     outside = _outside(values)
     made = np.empty((count[2], count[1], count[0]), dtype=values.dtype)
+    slack = SAME * gap
     starts = positions @ np.array([along_row, along_column]).T
     # Slices that do not exist, so that every slice has a neighbour; nothing is read of them.
     ends = np.concatenate([[heights[0] - gap], heights, [heights[-1] + gap]])
@@ -163,12 +164,7 @@ def of_slices(
     for number, height in enumerate(z):
         across, down, up = (p + v[2] * height for p, v in zip(plane, vectors, strict=True))
         place = np.interp(up, heights, np.arange(len(heights)))
-        slack = SAME * gap
-        beyond = (up < heights[0] - slack) | (up > heights[-1] + slack)
-        below = np.minimum(place.astype(np.intp), len(heights) - 2)
-        part = place - below
-        # A slice that the place belongs to wholly decides alone.
-        part = np.where(part <= SAME, 0.0, np.where(part >= 1.0 - SAME, 1.0, part))
+        below, part = _between(place, len(heights) - 2)
         slices = [np.clip(below + side, 0, len(heights) - 1) for side in SIDES]
         v = [(down - starts[k, 1]) / spacing[1] for k in slices]
         gaps = [ends[below + side + 1] - ends[below + side] for side in range(3)]
@@ -189,9 +185,17 @@ def of_slices(
             ]
             total = np.sum([w * f for w, f in zip(weights, found, strict=True)], axis=0)
             layer = _limited(total, found[1:3])
-        layer[beyond] = outside
+        layer[(up < heights[0] - slack) | (up > heights[-1] + slack)] = outside
         made[number] = np.rint(layer) if values.dtype.kind in "iu" else layer
     return ImageData(made.T, grid, low)
+
+
+def _between(place: Floats, last: int) -> tuple[NDArray[np.intp], Floats]:
+    """The slice below each place, at most the one given, and how far it is to the next, 0 to 1."""
+    below = np.minimum(place.astype(np.intp), last)
+    part = place - below
+    # A slice that the place belongs to wholly decides alone.
+    return below, np.where(part <= SAME, 0.0, np.where(part >= 1.0 - SAME, 1.0, part))
 
 
 def _rows_to_left(

@@ -150,19 +150,7 @@ def _header(path: Path, data: bytes) -> _Header:
     if codes[1] > 0 >= codes[0] and not _is_spacing(spacing[1:]) and np.isfinite(rows).all():
         ignored.append(f"pixdim {spacing[1:].tolist()}: its sform states the size of a voxel")
         spacing[1:] = np.linalg.norm(rows[:, :3], axis=0)
-    for name, values, is_used in (
-        ("pixdim", spacing[1:], True),
-        ("pixdim[0], the quaternion and offset of its qform", (spacing[0], *turn), codes[0] > 0),
-        ("sform", rows, codes[1] > 0),
-        ("slope and intercept", scale, True),
-        ("start of the data", start, True),
-    ):
-        numbers = np.ravel(values)
-        if is_used and not (np.abs(numbers) <= MOST_NUMBER).all():
-            raise ImageInputError(
-                f"{path.name}: {name} is {numbers.tolist()}: every number must be finite; convert "
-                "the DICOM series again"
-            )
+    _check_numbers(path, codes, spacing=spacing, turn=turn, rows=rows, scale=scale, start=start)
     if not _is_spacing(spacing[1:]):
         raise ImageInputError(f"{path.name}: spacing is {spacing[1:].tolist()}: must be above 0")
     if not first <= start <= MOST_START:
@@ -182,6 +170,32 @@ def _header(path: Path, data: bytes) -> _Header:
         units & 7 in NIFTI_UNITS,
         tuple(ignored),
     )
+
+
+def _check_numbers(
+    path: Path,
+    codes: tuple[int, int],
+    *,
+    spacing: NDArray[np.float64],
+    turn: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    scale: tuple[float, float],
+    start: float,
+) -> None:
+    """Refuses the numbers of a header that are used and not finite."""
+    for name, values, is_used in (
+        ("pixdim", spacing[1:], True),
+        ("pixdim[0], the quaternion and offset of its qform", (spacing[0], *turn), codes[0] > 0),
+        ("sform", rows, codes[1] > 0),
+        ("slope and intercept", scale, True),
+        ("start of the data", start, True),
+    ):
+        numbers = np.ravel(values)
+        if is_used and not (np.abs(numbers) <= MOST_NUMBER).all():
+            raise ImageInputError(
+                f"{path.name}: {name} is {numbers.tolist()}: every number must be finite; convert "
+                "the DICOM series again"
+            )
 
 
 def _is_spacing(steps: NDArray[np.float64]) -> bool:

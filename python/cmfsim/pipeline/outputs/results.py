@@ -203,6 +203,12 @@ class _Drawing:
         return self._begun[model, name]
 
 
+def _seal(fresh: Path, compared: Mapping[str, Any]) -> None:
+    """Writes the summary of a comparison, with the hashes of its files."""
+    sealed = [n for n in compared["files"] if n not in {EVALUATION_FILE, REPORT_FILE}]
+    write_summary(fresh / EVALUATION_FILE, compared, hashes_of(fresh, sealed))
+
+
 def write_results(
     output: Path,
     predictions: Predictions,
@@ -242,26 +248,22 @@ def write_results(
                 _fill_model(fresh, prediction, clock, drawing=drawing, slicer=slicer)
             )
         clock.place = None
-        key = written.predictions[0].summary["case_key"]
         compared: Mapping[str, Any] | None
         if evaluation is not None:
             stage("writing the comparison")
             compared = _fill_evaluation(fresh, evaluation())
             written.files = [*compared["files"], EVALUATION_FILE]
         else:
-            compared = _earlier_evaluation(output, key)
+            compared = _earlier_evaluation(output, written.predictions[0].summary["case_key"])
         if with_report:
             stage(REPORT_STAGE)
             with clock.timed(REPORT_STAGE):
                 written.report = _report_of(fresh, output, written, compared)
         clock.write(fresh)
-        if evaluation is not None and written.report is not None:
-            written.files.append(written.report)
-        if evaluation is not None and compared is not None:
-            values = {**compared, "files": written.files}
-            sealed = [n for n in written.files if n not in {EVALUATION_FILE, REPORT_FILE}]
-            write_summary(fresh / EVALUATION_FILE, values, hashes_of(fresh, sealed))
         own = [written.report] if written.report is not None else []
+        if evaluation is not None and compared is not None:
+            written.files += own
+            _seal(fresh, {**compared, "files": written.files})
         of_models = [f"{w.place}/{n}".lstrip("/") for w in written.predictions for n in w.files]
         return list(dict.fromkeys([*of_models, *written.files, *own]))
 

@@ -74,17 +74,8 @@ def nodes_of(
         contacts=contacts.surfaces,
     )
     stages.add(classified.findings)
-    kinds, whole = classified.kinds, mesh.n_tets
-    if case.mesh.file is None:
-        mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
-        stages.add(noticed)
-        if case.solver.kinematics != "linear":
-            mesh, kinds, noticed = without_crushed(
-                mesh, kinds, bones.segments, bones.motions, case.mesh.cleft
-            )
-            stages.add(noticed)
-    mesh, kinds, noticed = held_part(mesh, kinds)
-    stages.add(noticed)
+    whole = mesh.n_tets
+    mesh, kinds = _remaining(stages, bones, mesh, classified.kinds, case)
     lips = CaseLipContact({}, kinds)
     if tissue.seam is not None:
         stages.begin("separating the lips")
@@ -121,6 +112,24 @@ def nodes_of(
             lifted = None if lifted is None else lifted.without(held.nodes)
         report = report if counted is None else counted.result()
     return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
+
+
+def _remaining(
+    stages: Stages, bones: PlannedBones, mesh: TetMesh, kinds: NodeKinds, case: Case
+) -> tuple[TetMesh, NodeKinds]:
+    """The tets that are neither in a cleft nor crushed and are held by bone, and their nodes."""
+    moved = _moved(case, bones)
+    if case.mesh.file is None:
+        mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
+        stages.add(noticed)
+        if case.solver.kinematics != "linear":
+            mesh, kinds, noticed = without_crushed(
+                mesh, kinds, bones.segments, bones.motions, case.mesh.cleft
+            )
+            stages.add(noticed)
+    mesh, kinds, noticed = held_part(mesh, kinds)
+    stages.add(noticed)
+    return mesh, kinds
 
 
 def _walls(
