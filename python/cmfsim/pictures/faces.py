@@ -5,7 +5,6 @@ import html
 import io
 import os
 import shutil
-import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from cmfsim.pictures.canvas import (
     polydata,
     write_whole,
 )
+from cmfsim.processes.worker import run_program
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.patient_model import PatientModel
@@ -266,6 +266,8 @@ def picture_motions(
 
 # Pixels, even as films need it; pictures of the way, and how long each and both ends are seen, ms.
 FILM_SIZE, STEPS, EACH, HELD = (960, 520), 12, 80, 1000
+# A film of these few pictures takes a second or two.
+FILM_SECONDS = 120.0
 # What moves by more than this, mm, decides what is seen, with so much of its size around it.
 MOVES, AROUND = 0.1, 0.15
 ENDINGS = (".gif", ".mp4")
@@ -353,7 +355,7 @@ def _film(name: str, frames: Sequence[NDArray[np.uint8]], times: Sequence[int]) 
         "-pix_fmt yuv420p -movflags frag_keyframe+empty_moov -f mp4 -"
     )
     given = b"".join(repeated)
-    run = subprocess.run(command.split(), input=given, capture_output=True, check=False)  # noqa: S603
+    run = run_program("ffmpeg", command.split(), given, seconds=FILM_SECONDS)
     if run.returncode or not run.stdout:
         reason = run.stderr.decode(errors="replace").strip()
         raise CaseInputError(f"{name}: ffmpeg ended with code {run.returncode}: {reason[-200:]}")

@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim import errors
-from cmfsim.errors import CaseError, CmfsimError
+from cmfsim.errors import CaseError, CaseInputError, CmfsimError
 
 # The worker's program: it finds the same modules as its parent, and nothing else is run. Ctrl-C is
 # the parent's, who ends it.
@@ -230,6 +230,26 @@ class Worker:
             count = dtype.itemsize * math.prod(shape)
             arrays[name] = _bytes(stream, count).view(dtype).reshape(shape)
         return Answer(header["values"], arrays)
+
+
+def run_program(
+    name: str, words: Sequence[str], given: bytes = b"", *, seconds: float
+) -> subprocess.CompletedProcess[bytes]:
+    """What another program printed, and the code that it ended with, whatever that is.
+
+    name: What a message calls it.
+    words: The program and its arguments; no shell reads them.
+    given: For its standard input.
+    Raises `CaseError`: It cannot be started, or has not ended after so many seconds.
+    """
+    try:
+        return subprocess.run(  # noqa: S603 (words of ours, and no shell)
+            list(words), input=given, capture_output=True, check=False, timeout=seconds
+        )
+    except OSError as error:
+        raise CaseInputError(f"{name} cannot be started: {error}") from error
+    except subprocess.TimeoutExpired:
+        raise CaseInputError(f"{name} has not ended after {seconds:g} s, and was stopped") from None
 
 
 def _error_of(kinds: list[str], text: str, trace: str) -> Exception:

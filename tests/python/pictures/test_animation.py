@@ -55,6 +55,10 @@ def test_a_film_gets_every_frame_as_long_as_it_is_seen(tmp_path, monkeypatch):
         cmfsim.CaseError, match=r"face\.mp4: ffmpeg ended with code 3: no such codec"
     ):
         animate_face(tmp_path / "face.mp4", BALL, MOVED)
+    tool.write_text("#!/bin/sh\nexec sleep 60\n")
+    monkeypatch.setattr(faces, "FILM_SECONDS", 0.3)
+    with pytest.raises(cmfsim.CaseError, match=r"ffmpeg has not ended after 0\.3 s"):
+        animate_face(tmp_path / "face.mp4", BALL, MOVED)
 
 
 def test_what_cannot_be_animated_is_refused(tmp_path, monkeypatch):

@@ -4,7 +4,6 @@ import json
 import os
 import platform
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Mapping
@@ -23,7 +22,7 @@ from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
 from cmfsim.lab.frontier.rows import read_points, skin_points, write_points
 from cmfsim.pipeline.building.case_model import build_model
-from cmfsim.processes.worker import SILENT, Worker, WorkerEndedError, WorkerFailedError
+from cmfsim.processes.worker import SILENT, Worker, WorkerEndedError, WorkerFailedError, run_program
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.simulation import solve_scene
 from cmfsim.values.skin_motion import SkinEnd, carried_points
@@ -154,13 +153,8 @@ def _commit() -> str | None:
     source = Path(__file__).parents[4]
     if git is None or not (source / ".git").exists():
         return None
-    done = subprocess.run(  # noqa: S603 (git, with our own words)
-        [git, "-C", str(source), "rev-parse", "--short", "HEAD"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return done.stdout.strip() or None
+    words = [git, "-C", str(source), "rev-parse", "--short", "HEAD"]
+    return run_program("git", words, seconds=10.0).stdout.decode().strip() or None
 
 
 def kept(path: Path) -> Answer | None:
