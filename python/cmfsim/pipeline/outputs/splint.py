@@ -22,6 +22,7 @@ from cmfsim.planning.occlusion import (
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.dental_arch import JAWS
+from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
@@ -149,6 +150,10 @@ def plan_for_bite(
             )
         asked.observer.stage("finding the final bite")
         bite = final_bite(upper, lower, upper_scan, lower_scan)
+        if bite.mirrored:
+            jaws = " and ".join(bite.mirrored)
+            what = f"the mirror image of the {jaws} scan fits the teeth as well"
+            asked.observer.found([Finding("bite-scan-symmetric", what)])
         plan[lower.segment] = bite.following(plan.get(upper.segment, np.eye(4)))
         return bite, plan
 

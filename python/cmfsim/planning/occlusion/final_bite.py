@@ -50,6 +50,9 @@ class FinalBite:
         Root mean square distance of the crowns from their scan.
     overlap, gap : float, mm
         How deep the rows lie in one another then, and their least distance.
+    mirrored : tuple of str
+        The jaws whose teeth fit the mirror image of their scan as well: if it was mirrored on its
+        way, nothing else shows it, and the bite would be mirrored too.
     """
 
     motion: Floats
@@ -57,6 +60,7 @@ class FinalBite:
     lower_error: float
     overlap: float
     gap: float
+    mirrored: tuple[str, ...] = ()
 
     def following(self, upper: ArrayLike) -> Floats:
         """The motion of the lower jaw if the upper one moves by `upper`, (4, 4) mm."""
@@ -70,6 +74,7 @@ class FinalBite:
             "lower_error_mm": self.lower_error,
             "overlap_mm": self.overlap,
             "gap_mm": self.gap,
+            "fits_mirrored": list(self.mirrored),
         }
 
 
@@ -88,8 +93,8 @@ def final_bite(
     Raises
     ------
     CaseError
-        (also `ValueError`) A scan that does not fit its row, or fits in several ways; scans that
-        are in no occlusion.
+        (also `ValueError`) A scan that does not fit its row, or fits in several ways, or better
+        when it is mirrored; scans that are in no occlusion.
 
     Examples
     --------
@@ -100,8 +105,8 @@ def final_bite(
     >>> plan["mandible_body"] = bite.following(plan["maxilla"])  # doctest: +SKIP
     """
     towards = upper_scan.vertices.mean(axis=0) - lower_scan.vertices.mean(axis=0)
-    upper_fit = _fitted(upper, upper_scan, towards)
-    lower_fit = _fitted(lower, lower_scan, -towards)
+    upper_fit, upper_mirrored = _fitted(upper, upper_scan, towards)
+    lower_fit, lower_mirrored = _fitted(lower, lower_scan, -towards)
     motion = np.asarray(np.linalg.inv(upper_fit.matrix) @ lower_fit.matrix, dtype=np.float64)
     contacts = contact_map(upper, lower.moved(motion))
     overlap, gap = contacts.greatest_overlap, max(0.0, contacts.least_gap)
@@ -111,11 +116,16 @@ def final_bite(
             f"mm and lie {gap:.1f} mm apart, {MOST_OVERLAP:g} and {MOST_GAP:g} mm are allowed; "
             "export both scans in occlusion, in one frame"
         )
-    return FinalBite(motion, upper_fit.rms, lower_fit.rms, overlap, gap)
+    mirrored = (("upper", upper_mirrored), ("lower", lower_mirrored))
+    jaws = tuple(jaw for jaw, as_well in mirrored if as_well)
+    return FinalBite(motion, upper_fit.rms, lower_fit.rms, overlap, gap, jaws)
 
 
-def _fitted(row: ToothRow, scan: SurfaceData, out: Floats) -> IcpFit:
-    """The motion of a row onto its scan; `out`: roughly from the bite to the roots of the scan."""
+def _fitted(row: ToothRow, scan: SurfaceData, out: Floats) -> tuple[IcpFit, bool]:
+    """The motion of a row onto its scan, and whether the row's mirror image fits it as well.
+
+    out: Roughly from the bite to the roots of the scan.
+    """
     jaw = row.arch.jaw
     points = row.surface.vertices[row.crowns]
     points = points[:: -(-len(points) // MOST_POINTS)]
@@ -145,6 +155,7 @@ def _fitted(row: ToothRow, scan: SurfaceData, out: Floats) -> IcpFit:
         raise CaseInputError(f"the {jaw} scan fits the {jaw} teeth nowhere (bite-scan-poor)")
     fits.sort(key=_quality)
     best = fits[0]
+    is_symmetric = _is_symmetric(row, points, scan, best, across)
     if best.rms > MOST_ERROR or best.kept_fraction < LEAST_SHARE:
         raise CaseInputError(
             f"the {jaw} scan does not fit the {jaw} teeth (bite-scan-poor): "
@@ -160,7 +171,31 @@ def _fitted(row: ToothRow, scan: SurfaceData, out: Floats) -> IcpFit:
                 f"the {jaw} scan fits the {jaw} teeth in two ways (bite-scan-ambiguous), to "
                 f"{best.rms:.2f} and {other.rms:.2f} mm: give scans of the whole row"
             )
-    return best
+    return best, is_symmetric
+
+
+def _is_symmetric(
+    row: ToothRow, points: Floats, scan: SurfaceData, best: IcpFit, across: Floats
+) -> bool:
+    """Whether mirrored crowns fit a scan about as well; an error where they fit clearly better.
+
+    A file that a program has mirrored without turning its triangles has its inside outwards.
+    """
+    own = row.surface.searched.closest(points)[1] @ best.matrix[:3, :3].T
+    facing = (scan.searched.closest(carried(best.matrix, points))[1] * own).sum(axis=1)
+    is_inside_out = float(np.median(facing)) < 0.0
+    mirror = points - 2.0 * ((points - row.arch.middle) @ across)[:, None] * across
+    quality = np.inf
+    with contextlib.suppress(RegistrationError):
+        near = _registered(mirror, scan, best.matrix, far=None)
+        quality = _quality(_registered(mirror, scan, near.matrix, far=FAR))
+    if is_inside_out or CLEARER * quality < _quality(best):
+        why = "its triangles face inwards" if is_inside_out else "its mirror image fits better"
+        raise CaseInputError(
+            f"the {row.arch.jaw} scan seems to be mirrored (bite-scan-mirrored): {why}, and left "
+            "would be right in the bite; export it again, without any mirroring or change of axes"
+        )
+    return quality < CLEARER * _quality(best)
 
 
 def _registered(points: Floats, scan: SurfaceData, initial: Floats, far: float | None) -> IcpFit:

@@ -1,5 +1,6 @@
 """The final bite of scans made from a head, moved by known motions."""
 
+import importlib
 import json
 
 import numpy as np
@@ -58,6 +59,31 @@ def test_the_lower_jaw_goes_where_the_scans_have_it(scans):
     assert bite.overlap == contacts.greatest_overlap
 
 
+def mirrored(surface, *, turned=True):
+    triangles = surface.triangles[:, ::-1] if turned else surface.triangles
+    return cmfsim.SurfaceData(surface.vertices * [-1.0, 1.0, 1.0], np.ascontiguousarray(triangles))
+
+
+def test_a_mirrored_scan_is_refused_or_noticed_where_the_arch_is_symmetric(scans, monkeypatch):
+    module = importlib.import_module("cmfsim.planning.occlusion.final_bite")
+    monkeypatch.setattr(module, "MOST_POINTS", 400)
+    upper, lower = scans
+    rows = heads.closed_rows()
+    # The teeth of this head are its own mirror image: nothing in the shapes tells them apart.
+    assert cmfsim.final_bite(*rows, mirrored(upper), mirrored(lower)).mirrored == ("upper", "lower")
+    with pytest.raises(cmfsim.CaseError, match=r"upper scan.*bite-scan-mirrored.*face inwards"):
+        cmfsim.final_bite(*rows, mirrored(upper, turned=False), mirrored(lower, turned=False))
+    # A row that leans to one side by 0.3 mm is not symmetric.
+    surface = rows[0].surface
+    shift = 0.3 * np.sin(0.3 * surface.vertices[:, [0]]) * [0.0, 1.0, 0.0]
+    bent = cmfsim.SurfaceData(surface.vertices + shift, surface.triangles)
+    lean = cmfsim.ToothRow(rows[0].segment, bent, rows[0].arch)
+    own = scan_of(lean, FRAME)
+    assert cmfsim.final_bite(lean, rows[1], own, lower).mirrored == ("lower",)
+    with pytest.raises(cmfsim.CaseError, match=r"bite-scan-mirrored.*mirror image fits better"):
+        cmfsim.final_bite(lean, rows[1], mirrored(own), mirrored(lower))
+
+
 def test_exchanged_scans_another_frame_and_other_units_are_refused_by_name(scans):
     upper, lower = scans
     apart = FRAME @ cmfsim.rigid_motion((0, 0, -8)) @ np.linalg.inv(FRAME)
@@ -93,6 +119,7 @@ def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
     # The bones of this case are made of voxels of 2 mm.
     assert np.linalg.norm(carried(lower, places) - carried(wanted, places), axis=1).max() < 0.3
     assert found["upper_error_mm"] < 0.35
+    assert found["fits_mirrored"] == ["upper", "lower"]
     # Exchanged files write no plan.
     exchanged = [{"--upper": "--lower", "--lower": "--upper"}.get(word, word) for word in words]
     out = str(tmp_path / "exchanged.toml")
