@@ -1,7 +1,7 @@
 """Errors (as in Figure 10 of Kim et al. 2010), the band of a prediction, and contacts of teeth."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -177,9 +177,12 @@ def _centred(skin: SurfaceData, distances: ArrayLike) -> tuple[Any, SkinEnds, Fl
     return surface, skin_ends(moved), 0.5 * (high - low), float(np.abs(values[shown]).mean())
 
 
-def distance_mesh(plotter: Any, surface: Any, limit: float) -> None:
+def distance_mesh(
+    plotter: Any, surface: Any, limit: float, colours: Sequence[str] = COLOURS
+) -> None:
     """Adds a surface coloured by its "distance"."""
-    table = np.array([_rgb(x, limit) for x in np.linspace(-limit, limit, STEPS)], dtype=np.uint8)
+    steps = np.linspace(-limit, limit, STEPS)
+    table = np.array([_rgb(x, limit, colours) for x in steps], dtype=np.uint8)
     plotter.add_mesh(
         surface,
         scalars="distance",
@@ -197,10 +200,10 @@ def distance_colour(distance: float, limit: float = DISTANCE_LIMIT) -> str:
     return "#" + "".join(f"{channel:02x}" for channel in _rgb(distance, limit))
 
 
-def _rgb(distance: float, limit: float) -> tuple[int, int, int]:
-    place = (np.clip(distance / limit, -1.0, 1.0) + 1.0) / 2.0 * (len(COLOURS) - 1)
-    stops = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in COLOURS], dtype=float)
-    channels = [np.interp(place, np.arange(len(COLOURS)), stops[:, k]) for k in range(3)]
+def _rgb(distance: float, limit: float, colours: Sequence[str] = COLOURS) -> tuple[int, int, int]:
+    place = (np.clip(distance / limit, -1.0, 1.0) + 1.0) / 2.0 * (len(colours) - 1)
+    stops = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in colours], dtype=float)
+    channels = [np.interp(place, np.arange(len(colours)), stops[:, k]) for k in range(3)]
     red, green, blue = (round(float(c)) for c in channels)
     return red, green, blue
 
@@ -315,12 +318,12 @@ def picture_contacts(
     def paint(plotter: Any, view: View) -> None:
         surface, gaps = upper if view.direction == "below" else lower
         shape = polydata(surface.vertices, surface.triangles)
-        shape["distance"] = np.ma.filled(-gaps, np.nan)
-        distance_mesh(plotter, shape, GAP_LIMIT)
+        shape["distance"] = np.ma.filled(gaps, np.nan)
+        distance_mesh(plotter, shape, GAP_LIMIT, COLOURS[::-1])
         if view.direction == "above":
             add_scale_bar(plotter, (0.89, 0.3), 5, "%+.1f")
 
-    words = ("Red: overlap; white: contact; blue: gap (the scale counts overlaps positive).",)
+    words = ("Red, negative: overlap. White: contact. Blue, positive: gap.",)
     draw(
         path,
         ROW_VIEWS,
