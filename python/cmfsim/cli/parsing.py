@@ -227,7 +227,7 @@ def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentPa
     report = commands.add_parser(
         "report", parents=[common], help="regenerate the report of a results folder"
     )
-    file(report, "folder", "FOLDER", "folder written by predict")
+    file(report, "folder", "FOLDER", "folder written by predict, or that of its case")
     switch(report, "--pdf", "also write report.pdf, one page for the chart")
     file(
         report,

@@ -18,7 +18,7 @@ from cmfsim.report.document import (
     View,
     number,
 )
-from cmfsim.report.page import MEASURES, MESH, MUSCLES, labelled
+from cmfsim.report.page import MEASURES, MESH, MUSCLES, labelled, plan_name
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, counted, grouped
 
@@ -39,7 +39,8 @@ PICTURES: Mapping[str, str] = {
     "case has data.",
     "plan": "The plan: bone segments in their planned positions, with outlines of their "
     "original positions.",
-    "contacts": "Contacts of the planned tooth rows: signed distance of the crowns, mm.",
+    "contacts": "Contacts of the planned tooth rows: signed distance of the crowns, mm; negative "
+    "is overlap.",
     "muscles": "The muscles of the template, fitted to the skull by landmarks.",
 }
 
@@ -114,7 +115,8 @@ def case_document(
     several = "Models" if len(predictions) > 1 else "Model"
     return Document(
         title=f"{entry['case']}: predicted face",
-        subtitle=f"{several} {models}. Lengths in mm; L is the patient's left, P posterior, S up.",
+        subtitle=f"{several} {models}. {plan_name(entry)}Lengths in mm; L is the patient's left, "
+        "P posterior, S up.",
         facts=_facts(entry, evaluation),
         sections=sections,
         footer=f"Made by {versions}. Mass-tensor model after Kim, Jürgens, Weber, Nolte and Reyes "

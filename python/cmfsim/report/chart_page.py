@@ -10,7 +10,7 @@ from typing import Any
 
 from cmfsim.errors import third_party
 from cmfsim.report.clinical import TITLES, WAYS, absent_text, measure_rows, site_rows
-from cmfsim.report.page import DISCLAIMER
+from cmfsim.report.page import DISCLAIMER, plan_name
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, grouped
 
@@ -141,7 +141,7 @@ def draw_chart_page(
     page.line(MARGIN, y, f"{prediction['case']}: predicted face", TITLE, weight="bold")
     page.line(MARGIN, y + 21.0, DISCLAIMER, TEXT, weight="bold", color=ALARM)
     skin = f"The skin moves by up to {prediction['skin']['largest']:.1f} mm."
-    about = f"Model {prediction['model']}. Lengths in mm. {skin}"
+    about = f"Model {prediction['model']}. {plan_name(prediction)}Lengths in mm. {skin}"
     page.line(MARGIN, y + 33.0, about, TEXT, color=PALE)
     y = page.heading(MARGIN, y + 48.0, "Plan")
     words = plan_lines({name: m["clinical"] for name, m in prediction["plan"].items()})
@@ -207,8 +207,6 @@ def _origin(page: _Page, prediction: Values) -> None:
     versions = ", ".join(f"{name} {version}" for name, version in prediction["versions"].items())
     inputs = "; ".join(f"{name} {value[:DIGITS]}" for name, value in prediction["inputs"].items())
     key = f"Plan, inputs and version: SHA-256 {prediction['case_key']}."
-    if digits := prediction.get("plan_digits"):
-        key += f" Digits of the plan: {digits}."
     for number, text in enumerate((f"Made by {versions}.", key)):
         page.line(MARGIN, FOOT + number * LEADING * FINE, text, FINE)
     texts = [f"Inputs (first {DIGITS} digits of SHA-256): {inputs}."] if inputs else []

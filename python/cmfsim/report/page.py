@@ -128,3 +128,9 @@ def _compact(png: bytes) -> tuple[bytes, str]:
     except (ImportError, OSError):
         return png, "png"
     return packed.getvalue(), "webp"
+
+
+def plan_name(prediction: Mapping[str, object]) -> str:
+    """What the planning page and a saved plan call the plan: its digits, as a sentence."""
+    digits = prediction.get("plan_digits")
+    return f"Plan {digits}. " if digits else ""

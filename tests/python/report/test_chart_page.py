@@ -10,6 +10,7 @@ import pytest
 
 import cmfsim
 import dicom_series
+import phantom_case
 import shared_values
 from cmfsim.cli import main
 from cmfsim.io.results.dicom_pdf import write_dicom_pdf
@@ -126,6 +127,26 @@ def test_the_command_writes_the_page_beside_the_report(case_results, capsys):
     assert written.count(b"/Type /Page\n") + written.count(b"/Type /Page ") == 1
     assert main(["report", str(case_results), "--pdf"]) == 0
     assert (case_results / "report.pdf").read_bytes() == written
+
+
+def test_a_case_that_was_changed_gets_no_report_of_its_earlier_plan(
+    case_results, tmp_path, tmp_path_factory, capsys, caplog
+):
+    case = phantom_case.surface_case(
+        tmp_path, cmfsim.make_head(), shared_values.drawn_levels(tmp_path_factory, 2.0)
+    )
+    digest = input_hash(case)
+    patient = shared_values.coarse_demo_patient(tmp_path_factory)
+    summary = {**patient.summary, "inputs": {case.name: digest}}
+    prediction = cmfsim.predict_patient(replace(patient, summary=summary), "H")
+    cmfsim.write_prediction(case_results, prediction)
+    assert main(["report", str(case.parent), "--pdf"]) == 0
+    case.write_text(case.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
+    assert main(["report", str(case.parent), "--pdf"]) == 2
+    assert "report-older" in capsys.readouterr().err
+    # Whoever names the results means them; a line says that the case has gone on.
+    assert main(["report", str(case_results)]) == 0
+    assert "before it was changed" in caplog.text
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from cmfsim.pipeline.outputs.results import (
     REPORT_STAGE,
     WrittenPrediction,
     WrittenResults,
+    results_folder,
     write_animation,
     write_case_report,
     write_chart_page,
@@ -311,8 +312,8 @@ def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
 
 
 def report(options: argparse.Namespace) -> int:
-    """Regenerates the report of a folder of results."""
-    folder: Path = options.folder
+    """Regenerates the report of a folder of results, or of a case that has them."""
+    folder = results_folder(options.folder)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("writing the report")
         name = write_case_report(folder)

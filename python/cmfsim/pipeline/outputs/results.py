@@ -18,7 +18,8 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.evaluation import error_table
-from cmfsim.io import replacing, replacing_files
+from cmfsim.io import Case, replacing, replacing_files
+from cmfsim.io.cases.case_files import CASE_FILE
 from cmfsim.io.files.summaries import hashes_of, write_summary
 from cmfsim.io.results.dicom_pdf import write_dicom_pdf
 from cmfsim.io.results.metrics import (
@@ -545,6 +546,29 @@ def _shown(found: Mapping[Path, Mapping[str, Any]]) -> tuple[Path, dict[str, byt
         if drawn or not pictures:
             pictures, shown = drawn, place
     return shown, pictures
+
+
+def results_folder(given: Path) -> Path:
+    """The folder with the results of a case, or the given one, which has results.
+
+    Raises `CaseError`: The results of a case are of other inputs than it has now: a report would
+        show an earlier plan beside the present one. Next to results, that is a warning.
+    """
+    is_case = given.is_file() or (given / CASE_FILE).is_file()
+    case_file = given if given.is_file() else (given if is_case else given.parent) / CASE_FILE
+    if not case_file.is_file():
+        return given
+    folder = Case.load(case_file).output if is_case else given
+    (found, *_) = predictions_of(folder).values()
+    if found["inputs"].get(case_file.name) == input_hash(case_file):
+        return folder
+    text = f"{folder}: holds the results of {case_file.name} as it was before it was changed"
+    if is_case:
+        raise CaseInputError(
+            f"{text} (report-older): run cmfsim predict again, or give {folder} if these are meant"
+        )
+    _log.warning("%s: run cmfsim predict again if its plan has changed", text)
+    return folder
 
 
 def write_chart_page(folder: Path) -> str:
