@@ -8,6 +8,8 @@ from browser_page import serious_faults
 
 pytest.importorskip("skimage")
 pytest.importorskip("meshio")
+image = pytest.importorskip("PIL.Image")
+draw = pytest.importorskip("PIL.ImageDraw")
 
 
 def test_the_mirror_image_is_at_the_plane_between_the_corners_of_the_eyes(opened, planning):
@@ -71,6 +73,77 @@ def test_a_measured_point_of_bone_moves_with_its_segment(opened):
     opened.get_by_role("checkbox", name="Measure").uncheck()
     opened.get_by_label("Handles").check()
     opened.locator("#show-skin").fill("1")
+
+
+PHOTO = {"width": 900, "height": 1200}
+
+
+def drawn_photo(opened, path, side, turn=0.1):
+    """A photo of the profile, and where it shows each landmark: the face looks to a side (±1)."""
+    sites = opened.evaluate(
+        "() => { const places = cmfsimPage.face.sitePlaces(null);"
+        " return cmfsimPage.photo.sites.map((name) => [name, places[name]]); }"
+    )
+    rows = np.array([place for _, place in sites])
+    flat = np.stack([-side * rows[:, 1], -rows[:, 2]], axis=1)
+    spin = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    pixels = 5.0 * (flat - flat.mean(axis=0)) @ spin.T + [450.0, 600.0]
+    picture = image.new("RGB", (PHOTO["width"], PHOTO["height"]), "#b9c7b0")
+    pen = draw.Draw(picture)
+    for x, y in pixels:
+        pen.ellipse([x - 9, y - 9, x + 9, y + 9], fill="#7a4a20")
+    picture.save(path)
+    return {name: pixel for (name, _), pixel in zip(sites, pixels, strict=True)}
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_photo_of_either_profile_lies_under_the_lines_of_the_plan(opened, tmp_path, side):
+    path = tmp_path / "photo.jpg"
+    pixels = drawn_photo(opened, path, side)
+    opened.locator("#photo-file").set_input_files(path)
+    opened.wait_for_function("!cmfsimPage.photo.canvas.hidden")
+    canvas = opened.locator("canvas.photo")
+    box = canvas.bounding_box()
+    scale = box["width"] / PHOTO["width"]
+    for name in (names := [*pixels])[:3]:
+        assert f"Click on {name.replace('_', ' ')} " in opened.locator("#photo-note").inner_text()
+        assert not opened.evaluate("Boolean(cmfsimPage.photo.fit.place)")
+        canvas.click(position={"x": scale * pixels[name][0], "y": scale * pixels[name][1]})
+    opened.locator("#photo-skip").click()
+    for name in names[4:]:
+        canvas.click(position={"x": scale * pixels[name][0], "y": scale * pixels[name][1]})
+    # Whole pixels of the screen are clicked on.
+    note = opened.locator("#photo-note").inner_text()
+    assert "Dashed: before" in note
+    assert opened.evaluate("cmfsimPage.photo.fit.error") < 1.0
+    left_out = names[3]
+    shown = opened.evaluate(
+        "name => cmfsimPage.photo.fit.place(cmfsimPage.face.sitePlaces(null)[name].slice(1))",
+        left_out,
+    )
+    assert np.linalg.norm(np.array(shown) - pixels[left_out]) < 6.0
+    with opened.expect_download() as saved:
+        opened.locator("#photo-save").click()
+    with image.open(saved.value.path()) as written:
+        assert written.size == (PHOTO["width"], PHOTO["height"])
+
+
+def test_a_photo_whose_points_do_not_fit_gets_no_lines(opened, tmp_path):
+    path = tmp_path / "photo.png"
+    pixels = drawn_photo(opened, path, 1)
+    opened.locator("#photo-file").set_input_files(path)
+    opened.wait_for_function("cmfsimPage.photo.photo && cmfsimPage.photo.points.length === 0")
+    wrong = [*pixels.values()][::-1]
+    wrong[0], wrong[1] = wrong[1], wrong[0]
+    opened.evaluate("rows => rows.forEach((row) => cmfsimPage.photo.take(row))",
+                    [row.tolist() for row in wrong])  # fmt: skip
+    assert "do not fit this face" in opened.locator("#photo-note").inner_text()
+    opened.locator("#photo-save").click()
+    assert not opened.evaluate("Boolean(cmfsimPage.photo.fit.place)")
+    # A file that is no picture leaves the photo that is there.
+    (tmp_path / "plan.png").write_text("no picture", encoding="utf-8")
+    opened.locator("#photo-file").set_input_files(tmp_path / "plan.png")
+    opened.get_by_text("is no JPEG or PNG").wait_for()
 
 
 def test_the_page_has_no_serious_fault_of_accessibility(opened):

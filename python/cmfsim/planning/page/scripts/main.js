@@ -16,6 +16,7 @@ import { PatientFace } from "./model.js";
 import { ExactSolver } from "./serving.js";
 import { PlanPanel } from "./plan_panel.js";
 import { PullPanel } from "./pull_panel.js";
+import { ProfilePhoto } from "./photo.js";
 import { NUMBERS, clinicalNumbers } from "./clinical.js";
 import { Plans, beyondLimits } from "./plans.js";
 import { connectKeys, connectPointing } from "./pointing.js";
@@ -83,9 +84,10 @@ class App {
     this.desk = new DeskPanel(this);
     this.profile = element("canvas", { className: "profile", role: "img", "aria-label": "Midline profile" });
     this.profileNote = element("p", { className: "note" });
+    this.photo = new ProfilePhoto(this);
     document.getElementById("panel").append(
       this.desk.root, this.panel.root, this.pulling.root, this.variants.root,
-      element("div", {}, element("h2", { textContent: "Midline profile" }), this.profile, this.profileNote),
+      element("div", {}, element("h2", { textContent: "Midline profile" }), this.profile, this.profileNote, this.page.has_profile ? this.photo.root : null),
       this.measuring.root, this.trusting.root, this.exporting.root);
     connectPointing(this);
     connectKeys(this);
@@ -350,6 +352,7 @@ class App {
     lines.push(...(this.otherProfiles ?? []).filter(Boolean));
     lines.push({ points: face.profile(this.after), colour: variantColour(active), thick: 2.5 });
     drawProfile(this.profile, lines);
+    this.photo.show([{ ...lines[0], colour: "#1d2530" }, lines.at(-1)]);
     this.profileNote.textContent = `Dashed: before. ${variants.map((v, i) => `${i === active ? "Thick" : "Thin"}: ${v.name}`).join("; ")}.`;
   }
 

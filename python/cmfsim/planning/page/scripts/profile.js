@@ -4,6 +4,19 @@ import { DISTINCT } from "./colours.js";
 
 const MARGIN = 10;
 
+/** Strokes polylines of (y, z), mm, at their places in a picture; `unit`: of their thickness, pixels. */
+export function drawLines(pen, lines, place, unit = 1) {
+  for (const { points, colour, thick, dash } of lines) {
+    pen.strokeStyle = colour;
+    pen.lineWidth = thick * unit;
+    pen.setLineDash((dash ?? []).map((length) => length * unit));
+    pen.beginPath();
+    points.forEach((p, i) => (i && p[2] !== false ? pen.lineTo(...place(p)) : pen.moveTo(...place(p))));
+    pen.stroke();
+  }
+  pen.setLineDash([]);
+}
+
 /** Draws polylines of (y, z) in mm: [{points, colour, width, dash}], with a bar of 10 mm. */
 export function drawProfile(canvas, lines) {
   const ratio = globalThis.devicePixelRatio || 1;
@@ -24,15 +37,7 @@ export function drawProfile(canvas, lines) {
     width / 2 - scale * (y - (low + high) / 2),
     height / 2 - scale * (z - (bottom + top) / 2),
   ];
-  for (const { points, colour, thick, dash } of lines) {
-    pen.strokeStyle = colour;
-    pen.lineWidth = thick;
-    pen.setLineDash(dash ?? []);
-    pen.beginPath();
-    points.forEach((p, i) => (i && p[2] !== false ? pen.lineTo(...place(p)) : pen.moveTo(...place(p))));
-    pen.stroke();
-  }
-  pen.setLineDash([]);
+  drawLines(pen, lines, place);
   pen.strokeStyle = pen.fillStyle = "#3a4450";
   pen.lineWidth = 2;
   pen.beginPath();

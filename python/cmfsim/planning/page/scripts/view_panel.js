@@ -25,11 +25,16 @@ export const slider = (id, label, value, onchange) => element("label", {}, label
 /** What can be switched on, by key. */
 const BOXES = { side: "Side by side", map: "Colour by movement", band: "Colour by uncertainty", handles: "Handles", pull: "Pull the skin" };
 
+// Opacity of skin through which bones are seen.
+const SEEN_THROUGH = 0.55;
+
 export class ViewPanel {
   /** boxes: the keys of what this page can show. */
   constructor(app, boxes) {
     this.app = app;
-    this.values = { skin: 1, bones: 1, share: 1, side: false, map: false, band: false, handles: true, pull: false };
+    // Where bones are planned they are seen at once.
+    const skin = boxes.includes("handles") ? SEEN_THROUGH : 1;
+    this.values = { skin, bones: 1, share: 1, side: false, map: false, band: false, handles: true, pull: false };
     addViews(app, "Whole face");
     const share = (key, label) => slider(`show-${key}`, label, this.values[key], (value) => this.set(key, value));
     const box = (key) => element("label", {}, element("input", {
