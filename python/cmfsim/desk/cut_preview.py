@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.bones.cuts.planes import Cut, CuttingPlane
-from cmfsim.bones.cuts.procedures import option_ranges, place_procedure
+from cmfsim.bones.cuts.procedures import option_ranges, option_words, place_procedure
 from cmfsim.errors import LandmarkError
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats
@@ -20,9 +20,14 @@ Options = Mapping[str, Mapping[str, float]]
 
 
 def procedure_choices() -> list[dict[str, Any]]:
-    """The procedures with their segments and options: default, lowest and highest."""
+    """The procedures with segments, and options: default, lowest, highest, and what each states."""
     return [
-        {"kind": kind, "segments": list(segments), "options": option_ranges(kind)}
+        {
+            "kind": kind,
+            "segments": list(segments),
+            "options": option_ranges(kind),
+            "words": option_words(kind),
+        }
         for kind, segments in PROCEDURES.items()
     ]
 

@@ -91,48 +91,34 @@ CHIN_HEIGHT = 8.0
 CHIN_LEAST_CLEARANCE = 1.0
 # The frontozygomatic suture lies this part of the way from the lower to the upper orbital rim.
 FRONTOZYGOMATIC_PART = 0.65
-# Defaults and allowed range of every option. Distances mm, angles degrees.
-_OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float]]] = MappingProxyType(
+# Default, lowest and highest value of every option, and what it states. Distances mm, angles
+# degrees. Bone farther to the side than `width` stays: the lower edge of the zygoma is not shaved.
+_OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float, str]]] = MappingProxyType(
     {
         "le_fort_1": {
-            # Of the plane above the estimated root apices.
-            "height": (5.0, -10.0, 20.0),
-            # Turns the plane about the line of the molars; positive raises the front.
-            "tilt": (0.0, -30.0, 30.0),
-            # Turns the plane about the line from back to front; positive raises the left side.
-            "cant": (0.0, -30.0, 30.0),
-            # Of the pterygomaxillary junction behind the second molars' landmarks.
-            "posterior": (12.0, 2.0, 30.0),
-            # Of the buttress lateral to the second molars' landmarks; bone further out stays, so
-            # that the lower edge of the zygoma is not shaved.
-            "width": (12.0, 5.0, 40.0),
+            "height": (5.0, -10.0, 20.0, "cut above the root tips"),
+            "tilt": (0.0, -30.0, 30.0, "front of the cut raised"),
+            "cant": (0.0, -30.0, 30.0, "left side of the cut raised"),
+            "posterior": (12.0, 2.0, 30.0, "back end of the piece behind the second molars"),
+            "width": (12.0, 5.0, 40.0, "sides of the piece beyond the second molars"),
         },
         "le_fort_3": {
-            # Of the nasofrontal cut above (positive) or below nasion.
-            "height": (0.0, -10.0, 10.0),
-            # Of the top of the pterygomaxillary cut above the molars' landmarks.
-            "junction": (22.0, 5.0, 40.0),
-            "posterior": (12.0, 2.0, 30.0),
-            # Of the lateral orbital wall's cut behind the lateral orbital landmarks.
-            "wall": (6.0, 0.0, 20.0),
-            # Where the arch is cut, as a part of the way from lateral orbit to mid-arch.
-            "arch": (0.5, 0.0, 1.0),
+            "height": (0.0, -10.0, 10.0, "cut of the nose above nasion"),
+            "junction": (22.0, 5.0, 40.0, "top of the back cut above the molars"),
+            "posterior": (12.0, 2.0, 30.0, "back end of the piece behind the second molars"),
+            "wall": (6.0, 0.0, 20.0, "cut of the orbit's wall behind its rim"),
+            "arch": (0.5, 0.0, 1.0, "cut of the arch: 0 at the orbit, 1 at its middle"),
         },
         "bsso": {
-            # Of the outer cut behind the second molars' landmarks, towards the angle.
-            "setback": (5.0, -15.0, 25.0),
-            # Between the split and a coronal cut; 0 cuts straight across.
-            "angle": (50.0, 0.0, 75.0),
-            # Of the inner horizontal cut above the bite, over the lingula.
-            "lingula": (10.0, 0.0, 30.0),
+            "setback": (5.0, -15.0, 25.0, "outer cut behind the second molars"),
+            "angle": (50.0, 0.0, 75.0, "split, from straight across"),
+            "lingula": (10.0, 0.0, 30.0, "inner cut above the bite"),
         },
         "genioplasty": {
-            # Of the cut below the estimated root apices of the lower front teeth.
-            "clearance": (5.0, -5.0, 20.0),
-            # Turns the cut about its front edge; positive lowers the back. Roots lean backwards.
-            "tilt": (5.0, -30.0, 30.0),
-            # How far back the chin may reach, behind (positive) the second molars' landmarks.
-            "posterior": (0.0, -40.0, 20.0),
+            "clearance": (5.0, -5.0, 20.0, "cut below the root tips"),
+            # Roots lean backwards.
+            "tilt": (5.0, -30.0, 30.0, "back of the cut lowered"),
+            "posterior": (0.0, -40.0, 20.0, "back end of the chin behind the second molars"),
         },
     }
 )
@@ -220,12 +206,17 @@ def procedure_options(kind: str) -> dict[str, float]:
     5.0
     """
     check_one_of("procedure", kind, PROCEDURES)
-    return {name: default for name, (default, _, _) in _OPTIONS[kind].items()}
+    return {name: default for name, (default, *_) in _OPTIONS[kind].items()}
 
 
 def option_ranges(kind: str) -> dict[str, tuple[float, float, float]]:
     """The default, lowest and highest value of each option of a procedure, mm or degrees."""
-    return dict(_OPTIONS[kind])
+    return {name: option[:3] for name, option in _OPTIONS[kind].items()}
+
+
+def option_words(kind: str) -> dict[str, str]:
+    """What each option of a procedure states: no motion, but where and how it cuts."""
+    return {name: option[3] for name, option in _OPTIONS[kind].items()}
 
 
 def place_procedure(
@@ -303,7 +294,7 @@ def _chosen_options(kind: str, options: Mapping[str, float]) -> dict[str, float]
         if name not in chosen:
             raise CaseInputError(f"{kind} has no option {name!r}: use {', '.join(chosen)}")
         number = as_number(f"{kind} {name}", value)
-        _, low, high = _OPTIONS[kind][name]
+        _, low, high, _ = _OPTIONS[kind][name]
         if not low <= number <= high:
             raise CaseInputError(f"{kind} {name} is {number:g}: {low:g} to {high:g} is allowed")
         chosen[name] = number

@@ -33,21 +33,21 @@ export class CutPanel {
       this.rows);
   }
 
-  procedure({ kind, options }) {
+  procedure({ kind, options, words: stated }) {
     const box = element("input", { type: "checkbox", id: `cut-${kind}`, onchange: () => this.choose(kind, box.checked) });
     this.boxes[kind] = box;
-    const rows = Object.entries(options).flatMap(([name, [, low, high]]) => this.option(kind, name, low, high));
+    const rows = Object.entries(options).flatMap(([name, [, low, high]]) => this.option(kind, name, low, high, stated[name]));
     const more = element("div", { className: "numbers options", hidden: true }, ...rows);
     this.fields[kind].more = more;
     return element("div", {}, element("div", { className: "choice" }, box, element("label", { for: `cut-${kind}`, textContent: NAMES[kind] ?? words(kind) })), more);
   }
 
-  option(kind, name, low, high) {
+  option(kind, name, low, high, stated) {
     const unit = ANGLES.includes(name) ? "°" : kind === "le_fort_3" && name === "arch" ? "share" : "mm";
     const step = high - low <= 2 ? 0.05 : 0.5;
     const id = `option-${kind}-${name}`;
-    const label = `${words(name)}, ${unit}`;
-    const field = numberField({ id, title: `${low} to ${high} ${unit}`, onchange: () => this.set(kind, name, typedNumber(field.value), true) });
+    const label = `${stated}, ${unit}`;
+    const field = numberField({ id, title: `${name} in the case file: ${low} to ${high} ${unit}`, onchange: () => this.set(kind, name, typedNumber(field.value), true) });
     const slide = element("input", {
       type: "range", min: low, max: high, step, "aria-label": label,
       oninput: () => this.set(kind, name, Number(slide.value)), onchange: () => this.keep(),

@@ -69,7 +69,7 @@ class App {
     const open = sites.filter((s) => !s.placed && (s.doubt || s.why));
     const placed = sites.filter((s) => s.placed).length;
     const text = open.length
-      ? `${open.length} of ${sites.length} sites are doubtful or missing: ${open.slice(0, 4).map((s) => s.name).join(", ")}${open.length > 4 ? ", …" : ""}. Cuts and muscles are placed by them: check these first.`
+      ? `${open.length} of ${sites.length} sites ${open.length === 1 ? "is" : "are"} doubtful or missing: ${open.slice(0, 4).map((s) => s.name).join(", ")}${open.length > 4 ? ", …" : ""}. Cuts and muscles are placed by them: check these first.`
       : `${sites.length} sites, none of them doubtful; ${placed} placed or accepted.`;
     return element("section", { className: "step", "aria-label": "Landmarks" },
       element("h2", { textContent: "1. Landmarks" }),
