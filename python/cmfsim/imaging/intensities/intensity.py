@@ -29,15 +29,14 @@ CLOSING, OPENING = 12.0, 3.0
 # Air by definition, and muscle and brain as scanners show them (25 to 60), HU.
 AIR = -1000.0
 SOFT = 40.0
-# Peaks this near to their nominal value, HU, are those of a CT in HU: scanners differ by 30 in air;
-# the soft peak is fat's (−110) in some heads.
-AIR_TOLERANCE = 130.0
+# Values are HU, or HU with a usual offset, where air lies this near to its nominal value, and soft
+# tissue in this range (fat is at −110), HU; where it is known to be muscle, in the second one.
+AIR_TOLERANCE = 60.0
+ANY_SOFT, MUSCLE = (-140.0, 85.0), (-20.0, 85.0)
+# Air at −1000 is that of a CT: soft tissue so near to its nominal value may be plastic's, HU.
 SOFT_TOLERANCE = 170.0
-# Offsets with which scanners store unsigned values.
-OFFSETS = (1000.0, 1024.0, 2000.0, 2048.0, 8192.0, 32768.0)
-OFFSET_TOLERANCE = 70.0
-# Air to soft tissue is 1040 HU, 890 to fat: a distance in this range is that of steps of 1 HU.
-UNIT_STEP = (840.0, 1140.0)
+# Offsets with which scanners store unsigned values; none counts as one.
+OFFSETS = (0.0, 1000.0, 1024.0, 2000.0, 2048.0, 8192.0, 32768.0)
 # A CT has most of its tissue within this of the soft peak (fat −110 … muscle 60), HU; an MR image
 # spreads it over its whole range.
 SOFT_SPREAD = 190.0
@@ -51,12 +50,13 @@ HISTOGRAM_BINS = 400
 LEAST_PLATEAU = 8
 LEAST_SATURATED = 15.0
 BELOW_SATURATED = 100.0
-# Expected errors at the surface of bone, HU: of an offset that scanners use, and of one by the peak
-# of air, which differs by 30 between scanners; the former two are clear.
-OFFSET_ERROR, AIR_ERROR, CLEAR = 10.0, 30.0, 40.0
+# Expected errors at the surface of bone, HU: of an offset that scanners use, at least; and which
+# are clear.
+OFFSET_ERROR, CLEAR = 10.0, 40.0
 # Fat (−110 HU) lies in this part of the way from air to muscle; where the image shows both peaks,
-# neither is taken for the other. Half of their distance is the error otherwise, carried to bone.
-FAT_PART = (0.82, 0.91)
+# or so little (of the peak) where muscle would lie above fat, neither is taken for the other. Half
+# of their distance is the error otherwise, carried to bone.
+FAT_PART, ABOVE_FAT, LEAST_MUSCLE = (0.82, 0.91), (1.12, 1.22), 0.2
 BOTH_ERROR, ONE_ERROR = 40.0, 110.0
 # With a stated scale, air lies within this of −1000 HU.
 STATED_TOLERANCE = 250.0
@@ -111,29 +111,39 @@ def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None)
         )
     if stated is not None:
         return _stated(sample, *stated)
-    if low < AIR - 400.0:
-        # Padding outside a round field of view (−2000, −3024) is no air of its own.
-        padded = sample < AIR - 400.0
-        if padded.any() and not padded.all() and (np.abs(sample - AIR) < AIR_TOLERANCE).any():
-            sample = np.maximum(sample, AIR - 100.0)
-            low, high = np.percentile(sample, (0.05, 99.95))
-    air, soft, is_both = _peaks(sample, low, high)
-    if abs(air - AIR) <= AIR_TOLERANCE and abs(soft - SOFT) <= SOFT_TOLERANCE:
-        result = Calibration(1.0, 0.0)
-    elif UNIT_STEP[0] <= soft - air <= UNIT_STEP[1]:
-        offset = AIR - air
-        usual = min(OFFSETS, key=lambda o: abs(o + offset))
-        if abs(usual + offset) <= OFFSET_TOLERANCE:
-            offset = -usual
-        error = OFFSET_ERROR if offset == -usual else AIR_ERROR
-        result = Calibration(1.0, offset, (_not_hu(air, soft, 1.0, offset, error),), error)
+    padded = sample < AIR - 400.0
+    # Padding outside a field of view has one value (−2000, −3024), and is no air of its own.
+    if padded.any() and np.mean(sample[padded] == sample.min()) > 0.5:
+        within = sample[~padded]
+        if within.size and (result := _judged(within)).has_air and not result.findings:
+            return result
+    return _judged(sample)
+
+
+def _judged(sample: NDArray[np.float64]) -> Calibration:
+    low, high = np.percentile(sample, (0.05, 99.95))
+    air, soft, is_muscle = _peaks(sample, low, high)
+    offset = -min(OFFSETS, key=lambda o: abs(air - o - AIR))
+    least, most = MUSCLE if is_muscle else ANY_SOFT
+    is_near = abs(air + offset - AIR) <= AIR_TOLERANCE
+    has_air = is_near and offset == 0.0
+    slope = (SOFT - AIR) / (soft - air)
+    # What the two peaks say of bone beside what the values do, where they are HU but for an offset.
+    apart = abs((slope - 1.0) * (BRIGHT - AIR))
+    if is_near and least <= soft + offset <= most:
+        error = max(OFFSET_ERROR, 0.5 * apart * is_muscle) if offset else 0.0
+        result = Calibration(1.0, offset, error=error)
+    elif has_air and abs(soft - SOFT) <= SOFT_TOLERANCE:
+        # Plastic, or another scale about air.
+        result = Calibration(1.0, 0.0, error=apart)
     else:
-        slope = (SOFT - AIR) / (soft - air)
-        offset = AIR - slope * air
-        error = BOTH_ERROR if is_both else ONE_ERROR
-        result = Calibration(slope, offset, (_not_hu(air, soft, slope, offset, error),), error)
+        error = BOTH_ERROR if is_muscle else ONE_ERROR
+        result = Calibration(slope, AIR - slope * air, error=error)
+    if (result.slope, result.offset) != (1.0, 0.0):
+        result = replace(result, findings=(_not_hu(air, soft, result),))
     odd = _odd_spread(sample * result.slope + result.offset, air, soft)
-    has_air = abs(air - AIR) <= AIR_TOLERANCE
+    if not odd and has_air and result.error:
+        odd = f"its soft tissue is at {soft:.0f} HU, so bone may be {result.error:.0f} HU off"
     if odd and not has_air:
         raise ImageInputError(
             f"the image does not look like a CT: {odd}. An MR image cannot be used: give the CT "
@@ -192,7 +202,7 @@ def saturation_of(values: NDArray[Any], voxel: float, scale: Calibration) -> flo
 
 
 def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float, float, bool]:
-    """The values at the peaks of air and of soft tissue, and whether fat and muscle both show."""
+    """The values at the peaks of air and soft tissue, and whether that is known to be muscle."""
     counts, edges = np.histogram(np.clip(sample, low, high), bins=HISTOGRAM_BINS)
     centres = 0.5 * (edges[1:] + edges[:-1])
     kernel = np.hanning(9)
@@ -219,17 +229,20 @@ def _peaks(sample: NDArray[np.float64], low: float, high: float) -> tuple[float,
     reach = centres[best] + 0.2 * (centres[best] - centres[air])
     near = above[(above > best) & (centres[above] <= reach) & (smooth[above] > 0.4 * smooth[best])]
     soft = near[-1] if len(near) else best
-    part = (centres[above] - centres[air]) / (centres[soft] - centres[air])
-    is_fat = (part > FAT_PART[0]) & (part < FAT_PART[1]) & (smooth[above] > 0.2 * smooth[soft])
-    return float(centres[air]), float(centres[soft]), bool(is_fat.any())
+    part = (centres - centres[air]) / (centres[soft] - centres[air])
+    least = LEAST_MUSCLE * smooth[soft]
+    has_fat = (part[above] > FAT_PART[0]) & (part[above] < FAT_PART[1]) & (smooth[above] > least)
+    is_alone = (smooth[(part > ABOVE_FAT[0]) & (part < ABOVE_FAT[1])] < least).all()
+    return float(centres[air]), float(centres[soft]), bool(has_fat.any() or is_alone)
 
 
-def _not_hu(air: float, soft: float, slope: float, offset: float, error: float) -> Finding:
+def _not_hu(air: float, soft: float, scale: Calibration) -> Finding:
+    sign = "+" if scale.offset >= 0.0 else "−"
     return Finding(
         "ct-not-hu",
         f"the image is not in HU: air is at {air:.4g}, soft tissue at {soft:.4g}; converted as "
-        f"HU = {slope:.4g}·value {'+' if offset >= 0.0 else '−'} {abs(offset):.4g}, to within "
-        f"{error:.0f} HU at the surface of bone",
+        f"HU = {scale.slope:.4g}·value {sign} {abs(scale.offset):.4g}, to within "
+        f"{scale.error:.0f} HU at the surface of bone",
         where="image",
         why="thresholds of skin and bone are in HU; an error in the guessed scale moves the "
         "surface of the bone",
