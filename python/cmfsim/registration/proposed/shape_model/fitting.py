@@ -135,12 +135,11 @@ def _stepped(
         shape = _Surface(part, places, facing, derivatives, there, back)
         rows += [*_pairs(model, shape, target, seen, noise)]
         gaps[part] = _gaps(shape, target)
-        scores.append(float(np.minimum(away, MOST_GAP).mean()))
+        scores.append(float(np.minimum(away / state.scale, MOST_GAP).mean()))
     if seen.any():
-        scores.append(
-            float(np.average(np.minimum(gaps, MOST_GAP)[seen], weights=model.areas[seen]))
-        )
-    shown = seen, gaps, sum(scores) / state.scale
+        near = np.minimum(gaps / state.scale, MOST_GAP)
+        scores.append(float(np.average(near[seen], weights=model.areas[seen])))
+    shown = seen, gaps, sum(scores)
     return _solved(model, state, rows, effort, shown)
 
 

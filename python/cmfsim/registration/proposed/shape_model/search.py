@@ -178,7 +178,8 @@ def _add(
     moved = np.einsum("sij,nj->sni", linear, points) + offset[:, None]
     turned = np.einsum("sij,nj->sni", linear, normals) / scale[:, None, None]
     gaps, index = finder.nearest(moved, turned)
-    total.score += np.minimum(gaps, cap).mean(axis=1) / scale
+    # Capped in the patient's size: a cap in the model's would favour small patients.
+    total.score += np.minimum(gaps / scale[:, None], cap).mean(axis=1)
     weight = 1.0 / (1.0 + (gaps / (0.4 * cap)) ** 2) ** 2
     goal, n = finder.points[index], finder.normals[index]
     columns = pose_columns(goal, moved, n)
