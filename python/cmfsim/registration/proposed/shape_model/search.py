@@ -39,7 +39,7 @@ STAGES = ((150, 5, 30), (300, 14, 3))
 # Threads of a look-up.
 WORKERS = 2
 # Damping of a step, and weight of a usual size, as shares of the points.
-DAMPING, SIZE_WEIGHT = 0.02, 0.01
+DAMPING, SIZE_WEIGHT = 0.02, 0.002
 
 
 class Finder:
