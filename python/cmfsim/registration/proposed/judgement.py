@@ -87,8 +87,12 @@ def missing_sites(
                 gone[name] = f"{IMAGE_ENDS} ({cut.name} border)"
     _below_a_cut_chin(skull, cuts, pose, gone)
     there = {name: place for name, place in skull.items() if name not in gone}
-    off = misfits(_own(there, pose), _own(skin, pose))
-    _impossible(off["skull"], gone)
+    own = _own(there, pose)
+    off = misfits(own, _own(skin, pose))
+    # Two sides that agree, each found on its own, are an unusual head (a long ramus) and stay.
+    uneven = _unevenness(own)
+    even = {n for n in own if uneven.get(n[:-2], np.inf) < MOST_UNEVEN}
+    _impossible({n: away for n, away in off["skull"].items() if n not in even}, gone)
     lost: dict[str, str] = {}
     for name in SKIN_LANDMARKS:
         if name not in skin:

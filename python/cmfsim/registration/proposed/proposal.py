@@ -11,17 +11,19 @@ from cmfsim._core import Surface
 from cmfsim.errors import LandmarkInputError
 from cmfsim.registration.proposed.definitions.detection import (
     Detected,
+    HeadBuild,
     HeadSurfaces,
     detect,
     is_lower,
 )
+from cmfsim.registration.proposed.definitions.groups import misfits
 from cmfsim.registration.proposed.jaw_evidence import (
     JawEvidence,
     jaw_evidence,
     separation_points,
     weakened,
 )
-from cmfsim.registration.proposed.judgement import IMAGE_ENDS, judged, missing_sites
+from cmfsim.registration.proposed.judgement import IMAGE_ENDS, IMPOSSIBLE, judged, missing_sites
 from cmfsim.registration.proposed.limits import cut_planes
 from cmfsim.registration.proposed.pose import (
     Pose,
@@ -158,7 +160,7 @@ def landmarks_from(
         fitted = _fitted(parts)
         pose = refined_pose(fitted.pose, parts.upper, average.bones["cranium"])
         drawn.result()
-    pose, found = _levelled_sites(parts, pose, average, fitted.jaw)
+    pose, found = _best_sites(parts, (pose, fitted.pose), average, fitted)
     likeness = [_likeness(template, parts.upper, pose, templates) for template in templates]
     found = _corrected(found, templates, likeness)
     skull = _evened({name: p for name, p in found.skull.items() if not name.startswith("_")})
@@ -240,24 +242,42 @@ def _template_sites(template: TemplateHead, average: TemplateHead) -> tuple[Pose
     """The pose of a template, and the sites that its definitions find."""
     parts = _template_surfaces(template)
     if template is average:
-        pose, jaw = Pose(np.zeros(3), np.eye(3), 1.0, 0.0), np.eye(4)
+        pose, build = Pose(np.zeros(3), np.eye(3), 1.0, 0.0), HeadBuild(np.eye(4), 1.0)
     else:
         fitted = _fitted(parts)
         pose = refined_pose(fitted.pose, parts.upper, average.bones["cranium"])
-        jaw = fitted.jaw
-    return _levelled_sites(parts, pose, average, jaw)
+        build = HeadBuild(fitted.jaw, fitted.breadth)
+    return _levelled_sites(parts, pose, average, build)
+
+
+def _best_sites(
+    parts: HeadSurfaces, poses: Sequence[Pose], average: TemplateHead, fitted: FittedHead
+) -> tuple[Pose, Detected]:
+    """The sites from the first pose that gives none which no average head has, or the best one.
+
+    Of a long skull, the whole cranium turns the pose by degrees that the face does not show.
+    """
+    build = HeadBuild(fitted.jaw, fitted.breadth)
+    found, scores = [], []
+    for pose in poses:
+        found.append(_levelled_sites(parts, pose, average, build))
+        off = misfits({n: p for n, p in found[-1][1].skull.items() if n[0] != "_"}, {})["skull"]
+        if off and max(off.values()) < IMPOSSIBLE:
+            return found[-1]
+        scores.append(sum(min(off.get(n, IMPOSSIBLE), IMPOSSIBLE) for n in SKULL_LANDMARKS))
+    return found[int(np.argmin(scores))]
 
 
 def _levelled_sites(
-    parts: HeadSurfaces, pose: Pose, average: TemplateHead, jaw: Floats
+    parts: HeadSurfaces, pose: Pose, average: TemplateHead, build: HeadBuild
 ) -> tuple[Pose, Detected]:
     """The pose in which the sites that are found level the head, and the sites in it."""
     seen = []
     for _ in range(LEVEL_ROUNDS):
-        skull = detect(parts, pose, jaw, skin=False).skull
+        skull = detect(parts, pose, build, skin=False).skull
         seen.append((pose, skull))
         pose = levelled(pose, skull, average.skull)
-    last = detect(parts, pose, jaw)
+    last = detect(parts, pose, build)
     means = dict(last.skull)
     for name, place in last.skull.items():
         places = [

@@ -67,26 +67,40 @@ class HeadSurfaces:
             points.setflags(write=False)
 
 
-def detect(head: HeadSurfaces, pose: Pose, jaw: Floats, *, skin: bool = True) -> Detected:
-    """The sites of a head that lies in a known pose: of cranium, mandible and, if asked, skin.
+@dataclass(frozen=True, eq=False)
+class HeadBuild:
+    """How a head differs from the average one beyond its pose and size.
 
-    jaw: (4, 4). The motion that opens the jaw of the average head as the patient's is: sites of
-        bone are looked for with the mouth closed.
+    jaw: (4, 4). The motion that opens the jaw of the average head as the patient's is.
+    breadth: Of the face, as a factor on the average head, size included.
     """
 
-    def placed(points: Floats) -> Floats:
-        return pose.into(points) / pose.size
+    jaw: Floats
+    breadth: float
 
-    turn, shift = jaw[:3, :3], jaw[:3, 3]
+
+def detect(head: HeadSurfaces, pose: Pose, build: HeadBuild, *, skin: bool = True) -> Detected:
+    """The sites of a head that lies in a known pose: of cranium, mandible and, if asked, skin.
+
+    Sites of bone are looked for with the mouth closed, and all in a face of average breadth.
+    """
+    broad = np.array([build.breadth / pose.size, 1.0, 1.0])
+
+    def placed(points: Floats) -> Floats:
+        return pose.into(points) / (pose.size * broad)
+
+    turn, shift = build.jaw[:3, :3], build.jaw[:3, 3]
     lower = (placed(head.lower_points) - shift) @ turn
     skull = find_skull_sites(skull_views(placed(head.upper_points), lower))
     for name in skull:
         if name.startswith((*JAW_SITES, "_lower_edge")):
             skull[name] = turn @ skull[name] + shift
-    if head.skin is None or not skin:
-        return Detected(skull, {})
-    front = depth_map(placed(head.skin_points), (0, 2, 1), 1.0, FRONT_REACH)
-    return Detected(skull, find_skin_sites(front, skull))
+    of_skin = {}
+    if head.skin is not None and skin:
+        front = depth_map(placed(head.skin_points), (0, 2, 1), 1.0, FRONT_REACH)
+        of_skin = find_skin_sites(front, skull)
+    wide = ({n: broad * place for n, place in sites.items()} for sites in (skull, of_skin))
+    return Detected(*wide)
 
 
 def is_lower(name: str) -> bool:

@@ -62,6 +62,8 @@ QUARTER = 0.5 * np.pi
 FRAME_BACK, FRAME_TOP, FRAME_DISTANCE, FRAME_ROUNDS = 20.0, 70.0, 4.0, 10
 # Surfaces say little of where along them a site lies: relief finer than the modes, mm.
 ALONG_SURFACE = 4.5
+# Pairs of the cranium whose distances tell how broad a head is.
+BROAD_PAIRS = ("zygomatic_arch", "supraglenoid", "lateral_orbit")
 # How a head may lie in an image whose axes are wrong, with what brings it upright. One axis that is
 # reversed looks like two, because a head is its own mirror image.
 AXES = np.eye(3)
@@ -140,6 +142,17 @@ class FittedHead:
     def errors(self) -> Mapping[tuple[str, str], float]:
         """Expected distance of each site from the true one, mm."""
         return dict(zip(SITES, self.distribution.errors.tolist(), strict=True))
+
+    @cached_property
+    def breadth(self) -> float:
+        """Of the fitted cranium, as a factor on the average head, sizes included."""
+        ratios = []
+        for pair in BROAD_PAIRS:
+            rows = [SITES.index(("skull", f"{pair}_{letter}")) for letter in "LR"]
+            own = [self.sites["skull", f"{pair}_{letter}"] for letter in "LR"]
+            usual = self.model.sites[rows]
+            ratios.append(np.linalg.norm(own[0] - own[1]) / np.linalg.norm(usual[0] - usual[1]))
+        return float(np.mean(ratios))
 
     def deviation(self, sites: Sequence[tuple[str, str]], direction: Floats) -> float:
         """Standard deviation of the mean of some sites along a unit vector, mm."""
