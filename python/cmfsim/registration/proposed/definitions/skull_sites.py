@@ -155,8 +155,13 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
     teeth = np.isfinite(line) & (line < -60.0) & (z < -15.0) & (z > -75.0)
     if not teeth.any():
         return
-    # Connected downwards from the alveolus.
-    edge = _run_end(teeth, int(np.flatnonzero(teeth).max()))
+    # The longest run downwards: nasal bones may end in the same range.
+    start, edge, longest = len(z), 0, 0
+    while teeth[:start].any():
+        top = int(np.flatnonzero(teeth[:start]).max())
+        start = _run_end(teeth, top)
+        if top - start >= longest:
+            edge, longest = start, top - start
     neck = int(np.argmin(np.abs(z - z[edge] - UPPER_CROWN)))
     if not np.isfinite(line[neck]):
         return
