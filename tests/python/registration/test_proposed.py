@@ -73,6 +73,15 @@ def test_stored_biases_are_those_that_the_definitions_have():
             np.testing.assert_allclose(stored[name], bias, atol=1e-6)
 
 
+def test_an_upper_jaw_without_teeth_has_its_own_sites():
+    """Where the neck of the incisors would be, a jaw without them has the floor of the nose."""
+    head, average = cmfsim.make_head(), average_head()
+    bones = {"cranium": head.surface("cranium", 1.5), "mandible": average.bones["mandible"]}
+    errors = _errors(cmfsim.propose_landmarks(bones, average.skin).skull, head.skull_landmarks)
+    assert errors["supradentale"] < 3.0
+    assert errors["mid_philtrum"] < 3.0
+
+
 @pytest.mark.parametrize(
     ("wrong", "lost"),
     [

@@ -139,8 +139,14 @@ def _nasal_end(z: Floats, top: Floats, centre: float) -> int | None:
     return None
 
 
-# Height of the crown of the upper incisors up to the bone, mm.
-UPPER_CROWN = 12.0
+# Height of the crown of the upper incisors up to the bone, and of the rounding of a ridge without
+# teeth up to its front, mm.
+UPPER_CROWN, BARE_RIDGE = 12.0, 2.0
+# From the edge of the upper incisors to the floor of the nose Legan and Burstone (1980) measured
+# 30.5 ± 2.1 mm in men and 27.5 ± 1.7 mm in women: what is this much lower has no incisors, mm.
+LEAST_WITH_TEETH = 20.0
+# The floor is where the bone beside the septum falls back by so much, mm; so far from the midline.
+FLOOR_DROP, BESIDE_SEPTUM = 10.0, (4.0, 6.0, 8.0)
 # That of the lower ones in parts of the height of the jaw at the chin: 0.26 and 0.28 on two real
 # heads, on which it is 7.8 and 11.4 mm; at least so many mm, as of a chin that is cut off.
 LOWER_SHARE, LOWER_CROWN = 0.27, 8.2
@@ -162,7 +168,9 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
         start = _run_end(teeth, top)
         if top - start >= longest:
             edge, longest = start, top - start
-    neck = int(np.argmin(np.abs(z - z[edge] - UPPER_CROWN)))
+    height = _to_nasal_floor(front, lean, edge)
+    crown = UPPER_CROWN if height > LEAST_WITH_TEETH else BARE_RIDGE
+    neck = int(np.argmin(np.abs(z - z[edge] - crown)))
     if not np.isfinite(line[neck]):
         return
     found["supradentale"] = np.array([lean, line[neck], z[neck]])
@@ -177,8 +185,18 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
         spine += 1
     half = z[neck] + 0.38 * (z[spine] - z[neck])
     at = int(np.argmin(np.abs(z - half)))
-    found["_spine"] = np.array([lean, line[spine], z[spine]])
     found["mid_philtrum"] = np.array([lean, line[at], z[at]])
+
+
+def _to_nasal_floor(front: DepthMap, lean: float, edge: int) -> float:
+    """From the edge of the upper jaw up to the floor of the nose, mm; infinite without one."""
+    z = front.columns
+    heights = []
+    for x in [lean + side * across for side in (-1.0, 1.0) for across in BESIDE_SEPTUM]:
+        line = smoothed(front.column(x, 1.0), 0.6)[edge:]
+        back = line > np.fmin.accumulate(line) + FLOOR_DROP
+        heights.append(z[edge + int(np.argmax(back))] - z[edge] if back.any() else np.inf)
+    return float(np.median(heights))
 
 
 def _run_end(known: NDArray[np.bool_], start: int) -> int:
