@@ -130,6 +130,14 @@ class Calls:
             if name not in self._session.state()["files"]:
                 raise RefusedError(404, "there is no report of this plan: make it on the page")
             data = (self._session.case().output / name).read_bytes()
+            if (
+                hashlib.sha256(data).hexdigest()
+                != self._session.made["report"].values["files"][name]
+            ):
+                raise RefusedError(
+                    409, f"another program has written {name} since, perhaps of another plan: make "
+                    "the report again"
+                )  # fmt: skip
             return Reply(data, *RESULTS[name])
 
         return read
@@ -187,7 +195,6 @@ class Calls:
             if not made and not case.plan and not moves:
                 raise CaseInputError("choose a procedure, or state a move: nothing is cut or moved")
             self._write(new)
-        session.made.pop("compute", None)
         session.start("compute")
         return self.state()
 

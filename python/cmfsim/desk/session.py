@@ -110,6 +110,9 @@ class Session:
         """
         with self._asking:
             self._refuse_busy()
+            if kind in {"compute", "report"}:
+                # Until it has ended well there is none: the one before is of an earlier plan.
+                self.made.pop(kind, None)
             self._kind, self._stage, self._error, self._cancelled = kind, "", "", False
         threading.Thread(target=self._run, args=(kind,), daemon=True).start()
 
@@ -221,9 +224,8 @@ class Session:
                 plan = {n: m.matrix for n, m in case.plan.items() if m.matrix is not None}
                 values["digits"] = plan_digits(plan)
             if text == self.reported:
-                values["files"] = (
-                    self.made["report"].values["files"] if "report" in self.made else []
-                )
+                made = self.made.get("report")
+                values["files"] = [] if made is None else [*made.values["files"]]
         return values
 
     def _findings(self) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ from cmfsim.drafting import init_case
 from cmfsim.errors import CaseInputError, LandmarkError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.inputs import (
+    input_hash,
     plan_key,
     read_anatomy,
     read_case_landmarks,
@@ -128,7 +129,7 @@ def _plan(case_file: str, body: str) -> dict[str, Any]:
 
 
 def report(case_file: str) -> dict[str, Any]:
-    """Predicts the case as `cmfsim predict` does; its report, the page for the chart, findings.
+    """Predicts the case as `cmfsim predict` does; its report and chart with hashes, findings.
 
     Where only the plan differs from the case of the plan operator, nothing is built again.
     """
@@ -146,5 +147,8 @@ def report(case_file: str) -> dict[str, Any]:
 
     written = write_results(case.output, predicted, (MODEL,), stage=_stage)
     _stage("drawing the page for the chart")
-    names = [written.report, write_chart_page(case.output)]
-    return {"files": names, "findings": told.as_values()}
+    names = filter(None, (written.report, write_chart_page(case.output)))
+    return {
+        "files": {name: input_hash(case.output / name) for name in names},
+        "findings": told.as_values(),
+    }

@@ -1,5 +1,6 @@
 """The server of the desk: what it refuses, what it writes, and work that dies or is stopped."""
 
+import hashlib
 import json
 import os
 import signal
@@ -218,6 +219,36 @@ def test_a_plan_without_an_operator_is_not_saved(post, state):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are POSIX")
+def test_a_report_of_an_earlier_plan_is_gone_when_another_is_asked_for(
+    server, post, state, session, folder
+):
+    """Also if the new one fails, and if another program has written one in its place."""
+    (folder / "out").mkdir()
+    file = folder / "out/report.pdf"
+    file.write_bytes(b"%PDF of plan A")
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    session.made["report"] = Answer({"files": {"report.pdf": digest}, "findings": []}, {})
+    session.reported = session.text()
+    assert state()["files"] == ["report.pdf"]
+    assert asked(f"{server.url}report.pdf")[1] == b"%PDF of plan A"
+    file.write_bytes(b"%PDF of plan B, by cmfsim predict --plan")
+    status, text, _ = asked(f"{server.url}report.pdf")
+    assert status == 409
+    assert b"another program" in text
+    case = folder / "case.toml"
+    case.write_text(case.read_text(encoding="utf-8") + "# plan B\n", encoding="utf-8")
+    assert state()["files"] == []
+
+    def fails(kind):
+        raise OSError(f"{kind}: disk full")
+
+    session._work = fails
+    assert post("report")[0] == 200
+    wait_for(lambda: state()["error"] == "report: disk full")
+    assert state()["files"] == []
+    assert asked(f"{server.url}report.pdf")[0] == 404
+
+
 def test_a_worker_that_is_killed_or_stopped_is_reported_and_replaced(post, state, session):
     status, _ = post("open")
     assert status == 200
