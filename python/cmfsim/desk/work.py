@@ -10,6 +10,7 @@ from cmfsim.drafting import init_case
 from cmfsim.errors import CaseInputError, LandmarkError
 from cmfsim.io import Case
 from cmfsim.pipeline.building.inputs import (
+    OpenHeads,
     input_hash,
     plan_key,
     read_anatomy,
@@ -37,6 +38,8 @@ MODEL = "M+S"
 # solved exactly as soon as it is kept.
 TRIALS = 4
 
+# The head that is open, until its plan is computed: its jaws are then separated by the landmarks.
+_opened: OpenHeads = {}
 # The planning model of a case file, with the case as it was then.
 _held: dict[str, tuple[Case, PlanningModel]] = {}
 
@@ -75,7 +78,8 @@ def open_head(case_file: str) -> Answer:
     """The content of the page of landmarks, the sites of the skull, and findings."""
     case = Case.load(case_file)
     landmarks, noticed = read_case_landmarks(case)
-    anatomy, found = read_anatomy(case, landmarks.get("skull", {}), _stage)
+    _opened.clear()
+    anatomy, found = read_anatomy(case, landmarks.get("skull", {}), _stage, _opened)
     _stage("finding the landmarks")
     try:
         head = proposed_head(case, anatomy, _stage)
@@ -95,9 +99,8 @@ def compute(case_file: str) -> dict[str, Any]:
     """The planning page of a case, what it was made for, and findings; its model is kept."""
     _held.clear()
     case, told = Case.load(case_file), _Told()
-    made = make_planning_page(
-        case, model=MODEL, trials=TRIALS, corrections=0, observer=told, progress=_stage
-    )
+    asked: BuildKeywords = {"opened": _opened, "observer": told, "progress": _stage}
+    made = make_planning_page(case, model=MODEL, trials=TRIALS, corrections=0, **asked)
     _held[case_file] = case, made.planning
     content = replace(made.content, values={**made.content.values, "on_desk": True})
     return {

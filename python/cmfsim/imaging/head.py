@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -84,6 +84,30 @@ def segment_head(
     >>> sorted(anatomy.bones)
     ['cranium', 'mandible']
     """
+    return segmented(image, options, landmarks=landmarks, progress=progress)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenHead:
+    """A head before its jaws are separated: nothing of it depends on landmarks.
+
+    noticed: Findings before and after those on the scan's values.
+    """
+
+    work: Working
+    skin: Skin
+    bone: Bone
+    noticed: tuple[Sequence[Finding], Sequence[Finding]]
+
+
+def segmented(
+    head: ImageData | OpenHead,
+    options: SegmentOptions | None = None,
+    *,
+    landmarks: Mapping[str, ArrayLike] | None = None,
+    progress: Progress | None = None,
+) -> tuple[Anatomy, OpenHead]:
+    """What `segment_head` gives, and the head from which it is segmented with other landmarks."""
     options = SegmentOptions() if options is None else options
 
     def say(stage: str) -> None:
@@ -96,22 +120,9 @@ def segment_head(
         # What separates the jaws of a head without landmarks depends on nothing of the image.
         is_guessed = points is None and options.part_jaws
         modelled = beside.submit(head_model) if is_guessed else None
-        say("grid")
-        work, findings = working_grid(image, options)
-        hu, cupping = without_cupping(work)
-        work = replace(work, hu=hu)
-        all_findings: list[Finding] = [*findings, *cupping]
-        say("metal")
-        metal = find_metal(work, options)
-        say("skin")
-        skin = find_skin(work, metal, options, beside)
-        _check_head(work, skin.mask)
-        say("bone")
-        # The couch and the air around the head need no more work, here or later.
-        work, metal = work.part(skin.box), metal_within(metal, skin.box)
-        smooth, noisy = without_noise(metal.hu)
-        metal = replace(metal, hu=smooth)
-        bone = find_bone(work, metal, skin, options)
+        if not isinstance(head, OpenHead):
+            head = _opened(head, options, beside, say)
+        work, skin, bone = head.work, head.skin, head.bone
         # Where the bone is and which of it is the jaw are found without each other.
         level = beside.submit(bone_level, bone, options)
         noticed = beside.submit(_noticed, work, skin, bone, options)
@@ -120,17 +131,33 @@ def segment_head(
         bones, teeth, jaws = _bones(work, bone, skin, points, level, options=options, say=say)
         say("air")
         hollow = air_level(work, skin, bone, options)
-        all_findings += [
-            *noisy,
-            *noticed.result()[0],
-            *metal.findings,
-            *skin.findings,
-            *bone.findings,
-            *noticed.result()[1],
-            *jaws,
-        ]
+        (first, second), (weak, seen) = head.noticed, noticed.result()
+        findings = (*first, *weak, *second, *seen, *jaws)
     air = None if hollow is None else work.image(hollow)
-    return Anatomy(work.image(skin.level), bones, air, teeth, tuple(all_findings))
+    return Anatomy(work.image(skin.level), bones, air, teeth, findings), head
+
+
+def _opened(
+    image: ImageData, options: SegmentOptions, beside: ThreadPoolExecutor, say: Progress
+) -> OpenHead:
+    """Skin and bone of a head, and what was noticed on the way."""
+    say("grid")
+    work, findings = working_grid(image, options)
+    hu, cupping = without_cupping(work)
+    work = replace(work, hu=hu)
+    say("metal")
+    metal = find_metal(work, options)
+    say("skin")
+    skin = find_skin(work, metal, options, beside)
+    _check_head(work, skin.mask)
+    say("bone")
+    # The couch and the air around the head need no more work, here or later.
+    work, metal = work.part(skin.box), metal_within(metal, skin.box)
+    smooth, noisy = without_noise(metal.hu)
+    metal = replace(metal, hu=smooth)
+    bone = find_bone(work, metal, skin, options)
+    second = (*metal.findings, *skin.findings, *bone.findings)
+    return OpenHead(work, skin, bone, ((*findings, *cupping, *noisy), second))
 
 
 def _noticed(

@@ -1,6 +1,7 @@
 """The work of the desk gives what the commands give, without building a head twice."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import cmfsim
 from cmfsim.desk import work
 from cmfsim.pipeline import predicting
+from cmfsim.pipeline.building.inputs import read_anatomy
 
 pytest.importorskip("skimage")
 pytest.importorskip("pyvista")
@@ -23,7 +25,14 @@ def case(tmp_path_factory):
     path = folder / "case.toml"
     text = path.read_text(encoding="utf-8").replace("[image]", "[image]\nworking_spacing = 3.0")
     path.write_text(f"{text}\n[mesh]\nedge_length = 14.0\n", encoding="utf-8")
+    opened = work.open_head(str(path))
+    assert len(work._opened) == 1
     work.compute(str(path))
+    # The head of the plan is that of the page of cuts, and is kept no longer.
+    assert not work._opened
+    assert "reading the image" not in work._held[str(path)][1].patient.summary["timings"]
+    skull = work._held[str(path)][1].patient.landmarks["skull"]
+    np.testing.assert_array_equal(opened.values["skull"]["nasion"], skull["nasion"])
     text = path.read_text(encoding="utf-8").replace("-4.0, 0.0]", "-4.0, 1.0]")
     moved = "[plan.mandible_body]\ntranslation = [0.0, 2.5, 0.0]\n\n[plan.maxilla]"
     path.write_text(text.replace("[plan.maxilla]", moved), encoding="utf-8")
@@ -93,3 +102,24 @@ def test_another_mesh_or_image_is_built_again(case, monkeypatch):
         case.write_text(text, encoding="utf-8")
         case.with_name("ct.nrrd").write_bytes(image)
     assert len(built) == 2
+
+
+def test_jaws_separated_by_landmarks_need_no_image_again(case):
+    """With the same bits as from the image; heads of other options are opened anew."""
+    known, kept, stages = cmfsim.Case.load(case), {}, []
+    marks = cmfsim.make_head().skull_landmarks
+    read_anatomy(known, {}, stages.append, kept)
+    again, noticed = read_anatomy(known, marks, stages.append, kept)
+    assert stages.count("reading the image") == 1
+    assert not kept
+    fresh, same = read_anatomy(known, marks, stages.append)
+    assert noticed == same
+    for name, level in fresh.bones.items():
+        np.testing.assert_array_equal(again.bones[name].values, level.values)
+    np.testing.assert_array_equal(again.skin.values, fresh.skin.values)
+    np.testing.assert_array_equal(again.air.values, fresh.air.values)
+    # A head of other options is opened anew: it is kept under another name.
+    other = replace(known, image=replace(known.image, working_spacing=4.0))
+    for one in (known, other):
+        read_anatomy(one, {}, stages.append, kept)
+    assert len(kept) == 2

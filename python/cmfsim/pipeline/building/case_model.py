@@ -316,7 +316,11 @@ def _read_head(
     stages.add(noticed)
     anatomy = options.anatomy
     if anatomy is None:
-        anatomy, noticed = read_anatomy(case, landmarks.get("skull", {}), stages.begin)
+        skull = landmarks.get("skull", {})
+        anatomy, noticed = read_anatomy(case, skull, stages.begin, options.opened)
+        if options.opened is not None:
+            # It is large, and needed no longer.
+            options.opened.clear()
         stages.add(noticed)
     check_bones_of_sites(case, landmarks.get("skull", {}), anatomy, by_hand=True)
     return landmarks, anatomy

@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -33,6 +33,11 @@ from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
 if TYPE_CHECKING:
     from cmfsim.imaging import SegmentOptions
+    from cmfsim.imaging.head import OpenHead
+    from cmfsim.values.image_data import ImageData
+
+# Heads that were opened, by image and options, with what was noticed on reading it.
+OpenHeads: TypeAlias = "dict[str, tuple[OpenHead, tuple[Finding, ...]]]"
 
 # Voxels of the grid that surfaces are worked on, in edges of the mesh to come, and in mm at least.
 VOXELS_PER_EDGE = 3.0
@@ -67,23 +72,38 @@ def read_placed_sites(case: Case) -> dict[tuple[str, str], tuple[Floats, SiteSta
 
 
 def read_anatomy(
-    case: Case, landmarks: Mapping[str, Floats], progress: Progress
+    case: Case, landmarks: Mapping[str, Floats], progress: Progress, kept: OpenHeads | None = None
 ) -> tuple[Anatomy, tuple[Finding, ...]]:
-    """The head of a case, from its CT or its surfaces."""
+    """The head of a case, from its CT or its surfaces.
+
+    kept: Takes the opened head, or gives it once where it was opened before: separating its jaws by
+        other landmarks needs no more of the image.
+    """
     if case.image is not None:
         # A case of surfaces loads nothing of imaging.
-        from cmfsim.imaging import segment_head  # noqa: PLC0415
+        from cmfsim.imaging.head import segmented  # noqa: PLC0415
 
-        progress("reading the image")
-        read = read_image_file(case.image.file, series=case.image.series)
-        anatomy = segment_head(
-            read.image,
-            segment_options(case),
+        tissue, key = segment_options(case), ""
+        head: ImageData | OpenHead | None = None
+        noticed: tuple[Finding, ...] = ()
+        if kept is not None:
+            key = f"{input_hash(case.image.file)} {case.image.series} {tissue}"
+            head, noticed = kept.pop(key, (None, noticed))
+        is_new = head is None
+        if head is None:
+            progress("reading the image")
+            read = read_image_file(case.image.file, series=case.image.series)
+            head, noticed = read.image, tuple(read.findings)
+        anatomy, opened = segmented(
+            head,
+            tissue,
             landmarks=landmarks or None,
             progress=lambda stage: progress(f"segmenting the head: {stage}"),
         )
+        if kept is not None and is_new:
+            kept[key] = opened, noticed
         refuse_errors(anatomy, case.where("image"))
-        return anatomy, (*read.findings, *anatomy.findings)
+        return anatomy, (*noticed, *anatomy.findings)
     given_surfaces = case.surfaces
     if given_surfaces is None:  # a Case has the one or the other
         raise AssertionError(case.name)

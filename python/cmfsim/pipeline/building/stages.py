@@ -13,6 +13,8 @@ from cmfsim.values.finding import Finding, OnFindings
 from cmfsim.values.progress import Observer, ProgressOrBar, shown_progress
 
 if TYPE_CHECKING:
+    from cmfsim.pipeline.building.inputs import OpenHeads
+
     # A case without muscles loads nothing of them.
     from cmfsim.values.musculature import Musculature
     from cmfsim.values.patient_model import PatientModel
@@ -33,6 +35,7 @@ class BuildKeywords(TypedDict, total=False):
     check: bool
     findings: Iterable[Finding]
     anatomy: Anatomy | None
+    opened: "OpenHeads | None"
     after: Postoperative | None
     progress: ProgressOrBar
     on_findings: OnFindings | None
@@ -55,6 +58,8 @@ class BuildOptions:
         What is known of the case already; the model keeps it.
     anatomy : Anatomy or None
         The head, where it is known; the image or surfaces of the case are then not read.
+    opened : dict or None
+        Heads that `read_anatomy` has opened before; it is emptied when the head is there.
     after : Postoperative or None
         What `read_postoperative` gives, where it is known already.
 
@@ -74,6 +79,7 @@ class BuildOptions:
     check: bool = True
     findings: Iterable[Finding] = ()
     anatomy: Anatomy | None = None
+    opened: "OpenHeads | None" = None
     after: Postoperative | None = None
     progress: InitVar[ProgressOrBar] = None
     on_findings: InitVar[OnFindings | None] = None
