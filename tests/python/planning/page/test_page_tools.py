@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planning_steps import settle
 
-from browser_page import serious_faults
+from browser_page import serious_faults, until
 
 pytest.importorskip("skimage")
 pytest.importorskip("meshio")
@@ -101,7 +101,7 @@ def test_a_photo_of_either_profile_lies_under_the_lines_of_the_plan(opened, tmp_
     path = tmp_path / "photo.jpg"
     pixels = drawn_photo(opened, path, side)
     opened.locator("#photo-file").set_input_files(path)
-    opened.wait_for_function("!cmfsimPage.photo.canvas.hidden")
+    until(opened, "!cmfsimPage.photo.canvas.hidden")
     canvas = opened.locator("canvas.photo")
     box = canvas.bounding_box()
     scale = box["width"] / PHOTO["width"]
@@ -132,7 +132,7 @@ def test_a_photo_whose_points_do_not_fit_gets_no_lines(opened, tmp_path):
     path = tmp_path / "photo.png"
     pixels = drawn_photo(opened, path, 1)
     opened.locator("#photo-file").set_input_files(path)
-    opened.wait_for_function("cmfsimPage.photo.photo && cmfsimPage.photo.points.length === 0")
+    until(opened, "cmfsimPage.photo.photo && cmfsimPage.photo.points.length === 0")
     wrong = [*pixels.values()][::-1]
     wrong[0], wrong[1] = wrong[1], wrong[0]
     opened.evaluate("rows => rows.forEach((row) => cmfsimPage.photo.take(row))",

@@ -7,12 +7,8 @@ import { drawLines } from "./profile.js";
 // Landmarks in the middle of the face, from top to bottom, and how many are needed.
 const SITES = ["glabella", "nasion", "pronasale", "subnasale", "labiale_superius", "labiale_inferius", "sublabiale", "pogonion", "menton"];
 const LEAST = 3;
-// Root mean square distance of the landmarks above which they do not fit, mm.
-const MOST_ERROR = 5;
-// The face looks to one side if that fits better than the other by this ratio of errors.
-const CLEARER = 0.6;
-// A photo is kept with as many pixels to a side.
-const MOST_PIXELS = 2000;
+// Root mean square distance, mm, above which landmarks do not fit; by which ratio one side fits better than the other; pixels that are kept.
+const MOST_ERROR = 5, CLEARER = 0.6, MOST_PIXELS = 2000;
 
 /** The similarity from (y, z), mm, to pixels that fits points best, for each side to which the face may look; best first. */
 export function fitted(sites, pixels) {
@@ -23,9 +19,7 @@ export function fitted(sites, pixels) {
     let [re, im, size] = [0, 0, 0];
     sites.map(flat).forEach(([u, v], i) => {
       const [a, b, c, d] = [u - m[0], v - m[1], pixels[i][0] - q[0], pixels[i][1] - q[1]];
-      re += a * c + b * d;
-      im += a * d - b * c;
-      size += a * a + b * b;
+      [re, im, size] = [re + a * c + b * d, im + a * d - b * c, size + a * a + b * b];
     });
     const [c, s] = [re / size, im / size];
     const place = (site) => {
@@ -93,8 +87,7 @@ export class ProfilePhoto {
     const places = this.app.face.sitePlaces(null);
     const used = this.sites.filter((_, i) => this.points[i]);
     if (used.length < LEAST) return { why: `${LEAST - used.length} more needed.` };
-    const pixels = this.points.filter(Boolean);
-    const [best, other] = fitted(used.map((name) => places[name].slice(1)), pixels);
+    const [best, other] = fitted(used.map((name) => places[name].slice(1)), this.points.filter(Boolean));
     if (!(best.error <= MOST_ERROR)) {
       return { why: `The points do not fit this face: they are ${best.error.toFixed(1)} mm off, at most ${MOST_ERROR} mm are allowed. Check the order, and that the photo is a profile of this patient.` };
     }
@@ -112,9 +105,8 @@ export class ProfilePhoto {
     pen.drawImage(photo, 0, 0);
     this.fit = this.placed();
     if (this.fit.place) drawLines(pen, lines, this.fit.place, unit);
+    Object.assign(pen, { strokeStyle: "#d0021b", lineWidth: 1.5 * unit });
     points.filter(Boolean).forEach(([x, y]) => {
-      pen.strokeStyle = "#d0021b";
-      pen.lineWidth = 1.5 * unit;
       pen.beginPath();
       pen.arc(x, y, 4 * unit, 0, 2 * Math.PI);
       pen.stroke();
@@ -134,8 +126,7 @@ export class ProfilePhoto {
     const text = `${app.page.case}, variant ${app.exporting.stem.split("-").at(-1)}: dashed before, solid predicted. Not a medical device.`;
     pen.fillStyle = "#ffffffcc";
     pen.fillRect(0, canvas.height - 2 * size, canvas.width, 2 * size);
-    pen.fillStyle = "#1d2530";
-    pen.font = `${size}px system-ui, sans-serif`;
+    Object.assign(pen, { fillStyle: "#1d2530", font: `${size}px system-ui, sans-serif` });
     pen.fillText(text, size, canvas.height - 0.6 * size, canvas.width - 2 * size);
     canvas.toBlob((blob) => save(`${app.exporting.stem}-${fileName("photo")}.png`, blob, "image/png"));
     this.show(this.lines);

@@ -36,8 +36,7 @@ export class PullPanel {
       element("div", { className: "row", role: "group", "aria-label": "Segments that follow" },
         ...app.page.segments.map((s, i) => element("label", {}, this.follows[i], ` ${s.label}`))),
       element("div", { className: "row" }, element("label", { for: "pull-point", textContent: "Point" }), this.choice),
-      element("div", { className: "row" }, ...WISHES.flatMap(({ key, label }) => [
-        element("label", { for: `wish-${key}`, textContent: label }), this.fields[key]])),
+      element("div", { className: "row" }, ...WISHES.map(({ key, label }) => element("label", {}, `${label} `, this.fields[key]))),
       element("div", { className: "row" }, button("Pull", () => this.typed(), { id: "pull-typed" })),
       this.state);
     this.fill();
