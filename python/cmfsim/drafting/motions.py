@@ -407,8 +407,8 @@ def _motion(
         why = "a scene turns the head" if is_turned else "no file of landmarks names it"
         raise CaseInputError(
             f"--move {segment}: pitch, yaw and roll turn it about its teeth or chin, whose place "
-            f"is not known yet, because {why}; give mm alone, and add the turn to the case file "
-            "once cmfsim landmarks has found it"
+            f"is not known yet, because {why}; give mm alone, and turn it on the page of cmfsim "
+            "desk or plan, or run cmfsim landmarks and name its file first"
         )
     at = np.zeros(3) if still.point is None else still.point
     matrix = planned_motion(at, shift=shift, turn=turn)
