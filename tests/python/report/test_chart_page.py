@@ -146,7 +146,7 @@ def test_a_case_that_was_changed_gets_no_report_of_its_earlier_plan(
     assert "report-older" in capsys.readouterr().err
     # Whoever names the results means them; a line says that the case has gone on.
     assert main(["report", str(case_results)]) == 0
-    assert "before it was changed" in caplog.text
+    assert "or of this one as it was" in caplog.text
 
 
 @pytest.fixture

@@ -560,9 +560,10 @@ def results_folder(given: Path) -> Path:
         return given
     folder = Case.load(case_file).output if is_case else given
     (found, *_) = predictions_of(folder).values()
-    if found["inputs"].get(case_file.name) == input_hash(case_file):
+    digest = found["inputs"].get(case_file.name)
+    if digest == input_hash(case_file) or (digest is None and not is_case):
         return folder
-    text = f"{folder}: holds the results of {case_file.name} as it was before it was changed"
+    text = f"{folder}: holds the results of another {case_file.name}, or of this one as it was"
     if is_case:
         raise CaseInputError(
             f"{text} (report-older): run cmfsim predict again, or give {folder} if these are meant"
