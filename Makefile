@@ -57,7 +57,10 @@ quick: $(ENV_STAMP) ## compile a change of the core in seconds, less optimised (
 	@rm -f $(BUILD_STAMP) $(DEVELOP_STAMP)
 	$(subst --release,--profile quick,$(DEVELOP)) --extras imaging,mesh,report,study,test,lint
 
-test: test-rust test-python ## build, then run every test of the project
+# While cargo compiles the tests, pip installs what the Python ones need.
+test: ## build, then run every test of the project
+	"$(MAKE)" --jobs=2 test-rust $(DEVELOP_STAMP)
+	"$(MAKE)" test-python
 
 test-rust: $(ENV_STAMP)
 	cargo test --workspace --release $(CARGO_FLAGS) $(CORE_FEATURES)
