@@ -29,37 +29,8 @@ impl Link {
         (self.stiffness * (self.goal - along)).max(0.0)
     }
 
-    /// Adds that force to rows y.
-    pub fn add_push(&self, along: f64, y: &mut [[f64; 3]]) {
-        self.add(self.push(along), y);
-    }
-
-    /// Adds k (c·x) c to rows y.
-    pub fn add_product(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(self.stiffness * self.along(x), y);
-    }
-
-    /// Adds k goal c to the right-hand side `b`.
-    pub fn add_goal(&self, b: &mut [[f64; 3]]) {
-        self.add(self.stiffness * self.goal, b);
-    }
-
-    /// Adds k (goal − c·x) c to rows y: the force that the spring exerts on them at x, N.
-    pub fn add_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(self.pull(x), y);
-    }
-
-    /// Subtracts the force of a link that only pushes.
-    pub fn take_push(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(-self.push(self.along(x)), y);
-    }
-
-    /// Subtracts the same force again.
-    pub fn take_force(&self, x: &[[f64; 3]], y: &mut [[f64; 3]]) {
-        self.add(-self.pull(x), y);
-    }
-
-    fn add(&self, force: f64, y: &mut [[f64; 3]]) {
+    /// Adds c times `force`, N, to rows y.
+    pub fn add(&self, force: f64, y: &mut [[f64; 3]]) {
         for (row, c) in &self.ends {
             y[*row as usize] = add(y[*row as usize], scaled(*c, force));
         }

@@ -419,7 +419,7 @@ impl TouchingPlan<'_> {
         met.retain(|m| m.is_bone || m.force > 0.0 || m.gap >= -close || is_inside(m.node));
         let mut forces = vec![[0.0; 3]; pose.rows.len()];
         for link in &done.round.links {
-            link.add_force(&pose.rows, &mut forces);
+            link.add(link.pull(&pose.rows), &mut forces);
         }
         let converged = done.converged && overlap <= THROUGH * self.close();
         let result = TouchResult {

@@ -85,7 +85,7 @@ impl Pressed<'_> {
         loop {
             g.copy_from_slice(&r);
             for (link, s) in self.links.iter().zip(&along) {
-                link.add_push(*s, &mut g);
+                link.add(link.push(*s), &mut g);
             }
             self.a.project(&mut g);
             self.preconditioner.apply(&g, &mut z);
@@ -161,7 +161,7 @@ mod tests {
         let x = [[0.3, -1.1, 0.7], [0.2, 0.9, -0.4], [1.3, 0.8, -0.6]];
         let mut expected = matrix.multiply(&x);
         for link in &links {
-            link.add_product(&x, &mut expected);
+            link.add(link.stiffness * link.along(&x), &mut expected);
         }
         let found = with_links(&matrix, &links).multiply(&x);
         for (a, b) in found.iter().flatten().zip(expected.iter().flatten()) {

@@ -54,7 +54,7 @@ impl Operator for ProjectedProduct<'_> {
             y[*row] = add(y[*row], scaled(spring.axis, pull));
         }
         for link in self.links {
-            link.add_product(x, y);
+            link.add(link.stiffness * link.along(x), y);
         }
         self.project(y);
     }

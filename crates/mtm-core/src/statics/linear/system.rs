@@ -244,7 +244,7 @@ impl System {
         }
         let mut b = b.to_vec();
         for link in linked.links {
-            link.add_goal(&mut b);
+            link.add(link.stiffness * link.goal, &mut b);
         }
         let leave = KeptForNext {
             reach: f64::INFINITY,

@@ -160,7 +160,7 @@ impl RowLinks<'_> {
         let (mut shift, mut out) = (vec![[0.0; 3]; b.len()], b.to_vec());
         add_offsets(&mut shift, constraints);
         for link in self.links {
-            link.add_force(&shift, &mut out);
+            link.add(link.pull(&shift), &mut out);
         }
         Cow::Owned(out)
     }
@@ -290,10 +290,9 @@ impl Projected<'_, '_> {
             *f = sub(*f, *b);
         }
         for link in self.linked.links {
-            match self.linked.share {
-                Some(_) => link.take_push(x, &mut out),
-                None => link.take_force(x, &mut out),
-            }
+            let force = link.pull(x);
+            let only_pushes = self.linked.share.is_some();
+            link.add(if only_pushes { -force.max(0.0) } else { -force }, &mut out);
         }
         out
     }
