@@ -54,7 +54,7 @@ const SHARP_ROUNDS: usize = 6;
 /// Rounds of a step with the planes at its start, and the depth behind them, over the mean edge, at which they
 /// end.
 const MOST_ROUNDS_AHEAD: usize = 8;
-const AHEAD_EDGES: f64 = 0.05;
+const AHEAD_EDGES: f64 = 0.15;
 /// Share of the first residual, in the energy norm, that a round before the last ones may leave.
 const ROUGH_SHARE: f64 = 0.1;
 /// Error of the solves that end a plan, over the distance that counts as touching, which is at most this share of
