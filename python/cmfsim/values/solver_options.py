@@ -33,7 +33,8 @@ class SolverOptions:
     max_iterations : int or None
     contact_tolerance : float, mm
         Largest distance of a node in contact from its contact surface; the force along the surface
-        may still move any single node by at most a tenth of it.
+        may still move any single node by at most a tenth of it. Between lips, 100 times as much,
+        at most 0.01 mm.
     contact_iterations : int
         Newton steps of the contact solver.
     memory_limit : float or None, MB

@@ -94,7 +94,7 @@ fn touching(segments: Vec<Segment>, pairs: Vec<TouchingPair>) -> Arc<Boundary> {
 }
 
 fn options() -> StaticOptions {
-    StaticOptions { contact: near_exact(), ..StaticOptions::default() }
+    StaticOptions::default()
 }
 
 /// u = −ν ε (x, y) and ε z over a floor that stays, of nodes at heights `z`: compression by ε = −`strain`.

@@ -34,8 +34,10 @@ const SHORTEST_STEP: f64 = 1.0 / 512.0;
 /// diagonal of the mesh, for small scenes.
 const CLOSE: f64 = 0.01;
 const CLOSE_SHARE: f64 = 4e-5;
-/// Multiples of that distance which are accepted in intermediate steps, and at the end with a warning: the
-/// latter is half a millimetre, at a node on a fold inside the mouth.
+/// Largest accepted distance over the tolerance of contact, which is smaller only on request.
+const CLOSE_TOLERANCES: f64 = 100.0;
+/// Multiples of the distance that counts as touching which are accepted in intermediate steps, and at the end with
+/// a warning: the latter is half a millimetre, at a node on a fold inside the mouth.
 const LOOSE: f64 = 5.0;
 const SEEN: f64 = 50.0;
 /// Multiple of that distance by which a node may lie inside a tet of other tissue, where edges meet; beyond it,
@@ -145,7 +147,7 @@ impl TouchingPlan<'_> {
         let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(solve.scale);
         let mut step = 1.0 / (farthest / (STEP_EDGES * self.pairs.mean_edge())).ceil().max(1.0);
         let (mut pose, mut here, mut rounds) = (self.rest(), 0.0, 0);
-        solve.allowed = SOLVED_SHARE * self.close().min(SMALL_SHARE * farthest);
+        solve.allowed = SOLVED_SHARE * self.sought().min(SMALL_SHARE * farthest);
         loop {
             let there = if here + 1.5 * step >= 1.0 { 1.0 } else { here + step };
             let shorter = step > SHORTEST_STEP;
@@ -183,6 +185,11 @@ impl TouchingPlan<'_> {
     /// Distance that counts as touching, mm.
     fn close(&self) -> f64 {
         CLOSE.min(CLOSE_SHARE * self.mesh.diagonal())
+    }
+
+    /// The same at the end of the plan, mm: less if the tolerance of contact asks for it.
+    fn sought(&self) -> f64 {
+        self.close().min(CLOSE_TOLERANCES * self.options.contact.tolerance)
     }
 
     /// `pose`, reached at the share `from` of the plan, advanced to the share `to`; nothing if the step is too
@@ -254,7 +261,7 @@ impl TouchingPlan<'_> {
         solve: &mut PlanSolve<'_>,
     ) -> Result<(PartialState, Done)> {
         let most = if is_last { MOST_ROUNDS } else { MOST_ROUNDS_ON_THE_WAY };
-        let close = if is_last { self.close() } else { LOOSE * self.close() };
+        let close = if is_last { self.sought() } else { LOOSE * self.close() };
         let (mut rough, mut count) = (true, 0);
         loop {
             count += 1;
