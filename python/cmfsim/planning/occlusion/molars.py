@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim.errors import third_party
 from cmfsim.planning.occlusion.rows import ToothRow
 from cmfsim.values.checks import Floats
 
@@ -130,13 +131,8 @@ def _unrolled(row: ToothRow) -> _Unrolled:
     centres = np.column_stack([np.interp(along, length, flat[:, k]) for k in range(2)])
     ahead = np.gradient(centres, axis=0)
     ahead /= np.linalg.norm(ahead, axis=1)[:, None]
-    # The nearest centre of each sample, in blocks of little memory.
-    nearest = np.concatenate(
-        [
-            np.argmin(((block[:, None, :2] - centres) ** 2).sum(axis=2), axis=1)
-            for block in np.array_split(places, len(places) // 2000 + 1)
-        ]
-    )
+    spatial = third_party("scipy.spatial", "first molars are found", "imaging")
+    nearest = spatial.cKDTree(centres).query(places[:, :2])[1]
     off = places[:, :2] - centres[nearest]
     beside = off[:, 0] * ahead[nearest, 1] - off[:, 1] * ahead[nearest, 0]
     # What lies beyond the ends of the line has its end as the nearest place.
