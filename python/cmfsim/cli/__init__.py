@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 failed, 2 bad input, 141 where standard output was closed.
 
 import argparse
 import contextlib
+import gc
 import io
 import json
 import logging
@@ -37,6 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         # The process is this command's; a caller's stays as it is.
         keep_freed_memory()
+        # What a command loads first is no garbage: looking for some took a tenth of that time.
+        gc.disable()
         # The products here are thin: numpy's own threads only wait for each other, and keep
         # processors from other work. It is read when numpy is loaded: below, by the commands.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -46,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         spell_out(sys.stdout, sys.stderr)
     try:
-        code = _command(words)
+        code = _command(words, is_own=arguments is None)
         # Here, not at the end of the interpreter, where nobody would catch it.
         sys.stdout.flush()
     except OSError as error:
@@ -60,10 +63,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
-def _command(words: Sequence[str]) -> int:
+def _command(words: Sequence[str], *, is_own: bool) -> int:
     options = _parsed(words)
     if isinstance(options, int):
         return options
+    if is_own:
+        gc.freeze()
+        gc.enable()
     from cmfsim.cli.terminal import ProgressHandler  # noqa: PLC0415 (loads numpy)
 
     handler = ProgressHandler()
