@@ -15,6 +15,5 @@ from cmfsim.meshing.stuffing import part_mesh as part_mesh
 from cmfsim.meshing.stuffing import report_of_part as report_of_part
 from cmfsim.meshing.stuffing import separated_mesh as separated_mesh
 from cmfsim.meshing.tissue import TissueRegion as TissueRegion
-from cmfsim.meshing.tissue import narrow_rooms as narrow_rooms
 from cmfsim.meshing.tissue import near_skin as near_skin
 from cmfsim.meshing.tissue import tissue_level as tissue_level

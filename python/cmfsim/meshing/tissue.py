@@ -76,17 +76,8 @@ class TissueRegion:
         object.__setattr__(self, "foramen_radius", foramen_radius)
 
 
-def tissue_level(
-    anatomy: Anatomy, region: TissueRegion, *, narrow: Mask | None = None
-) -> tuple[ImageData, tuple[Finding, ...]]:
+def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tuple[Finding, ...]]:
     """The level image of the soft tissue in front of the posterior plane, and findings.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-    region : TissueRegion
-    narrow : (nx, ny, nz) bool, optional
-        The `narrow_rooms` of the anatomy, if the caller has them.
 
     Returns
     -------
@@ -108,9 +99,10 @@ def tissue_level(
     """
     grid = anatomy.skin
     level: Levels = np.array(grid.values, dtype=np.float32)
-    np.minimum(level, np.float32(1.0), out=level)
-    for bone in anatomy.bones.values():
-        np.minimum(level, -bone.values, out=level)
+    bone: Levels = np.full(level.shape, -1.0, dtype=np.float32)
+    for other in anatomy.bones.values():
+        np.maximum(bone, other.values, out=bone)
+    np.minimum(level, -bone, out=level)
     if anatomy.air is not None:
         np.minimum(level, -anatomy.air.values, out=level)
     _within_region(level, grid, region)
@@ -119,19 +111,8 @@ def tissue_level(
             "no soft tissue lies in front of the posterior plane: check its point and normal, "
             "and that skin and bones are from one patient"
         )
-    if narrow is None:
-        narrow = narrow_rooms(anatomy, region.foramen_radius)
-    return grid.with_values(level), tuple(_without_hollows(level, narrow, grid))
-
-
-def narrow_rooms(anatomy: Anatomy, radius: float = FORAMEN_RADIUS) -> Mask:
-    """Where no ball of a foramen's radius fits between the bones, nor reaches, (nx, ny, nz)."""
-    sx, sy, sz = (float(s) for s in anatomy.skin.spacing)
-    bone = np.zeros(anatomy.skin.values.shape, dtype=bool)
-    for other in anatomy.bones.values():
-        bone |= other.values > 0.0
-    roomy = _core.distance_image(bone, (sx, sy, sz), within=radius) > radius
-    return _core.distance_image(roomy, (sx, sy, sz), within=radius) > radius
+    findings = tuple(_without_hollows(level, bone, grid, region))
+    return grid.with_values(level), findings
 
 
 def near_skin(anatomy: Anatomy, depth: float) -> Mask:
@@ -163,15 +144,21 @@ def _within_region(level: Levels, grid: ImageData, region: TissueRegion) -> None
         np.minimum(level, below, out=level)
 
 
-def _without_hollows(level: Levels, narrow: Mask, grid: ImageData) -> Iterator[Finding]:
+def _without_hollows(
+    level: Levels, bone: Levels, grid: ImageData, region: TissueRegion
+) -> Iterator[Finding]:
     """Takes from `level` what only openings narrower than a foramen join to the outer tissue."""
     sx, sy, sz = (float(s) for s in grid.spacing)
     spacing = (sx, sy, sz)
     tissue: Mask = level > 0.0
+    # Where a ball of the foramen's radius fits between bones, and what such balls reach.
+    radius = region.foramen_radius
+    roomy = _core.distance_image(bone > 0.0, spacing, within=radius) > radius
+    closed: Mask = _core.distance_image(roomy, spacing, within=radius) > radius
     # Outer tissue touches the skin where no bone stands between; thin tissue over bone is not
     # roomy, so that the way along the skin stays open whatever its thickness.
     shallow = grid.values < 1.0
-    open_tissue = tissue & (~narrow | shallow)
+    open_tissue = tissue & (~closed | shallow)
     labels, sizes = _core.label_image(open_tissue)
     if len(sizes) == 1:
         return

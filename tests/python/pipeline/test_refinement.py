@@ -11,7 +11,6 @@ from cmfsim.pipeline.building.tissue.tissue_mesh import (
     MOUTH_LENGTH,
     MOUTH_WIDTH,
     allowed_halvings,
-    mouth_of,
     needed_halvings,
 )
 from shared_values import drawn_levels
@@ -42,7 +41,7 @@ def head(**renamed):
 
 def test_the_mouth_is_tissue_near_both_jaws_near_the_skin_and_in_front():
     level, anatomy, (x, y, z) = head()
-    needed = needed_halvings(level, mouth_of(anatomy))
+    needed = needed_halvings(level, anatomy)
     mouth = needed.astype(bool)
     assert needed.dtype == np.uint8
     assert set(np.unique(needed)) == {0, 1}
@@ -66,7 +65,7 @@ def test_the_mouth_is_tissue_near_both_jaws_near_the_skin_and_in_front():
 @pytest.mark.parametrize("renamed", [{"mandible": "skull"}, {"cranium": "mandible"}])
 def test_a_head_with_one_jaw_has_no_mouth(renamed):
     level, anatomy, _ = head(**renamed)
-    assert not needed_halvings(level, mouth_of(anatomy)).any()
+    assert not needed_halvings(level, anatomy).any()
 
 
 def test_the_lips_of_the_phantom_have_tets_of_half_the_edge(tmp_path_factory):
@@ -77,7 +76,7 @@ def test_the_lips_of_the_phantom_have_tets_of_half_the_edge(tmp_path_factory):
     edge, ends = 5.0, ("superius", "inferius")
     lips = np.mean([head.skin_landmarks[f"labiale_{end}"] for end in ends], axis=0)
     largest = []
-    for needed in (needed_halvings(level, mouth_of(anatomy)), None):
+    for needed in (needed_halvings(level, anatomy), None):
         options = cmfsim.MeshOptions(edge, refinements=GAP_REFINEMENTS)
         allowed = allowed_halvings(anatomy)
         made = cmfsim.mesh_from_level(level, options, allowed=allowed, needed=needed)

@@ -19,7 +19,6 @@ from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.skin.lips import CaseLipContact
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
-from cmfsim.pipeline.building.tissue.tissue_mesh import HeadRooms
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -65,7 +64,6 @@ class MeshedTissue:
     region: TissueRegion
     level: ImageData
     findings: tuple[Finding, ...]
-    rooms: HeadRooms
     filled: tuple[TetMesh, MeshReport, tuple[Finding, ...]] | None = None
 
 

@@ -55,14 +55,8 @@ from cmfsim.pipeline.building.surgery.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative
 from cmfsim.pipeline.building.tissue.contacts import mean_edge
 from cmfsim.pipeline.building.tissue.nodes import made_contacts, nodes_of
-from cmfsim.pipeline.building.tissue.tissue_mesh import (
-    HeadRooms,
-    head_rooms,
-    region_of,
-    tissue_mesh,
-)
+from cmfsim.pipeline.building.tissue.tissue_mesh import region_of, tissue_mesh
 from cmfsim.surfaces.levels import detailed_surface
-from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.node_kinds import NODE_KINDS
@@ -206,27 +200,9 @@ def build_model(case: CaseOrPath, **options: "Unpack[BuildKeywords]") -> Patient
 
 def model_of(case: Case, options: BuildOptions) -> PatientModel:
     """The model of a case, as `build_model` makes it."""
-    # Wrong options are refused before any work.
-    kind_options_of(case)
+    kinds = kind_options_of(case)
     stages = Stages(options)
-    with ThreadPoolExecutor(2) as beside:
-        landmarks, anatomy = _read_head(case, stages, options)
-        # What needs no landmarks is measured while they are found.
-        rooms = beside.submit(head_rooms, case, anatomy)
-        head = _with_landmarks(case, stages, options, landmarks, anatomy)
-        if head.anatomy is not anatomy:
-            rooms = beside.submit(head_rooms, case, head.anatomy)
-        return _model_of_head(head, stages, options, rooms, beside)
-
-
-def _model_of_head(
-    head: Head,
-    stages: Stages,
-    options: BuildOptions,
-    rooms: "Future[HeadRooms]",
-    beside: ThreadPoolExecutor,
-) -> PatientModel:
-    case, kinds = head.case, kind_options_of(head.case)
+    head = _head(case, stages, options)
     stages.add(check_skin(head.anatomy, head.skull))
     if case.photo is not None:
         # A case without a photo loads nothing of it.
@@ -237,23 +213,24 @@ def _model_of_head(
         head = replace(head, skin=skin, colours=colours)
         stages.add((placed,))
     # Tissue and muscles are placed by the anatomy and its landmarks, whatever becomes of the bones.
-    tissue = beside.submit(_meshed, head, rooms)
-    if case.muscles is None:
-        return _without_muscles(head, stages, kinds, options, tissue)[0]
-    # A case without muscles loads nothing of them.
-    from cmfsim.pipeline.building.tissue.muscles import NoMuscles, placed_muscles, with_muscles  # noqa: PLC0415
+    with ThreadPoolExecutor(2) as beside:
+        tissue = beside.submit(_meshed, head)
+        if case.muscles is None:
+            return _without_muscles(head, stages, kinds, options, tissue)[0]
+        # A case without muscles loads nothing of them.
+        from cmfsim.pipeline.building.tissue.muscles import NoMuscles, placed_muscles, with_muscles  # noqa: PLC0415
 
-    placing = beside.submit(placed_muscles, case.muscles, head.skull, head.anatomy)
+        placing = beside.submit(placed_muscles, case.muscles, head.skull, head.anatomy)
 
-    def show(bones: PlannedBones) -> None:
-        if placing.done():
-            placed = placing.result()
-            if not isinstance(placed, NoMuscles):
-                options.observer.muscles(placed.muscles, bones.segments)
+        def show(bones: PlannedBones) -> None:
+            if placing.done():
+                placed = placing.result()
+                if not isinstance(placed, NoMuscles):
+                    options.observer.muscles(placed.muscles, bones.segments)
 
-    patient, mesh = _without_muscles(head, stages, kinds, options, tissue, show=show)
-    stages.begin("placing and sampling the muscles")
-    return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
+        patient, mesh = _without_muscles(head, stages, kinds, options, tissue, show=show)
+        stages.begin("placing and sampling the muscles")
+        return with_muscles(patient, case.muscles, mesh=mesh, placed=placing.result)
 
 
 def replanned(
@@ -300,15 +277,13 @@ def planned_head(
 ) -> tuple[Head, PlannedBones, tuple[Finding, ...]]:
     """The head of a case and its bones with their motions, as `model_of` has them: no tissue."""
     stages = Stages(options)
-    head = _with_landmarks(case, stages, options, *_read_head(case, stages, options))
+    head = _head(case, stages, options)
     bones = _bones(head, stages, options.after)[0]
     return head, bones, tuple(stages.findings)
 
 
-def _read_head(
-    case: Case, stages: Stages, options: BuildOptions
-) -> tuple[dict[str, Mapping[str, Floats]], Anatomy]:
-    """The landmarks and the anatomy of a case as they were read."""
+def _head(case: Case, stages: Stages, options: BuildOptions) -> Head:
+    """What was read of a case, with the landmarks that were found."""
     if options.check:
         stages.begin("checking the case")
         stages.add(_checked(case))
@@ -323,17 +298,6 @@ def _read_head(
             options.opened.clear()
         stages.add(noticed)
     check_bones_of_sites(case, landmarks.get("skull", {}), anatomy, by_hand=True)
-    return landmarks, anatomy
-
-
-def _with_landmarks(
-    case: Case,
-    stages: Stages,
-    options: BuildOptions,
-    landmarks: dict[str, Mapping[str, Floats]],
-    anatomy: Anatomy,
-) -> Head:
-    """The head with the landmarks that were found on it."""
     if is_to_be_found(case, landmarks):
         is_read = options.anatomy is None
         head = found_landmarks(case, anatomy, stages, landmarks, is_read=is_read)
@@ -401,14 +365,13 @@ def _fits(bones: PlannedBones) -> dict[str, Any]:
     return {**({"plan_fits": fits} if fits else {}), "plan_sources": dict(bones.sources)}
 
 
-def _meshed(head: Head, rooms: "Future[HeadRooms]") -> MeshedTissue:
+def _meshed(head: Head) -> MeshedTissue:
     """The tissue of a head, with its mesh where no seam between the lips has to be found first."""
     region = region_of(head.case, head.anatomy, head.skull)
-    own = rooms.result()
-    level, findings = tissue_level(head.anatomy, region, narrow=own.narrow)
+    level, findings = tissue_level(head.anatomy, region)
     if head.case.lips.contact:
-        return MeshedTissue(region, level, findings, own)
-    return MeshedTissue(region, level, findings, own, tissue_mesh(head.case, level, own))
+        return MeshedTissue(region, level, findings)
+    return MeshedTissue(region, level, findings, tissue_mesh(head.case, level, head.anatomy))
 
 
 def _tissue(
@@ -438,7 +401,7 @@ def _tissue(
         stages.add(seam.findings)
         stages.begin("filling the tissue with tets")
     if filled is None:
-        filled = tissue_mesh(case, found.level, found.rooms, seam)
+        filled = tissue_mesh(case, found.level, anatomy, seam)
     mesh, report, noticed = filled
     stages.add(noticed)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)

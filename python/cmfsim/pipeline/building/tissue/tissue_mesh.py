@@ -1,7 +1,7 @@
 """The soft tissue of a case as tets: where it ends behind, below and above, and is refined."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,6 @@ from cmfsim.meshing import (
     mesh_findings,
     mesh_from_level,
     mesh_report,
-    narrow_rooms,
     near_skin,
     part_mesh,
     report_of_part,
@@ -28,7 +27,6 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.mesh_report import MeshReport
 
 Counts = NDArray[np.uint8]
-Mouth = tuple[tuple[slice, ...], NDArray[np.bool_]]
 
 # Depth below the skin to which thin tissue is refined, mm: lips, nose and lids, not the walls of
 # the nasal cavity.
@@ -98,30 +96,8 @@ def end_planes(region: TissueRegion) -> dict[str, tuple[ArrayLike, ArrayLike]]:
     return planes
 
 
-@dataclass(frozen=True, eq=False)
-class HeadRooms:
-    """What the tissue of a head takes from its anatomy alone, whatever its landmarks.
-
-    narrow: As `narrow_rooms`.
-    allowed: As `allowed_halvings`; None where no edge is halved, as the next.
-    mouth: As `mouth_of`.
-    """
-
-    narrow: NDArray[np.bool_]
-    allowed: Counts | None = None
-    mouth: Mouth | None = None
-
-
-def head_rooms(case: Case, anatomy: Anatomy) -> HeadRooms:
-    """The rooms of a head that its tissue needs."""
-    narrow = narrow_rooms(anatomy)
-    if case.mesh.file is not None or not case.mesh.refine:
-        return HeadRooms(narrow)
-    return HeadRooms(narrow, allowed_halvings(anatomy), mouth_of(anatomy))
-
-
 def tissue_mesh(
-    case: Case, level: ImageData, rooms: HeadRooms, seam: LipSeam | None = None
+    case: Case, level: ImageData, anatomy: Anatomy, seam: LipSeam | None = None
 ) -> tuple[TetMesh, MeshReport, tuple[Finding, ...]]:
     """The mesh that the case names or that fills the tissue, its report, and what to say of it.
 
@@ -134,9 +110,10 @@ def tissue_mesh(
         return mesh, report, mesh_findings(report)
     options = MeshOptions(case.mesh.edge_length, refinements=0, least_body=LEAST_BODY)
     allowed = needed = None
-    if rooms.allowed is not None:
+    if case.mesh.refine:
         options = replace(options, refinements=GAP_REFINEMENTS)
-        allowed, needed = rooms.allowed, needed_halvings(level, rooms.mouth)
+        allowed = allowed_halvings(anatomy)
+        needed = needed_halvings(level, anatomy)
         if seam is not None and seam.surface is not None:
             needed = np.maximum(needed, lip_halvings(level, seam, case.mesh.edge_length))
     made = mesh_from_level(level, options, allowed=allowed, needed=needed)
@@ -158,17 +135,23 @@ def allowed_halvings(anatomy: Anatomy) -> Counts:
     return allowed
 
 
-def mouth_of(anatomy: Anatomy) -> Mouth | None:
-    """A block of the grid and where in it both jaws and the skin are near; None without "mandible".
+def needed_halvings(level: ImageData, anatomy: Anatomy) -> Counts:
+    """How often the edge is halved at least: once at the mouth, if the anatomy has a "mandible".
 
-    No landmark is asked for, nor that the image show the lips apart.
+    A tet holds one mixture of fat and muscle: one half as large as a lip is thick smears the lip's
+    muscle over it, where the motions of the jaws differ most. No landmark is asked for, nor that
+    the image show the lips apart.
+
+    level: Of the tissue, on the anatomy's grid.
+    Returns: (nx, ny, nz) uint8.
     """
+    needed = np.zeros(level.values.shape, dtype=np.uint8)
     mandible = anatomy.bones.get("mandible")
     if mandible is None:
-        return None
+        return needed
     # Where a sum of distances below the width, and the depth there, depend on nothing outside.
-    sx, sy, sz = (float(s) for s in mandible.spacing)
-    reach = np.ceil((MOUTH_WIDTH + MOUTH_DEPTH) / mandible.spacing).astype(int) + 1
+    sx, sy, sz = (float(s) for s in level.spacing)
+    reach = np.ceil((MOUTH_WIDTH + MOUTH_DEPTH) / level.spacing).astype(int) + 1
     low, high = block_of(mandible.values > 0.0)
     box = tuple(slice(max(a - r, 0), b + r) for a, b, r in zip(low, high, reach, strict=True))
     lower = mandible.values[box] > 0.0
@@ -180,29 +163,12 @@ def mouth_of(anatomy: Anatomy) -> Mouth | None:
     width += distance_image(upper, (sx, sy, sz), within=MOUTH_WIDTH)
     outside = anatomy.skin.values[box] <= 0.0
     depth = distance_image(outside, (sx, sy, sz), within=MOUTH_DEPTH)
-    return box, (width < MOUTH_WIDTH) & (depth < MOUTH_DEPTH)
-
-
-def needed_halvings(level: ImageData, mouth: Mouth | None) -> Counts:
-    """How often the edge is halved at least: once at the mouth, if there is one.
-
-    A tet holds one mixture of fat and muscle: one half as large as a lip is thick smears the lip's
-    muscle over it, where the motions of the jaws differ most.
-
-    level: Of the tissue.
-    mouth: As `mouth_of` of the anatomy.
-    Returns: (nx, ny, nz) uint8.
-    """
-    needed = np.zeros(level.values.shape, dtype=np.uint8)
-    if mouth is None:
-        return needed
-    box, near = mouth
-    inside = near & (level.values[box] > 0.0)
-    rows = np.flatnonzero(inside.any(axis=(0, 2)))
+    mouth = (level.values[box] > 0.0) & (width < MOUTH_WIDTH) & (depth < MOUTH_DEPTH)
+    rows = np.flatnonzero(mouth.any(axis=(0, 2)))
     if len(rows):
         # The second axis of the grid runs from front to back.
-        inside[:, rows[0] + int(MOUTH_LENGTH / float(level.spacing[1])) + 1 :] = False
-    needed[box] = inside
+        mouth[:, rows[0] + int(MOUTH_LENGTH / sy) + 1 :] = False
+    needed[box] = mouth
     return needed
 
 
