@@ -58,7 +58,6 @@ PYTHON: Mapping[str, str] = {
     "scikit-image": "BSD-3-Clause",
     "scipy": "BSD-3-Clause",
     "pydicom": "MIT",
-    "fast-simplification": "MIT",
     "meshio": "MIT",
     "pyvista": "MIT",
     "tqdm": "MPL-2.0 AND MIT",

@@ -38,6 +38,7 @@ __all__ = [
     "ThinPlateSpline",
     "Tissue",
     "__version__",
+    "decimated",
     "distance_image",
     "icp",
     "label_image",
@@ -46,6 +47,7 @@ __all__ = [
     "rigid_matrix",
     "sample_muscles",
     "signed_distance_image",
+    "smoothed",
     "stuff_image",
     "tube_levels",
 ]
@@ -415,6 +417,10 @@ class IcpFit:
     def rms_history(self) -> _Floats: ...
 
 def rigid_matrix(matrix: ArrayLike, name: str = "matrix") -> _Floats: ...
+def decimated(
+    vertices: ArrayLike, triangles: ArrayLike, wanted: int
+) -> tuple[_Floats, _Indices]: ...
+def smoothed(vertices: ArrayLike, triangles: ArrayLike, steps: Sequence[float]) -> _Floats: ...
 def tube_levels(points: _Floats, segments: _Floats, outside: float) -> _Floats: ...
 def rigid_fit(
     moving: ArrayLike, fixed: ArrayLike, *, weights: ArrayLike | None = None, scale: bool = False

@@ -92,7 +92,9 @@ pub use boundary::{
 };
 pub use contact::{ContactMode, ContactOptions};
 pub use error::{ErrorKind, MtmError, Result, Shortfall};
+pub use geometry::decimation::decimated;
 pub use geometry::motion::{RigidMotion, SurfaceMotion, rigid_matrix};
+pub use geometry::smoothing::smoothed;
 pub use geometry::surface::{Closest, Surface};
 pub use geometry::triangle::{DEGENERATE_AREA, Feature};
 pub use geometry::tube::{TubeEnd, tube_levels};

@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use mtm_core::{
     ErrorKind, MeshQuality, Surface, SurfaceMotion, TetMesh, TubeEnd, WindingTree,
-    rigid_matrix as core_rigid_matrix, tube_levels as core_tube_levels,
+    decimated as core_decimated, rigid_matrix as core_rigid_matrix, smoothed as core_smoothed,
+    tube_levels as core_tube_levels,
 };
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::prelude::*;
@@ -372,6 +373,45 @@ pub fn rigid_matrix<'py>(
     let matrix = arrays::square4(matrix, name)?;
     let rigid = core_rigid_matrix(name.0, &matrix, name.1).map_err(Failure)?;
     Ok(arrays::table(py, rigid.to_vec()))
+}
+
+/// Vertices (v, 3) float64 and triangles (t, 3) uint32 of a surface with about `wanted` triangles.
+#[pyfunction]
+pub fn decimated<'py>(
+    py: Python<'py>,
+    vertices: &Bound<'py, PyAny>,
+    triangles: &Bound<'py, PyAny>,
+    wanted: usize,
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>)> {
+    let (points, corners) = triangle_mesh(vertices, triangles)?;
+    let (points, corners) = detached(py, move || core_decimated(points, corners, wanted))?;
+    Ok((arrays::rows(py, points), arrays::table(py, corners)))
+}
+
+/// Vertices (v, 3) float64 of a closed surface after steps towards the means of their neighbours.
+#[pyfunction]
+pub fn smoothed<'py>(
+    py: Python<'py>,
+    vertices: &Bound<'py, PyAny>,
+    triangles: &Bound<'py, PyAny>,
+    steps: Vec<f64>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let (points, corners) = triangle_mesh(vertices, triangles)?;
+    Ok(arrays::rows(py, detached(py, move || core_smoothed(points, &corners, &steps))?))
+}
+
+/// Vertices and triangles, whose indices are checked.
+fn triangle_mesh(
+    vertices: &Bound<'_, PyAny>,
+    triangles: &Bound<'_, PyAny>,
+) -> PyResult<(Vec<[f64; 3]>, Vec<[u32; 3]>)> {
+    let points = arrays::points(vertices, Named("vertices", MESH))?;
+    let corners = arrays::triangles(triangles, Named("triangles", MESH))?;
+    let n = points.len();
+    match corners.as_flattened().iter().find(|j| **j as usize >= n) {
+        Some(j) => Err(errors::input(MESH, format!("triangles have vertex {j}; there are {n}"))),
+        None => Ok((points, corners)),
+    }
 }
 
 /// Level of the nearest segment of a tube at points, (m,) float64, mm, no less than `outside`: positive inside.

@@ -32,7 +32,8 @@ mod _core {
     use crate::fibres::PyMuscleFibres;
     #[pymodule_export]
     use crate::geometry::{
-        PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh, rigid_matrix, tube_levels,
+        PyMeshQuality, PySurface, PySurfaceMotion, PyTetMesh, decimated, rigid_matrix, smoothed,
+        tube_levels,
     };
     #[pymodule_export]
     use crate::materials::{PyMassTensors, PyTissue};

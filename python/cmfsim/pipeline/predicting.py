@@ -78,8 +78,6 @@ def _needs(case: Case, *, report: bool, evaluation: bool) -> Iterator[_Need]:
         yield _Need("SimpleITK", "imaging", "reads images")
     yield _Need("scipy", "imaging", "computes on the grid of the tissue")
     yield _Need("skimage", "imaging", "makes surfaces from the grid")
-    if case.image is not None or case.osteotomies:
-        yield _Need("fast_simplification", "imaging", "coarsens surfaces of bone")
     for path in _surface_files(case):
         yield _Need("meshio", "mesh", "reads surfaces and meshes")
         if path.lower().endswith(".vtk"):

@@ -1,8 +1,6 @@
 """Closed, lightly smoothed surfaces of levels, of a size that contact can be searched on."""
 
 import logging
-import os
-import threading
 from concurrent.futures import Future
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -28,25 +26,6 @@ SHRINK, GROW = 0.5, -0.53
 CONTACT_RELIEF = 3.0
 # Where the blur is cut off, in standard deviations.
 BLUR_REACH = 3.0
-
-
-class _OneAtATime:
-    """A lock for one call at a time in a process, free again in the child of a fork."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        if hasattr(os, "register_at_fork"):
-            # A thread that holds the lock while another forks does not exist in the child.
-            os.register_at_fork(after_in_child=self._renew)
-
-    def _renew(self) -> None:
-        self.lock = threading.Lock()
-
-
-# fast-simplification keeps its mesh in global variables: two threads inside it would exchange
-# their meshes without an error. Version 0.2.0 holds Python's lock while it works, but does not
-# promise to.
-_DECIMATING = _OneAtATime()
 # The detailed surfaces of levels that are in use.
 _MADE: WeakKeyDictionary[ImageData, Future[SurfaceData]] = WeakKeyDictionary()
 
@@ -102,8 +81,7 @@ def surface_of_level(
     Raises
     ------
     CaseError
-        (also `ValueError`) A level without an inside; scikit-image, or fast-simplification where
-        the surface has to be decimated, is missing.
+        (also `ValueError`) A level without an inside; scikit-image is missing.
     """
     options = options or SurfaceOptions()
     values = level.single
@@ -122,9 +100,10 @@ def surface_of_level(
     points = np.asarray(vertices, dtype=np.float64) + (low - 1)
     corners, points = _without_slits(np.asarray(triangles, dtype=np.int64), points)
     points = level.lowest + points * spacing
-    points = _smoothed(points, corners, options.smoothing)
+    points = _core.smoothed(points, corners, [SHRINK, GROW] * options.smoothing)
     if len(corners) > options.max_triangles:
-        points, corners = _decimated(name, points, corners, options.max_triangles)
+        # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
+        points, corners = _closed(*_core.decimated(points, corners, options.max_triangles))
     return SurfaceData(points, _outward(points, corners))
 
 
@@ -238,36 +217,6 @@ def _without_slits(
     return left, points[used]
 
 
-def _smoothed(points: Floats, triangles: NDArray[np.int64], rounds: int) -> Floats:
-    if not rounds:
-        return points
-    sparse = third_party("scipy.sparse", "surfaces are smoothed", "imaging")
-    # The surface is closed: each edge is passed both ways, which makes both ends neighbours.
-    corners = triangles.astype(np.int32)
-    edges = corners.ravel(), corners[:, [1, 2, 0]].ravel()
-    n = len(points)
-    near = sparse.coo_matrix((np.ones(len(edges[0])), edges), shape=(n, n)).tocsr()
-    near.data[:] = 1.0
-    count = np.asarray(near.sum(axis=1))
-    points = points.copy()
-    for _ in range(rounds):
-        for step in (SHRINK, GROW):
-            # points + step (mean of the neighbours − points)
-            towards = near @ points
-            towards /= count
-            towards -= points
-            towards *= step
-            points += towards
-    return points
-
-
-def _decimated(
-    name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
-) -> tuple[Floats, NDArray[np.int64]]:
-    # Quadric decimation stays within a tenth of a voxel, but here and there it folds a sheet.
-    return _closed(*_simplified(name, points, triangles, wanted))
-
-
 def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> SurfaceData:
     """The surface with about as many triangles as wanted, open where it was (Garland 1997).
 
@@ -282,36 +231,19 @@ def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> S
     Raises
     ------
     CaseError
-        (also `ValueError`) fast-simplification is missing; nothing is left of the surface.
+        (also `ValueError`) Nothing is left of the surface.
     """
-    triangles = surface.triangles.astype(np.int64)
-    if len(triangles) <= max_triangles:
+    if len(surface.triangles) <= max_triangles:
         return surface
-    points, corners = _simplified(name, surface.vertices, triangles, max_triangles)
+    points, corners = _core.decimated(surface.vertices, surface.triangles, max_triangles)
     if not len(corners):
         raise CaseInputError(f"nothing is left of {name!r} at {max_triangles} triangles")
-    used, left = used_nodes(corners)
-    return SurfaceData(points[used], left)
+    return SurfaceData(points, corners)
 
 
-def _simplified(
-    name: str, points: Floats, triangles: NDArray[np.int64], wanted: int
-) -> tuple[Floats, NDArray[np.int64]]:
-    quadrics = third_party(
-        "fast_simplification",
-        f"the surface of {name!r} ({len(triangles)} triangles; or raise max_triangles to keep "
-        f"them) is decimated to {wanted}",
-        "imaging",
-    )
-    # A copy: it takes no read-only array.
-    places = np.array(points, dtype=np.float64, order="C")
-    with _DECIMATING.lock:
-        fewer, corners = quadrics.simplify(places, triangles.astype(np.int32), target_count=wanted)
-    return np.asarray(fewer, dtype=np.float64), np.asarray(corners, dtype=np.int64)
-
-
-def _closed(points: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+def _closed(points: Floats, corners: Indices) -> tuple[Floats, NDArray[np.int64]]:
     """The surface with triangles at edges that more than two share removed, and holes filled."""
+    triangles = corners.astype(np.int64)
     while True:
         low, high = np.sort(_half_edges(triangles), axis=1).T
         _, number, count = np.unique(

@@ -1,9 +1,7 @@
-"""Each segment keeps its own surface: decimation one at a time, and what notices an exchange."""
+"""Each segment keeps its own surface, and what notices an exchange."""
 
 import dataclasses
 import hashlib
-import threading
-import time
 import types
 from concurrent.futures import ThreadPoolExecutor
 
@@ -21,7 +19,6 @@ from cmfsim.surfaces import levels as surfaces
 from head_case import HeadCase
 
 pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
-quadrics = pytest.importorskip("fast_simplification", reason="needs fast-simplification")
 
 PLAN = {"le_fort_1": {}, "bsso": {}}
 
@@ -61,30 +58,6 @@ def digest(*found):
     return whole.hexdigest()
 
 
-def test_two_threads_are_never_inside_the_decimator_together(monkeypatch):
-    """The library keeps its mesh in global variables: a second caller would replace it."""
-    inside, most = [0], [0]
-    guard = threading.Lock()
-    real = quadrics.simplify
-
-    def slow(points, triangles, **options):
-        with guard:
-            inside[0] += 1
-            most[0] = max(most[0], inside[0])
-        time.sleep(0.05)
-        with guard:
-            inside[0] -= 1
-        # Not the real one: if it ran side by side here, it might crash.
-        with guard:
-            return real(points, triangles, **options)
-
-    monkeypatch.setattr(quadrics, "simplify", slow)
-    options = surfaces.SurfaceOptions(max_triangles=500)
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda r: surfaces.surface_of_level("b", ball(r), options), range(18, 26)))
-    assert most[0] == 1
-
-
 def test_surfaces_made_by_two_threads_are_those_made_one_after_another():
     """20 different meshes, byte for byte."""
     options = surfaces.SurfaceOptions(max_triangles=500)
@@ -97,14 +70,6 @@ def test_surfaces_made_by_two_threads_are_those_made_one_after_another():
     assert len(set(serial)) == 20
     with ThreadPoolExecutor(2) as pool:
         assert list(pool.map(make, levels)) == serial
-
-
-def test_a_forked_child_does_not_wait_for_a_thread_that_it_lacks():
-    """The lock is renewed in the child, whatever its state in the parent was."""
-    lock = surfaces._OneAtATime()
-    lock.lock.acquire()
-    lock._renew()
-    assert lock.lock.acquire(blocking=False)
 
 
 def test_sound_segments_pass(cut):
@@ -142,14 +107,13 @@ def test_a_surface_with_a_part_lost_is_an_error(cut):
 
 def test_a_decimator_that_exchanges_meshes_ends_the_cut(head, truth, monkeypatch):
     """As the race did: the second caller's mesh is given back to both."""
-    real, first = quadrics.simplify, []
+    real, first = surfaces._core.decimated, []
 
-    def exchanged(points, triangles, **options):
-        first.append((points, triangles, options))
-        points, triangles, options = first[0]
-        return real(points, triangles, **options)
+    def exchanged(*mesh):
+        first.append(mesh)
+        return real(*first[0])
 
-    monkeypatch.setattr(quadrics, "simplify", exchanged)
+    monkeypatch.setattr(surfaces._core, "decimated", exchanged)
     options = CutOptions(surface=surfaces.SurfaceOptions(max_triangles=1000))
     with pytest.raises(cmfsim.CaseError, match=r"same surface|is not that of its bone"):
         cmfsim.cut_bones(truth.bones, PLAN, landmarks=head.skull_landmarks, options=options)

@@ -53,7 +53,6 @@ def test_doctor_reports_that_muscles_are_left_out_where_finding_landmarks_is_off
 
 def test_a_page_is_written_and_missing_sites_are_filled_in_from_the_files(case, capsys):
     """Menton is given by its abbreviation and off by 6 mm: it stays, and the others follow it."""
-    pytest.importorskip("fast_simplification")
     place = average_head().skull["menton"] + [0.0, -6.0, 0.0]
     cmfsim.write_landmarks(case / "few.mrk.json", {"Me": place})
     text = (case / "case.toml").read_text(encoding="utf-8")

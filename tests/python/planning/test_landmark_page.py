@@ -8,6 +8,7 @@ import pytest
 
 import cmfsim
 import cmfsim.planning.landmark_page.page
+from browser_page import open_page, serious_faults, until
 from cmfsim.io import read_landmark_file
 from cmfsim.pipeline.outputs.landmark_page import head_content, write_landmark_page
 from cmfsim.pipeline.proposing import ProposedHead, filled_landmarks, head_distribution
@@ -15,10 +16,6 @@ from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.shape_model.site_covariance import PLACED_STD
 from cmfsim.values.landmark_sites import site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite, SiteState, site_state
-
-pytest.importorskip("fast_simplification")
-
-from browser_page import open_page, serious_faults, until
 
 HIGH = 9.0
 DOUBTFUL = ("infradentale", "pogonion", "menton")

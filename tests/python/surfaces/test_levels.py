@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim import _core
 from cmfsim.surfaces.levels import SurfaceOptions, detailed_surface, surface_of_level
 
 pytest.importorskip("skimage")
@@ -40,3 +41,19 @@ def test_a_detailed_surface_is_made_once_and_its_error_stays():
     for _ in range(2):
         with pytest.raises(cmfsim.CaseError, match="no voxel inside"):
             detailed_surface("skin", empty)
+
+
+def test_smoothing_moves_each_vertex_towards_the_mean_of_its_neighbours():
+    """An octahedron: each vertex has four neighbours, and two edges pass each of them."""
+    places = np.random.default_rng(0).normal(size=(6, 3))
+    triangles = [[a, b, c] for a in (0, 1) for b in (2, 3) for c in (4, 5)]
+    triangles = [t if sum(t) % 2 else t[::-1] for t in triangles]
+    expected = places.copy()
+    for step in (0.5, -0.53):
+        means = [expected[[k for k in range(6) if k // 2 != j // 2]].mean(axis=0) for j in range(6)]
+        expected = expected + step * (np.array(means) - expected)
+    found = _core.smoothed(places, triangles, [0.5, -0.53])
+    assert np.abs(found - expected).max() < 1e-15
+    assert np.array_equal(_core.smoothed(places, triangles, []), places)
+    with pytest.raises(cmfsim.MeshError, match="triangles have vertex 6; there are 6"):
+        _core.smoothed(places, [[0, 1, 6]], [0.5])

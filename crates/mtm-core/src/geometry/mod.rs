@@ -1,7 +1,9 @@
-//! Geometry without mechanics: triangles, closed surfaces, tubes, winding numbers, rigid motions.
+//! Geometry without mechanics: triangles, closed surfaces, their decimation and smoothing, tubes, winding numbers, rigid motions.
 
+pub mod decimation;
 pub(crate) mod lattice_hash;
 pub mod motion;
+pub mod smoothing;
 pub mod surface;
 pub(crate) mod topology;
 pub mod triangle;

@@ -34,7 +34,6 @@ def face_view(parts: Parts, colours: NDArray[np.uint8] | None = None) -> tuple[s
 
     parts: As `read_parts` has them: "skin" and "bones", each with its vertices after the operation.
     colours: Of the vertices of the skin.
-    Raises `CaseError`: fast-simplification is missing and a surface has to be simplified.
     """
     arrays: dict[str, NDArray[Any]] = {}
     shown: list[dict[str, Any]] = []

@@ -126,11 +126,6 @@ def landmark_content(
         How far a person's own point lies from the site, along each axis.
     built_for : str
         The state of the case.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) fast-simplification is missing and a surface has to be simplified.
     """
     arrays: dict[str, NDArray[Any]] = {
         "site_points": _singles([site.point for site in sites]),

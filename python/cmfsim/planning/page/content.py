@@ -106,8 +106,7 @@ def page_content(
     Raises
     ------
     CaseError
-        (also `ValueError`) More nodes on the skin than a page can have; fast-simplification is
-        missing and a surface has to be simplified.
+        (also `ValueError`) More nodes on the skin than a page can have.
 
     Examples
     --------
