@@ -18,6 +18,10 @@ use crate::running::{attempted, detached};
 
 const MESH: ErrorKind = ErrorKind::Mesh;
 
+/// Vertices and triangles of a surface, in the core and for Python.
+type Triangles = (Vec<[f64; 3]>, Vec<[u32; 3]>);
+type TriangleArrays<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>);
+
 /// Checked tetrahedral mesh of the soft tissue.
 ///
 /// Parameters
@@ -382,7 +386,7 @@ pub fn decimated<'py>(
     vertices: &Bound<'py, PyAny>,
     triangles: &Bound<'py, PyAny>,
     wanted: usize,
-) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>)> {
+) -> PyResult<TriangleArrays<'py>> {
     let (points, corners) = triangle_mesh(vertices, triangles)?;
     let (points, corners) = detached(py, move || core_decimated(points, corners, wanted))?;
     Ok((arrays::rows(py, points), arrays::table(py, corners)))
@@ -401,10 +405,7 @@ pub fn smoothed<'py>(
 }
 
 /// Vertices and triangles, whose indices are checked.
-fn triangle_mesh(
-    vertices: &Bound<'_, PyAny>,
-    triangles: &Bound<'_, PyAny>,
-) -> PyResult<(Vec<[f64; 3]>, Vec<[u32; 3]>)> {
+fn triangle_mesh(vertices: &Bound<'_, PyAny>, triangles: &Bound<'_, PyAny>) -> PyResult<Triangles> {
     let points = arrays::points(vertices, Named("vertices", MESH))?;
     let corners = arrays::triangles(triangles, Named("triangles", MESH))?;
     let n = points.len();
