@@ -224,6 +224,7 @@ class Boundary:
         gap: Mapping[str, ArrayLike | Literal["rest"]] | None = None,
         touching: Sequence[tuple[ArrayLike, ArrayLike]] | None = None,
         obstacles: Sequence[tuple[ArrayLike, str | None, Surface]] | None = None,
+        liftable: tuple[ArrayLike, str | None] | None = None,
         conflicts: str = "error",
     ) -> Boundary: ...
     @property
@@ -238,6 +239,8 @@ class Boundary:
     def gap(self) -> dict[str, _Floats | Literal["rest"]]: ...
     @property
     def segments(self) -> list[str]: ...
+    @property
+    def liftable(self) -> _Indices: ...
     @property
     def conflicts(self) -> int: ...
 
@@ -274,6 +277,7 @@ class StaticSolver:
     def solve(
         self, plan: _Plan, *, loads: ArrayLike | None = None, start: Solution | None = None
     ) -> Solution: ...
+    def holding(self, nodes: ArrayLike) -> StaticSolver: ...
     def responses(
         self,
         solution: Solution,

@@ -79,6 +79,8 @@ pub struct Boundary {
     conflicts: usize,
     /// Joined mid-edge nodes, with the ends of their edges.
     inherited: HashMap<u32, [u32; 2]>,
+    /// Nodes that some plans hold, ascending, and the segment that these are then joined to; fixed without one.
+    liftable: (Vec<u32>, Option<usize>),
 }
 
 /// How a segment moves.
@@ -124,6 +126,7 @@ impl Boundary {
             touching: Vec::new(),
             conflicts: 0,
             inherited: HashMap::new(),
+            liftable: (Vec::new(), None),
         };
         boundary.check_segments()?;
         let mut taken: HashMap<u32, String> = HashMap::new();
@@ -197,6 +200,80 @@ impl Boundary {
         }
         self.touching = pairs;
         Ok(self)
+    }
+
+    /// The boundary with nodes that plans hold or free ([`holding`](Self::holding)): joined to `segment` while they
+    /// are held, or fixed if there is none. Those that are so already are held.
+    ///
+    /// # Errors
+    /// A segment that is not part of the boundary, a node of another kind.
+    pub fn with_liftable(mut self, nodes: &[u32], segment: Option<&str>) -> Result<Self> {
+        let place = |name| self.segments.iter().position(|s| s.name == name);
+        let joined_to = segment.map(|name: &str| {
+            let problem = "cannot hold liftable nodes: the boundary has no such segment".into();
+            place(name).ok_or(MtmError::Segment { segment: name.to_owned(), problem })
+        });
+        let mut sorted = unique(nodes);
+        sorted.sort_unstable();
+        self.liftable = (sorted, joined_to.transpose()?);
+        let (nodes, own) = &self.liftable;
+        let mut others = vec![("fixed", own.map(|_| &self.fixed))];
+        for (s, segment) in self.segments.iter().enumerate() {
+            others.push(("joined", (*own != Some(s)).then_some(&segment.joined)));
+            others.push(("sliding", Some(&segment.sliding)));
+        }
+        for (kind, others) in others {
+            let both = others.and_then(|o| o.iter().find(|j| nodes.binary_search(j).is_ok()));
+            if let Some(&node) = both {
+                let (node, first, second) = (node as usize, kind.into(), "liftable".into());
+                return Err(MtmError::NodeOfTwoKinds { node, first, second });
+            }
+        }
+        Ok(self)
+    }
+
+    /// The boundary that holds `nodes` of those that plans hold or free, and no others of them.
+    ///
+    /// # Errors
+    /// A node that is not one of them.
+    pub fn holding(&self, nodes: &[u32]) -> Result<Self> {
+        let (liftable, own) = &self.liftable;
+        let is_liftable = |node: &u32| liftable.binary_search(node).is_ok();
+        if let Some(node) = nodes.iter().find(|node| !is_liftable(node)) {
+            return Err(MtmError::NotTogether {
+                what: "held node",
+                found: node.to_string(),
+                with: "a solver for other plans",
+                needed: "nodes that its boundary was given as liftable",
+                kind: ErrorKind::Boundary,
+            });
+        }
+        let mut out = self.clone();
+        let (held, given) = match *own {
+            Some(s) => (&mut out.segments[s].joined, Some(s)),
+            None => (&mut out.fixed, None),
+        };
+        held.retain(|node| !is_liftable(node));
+        held.extend(unique(nodes));
+        if let Some(s) = given {
+            out.given[s].clone_from(&out.segments[s].joined);
+        }
+        Ok(out)
+    }
+
+    /// The nodes that plans hold or free, ascending, and the places among them of those that are held.
+    pub fn liftable(&self) -> (&[u32], Vec<usize>) {
+        let (nodes, own) = &self.liftable;
+        let held = own.map_or(&self.fixed, |s| &self.segments[s].joined);
+        let mut places: Vec<usize> =
+            held.iter().filter_map(|node| nodes.binary_search(node).ok()).collect();
+        places.sort_unstable();
+        (nodes, places)
+    }
+
+    /// Kind of the nodes that plans hold or free, while they are held.
+    pub(crate) fn liftable_kind(&self) -> NodeKind {
+        self.liftable.1.map_or(NodeKind::Fixed, NodeKind::Joined)
     }
 
     /// The boundary with mid-edge nodes: node `n_corners + i` lies between `edges[i]`.
@@ -336,6 +413,7 @@ impl Boundary {
             }
             Ok(())
         };
+        set("liftable".into(), &self.liftable.0, NodeKind::Free)?;
         set("fixed".into(), &self.fixed, NodeKind::Fixed)?;
         for (s, segment) in self.segments.iter().enumerate() {
             set(format!("joined[\"{}\"]", segment.name), &segment.joined, NodeKind::Joined(s))?;

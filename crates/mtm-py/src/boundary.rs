@@ -35,6 +35,9 @@ const BOUNDARY: ErrorKind = ErrorKind::Boundary;
 /// obstacles : sequence of (nodes, segment, Surface), optional
 ///     Nodes that may touch bone without being sliding nodes of it: they may not go behind the surface, which is
 ///     given at rest with normals out of the bone and moves with the named segment; None for fixed bone.
+/// liftable : (nodes, segment), optional
+///     Nodes that some plans hold and others free: joined to the named segment while they are held, or fixed if it is
+///     None. Those that `joined` or `fixed` has are held; `StaticSolver.holding` holds others with the same factor.
 /// conflicts : {"error", "resolve"}
 ///     A node of two kinds is an error, or fixed takes precedence over joined and joined over sliding.
 ///
@@ -52,7 +55,7 @@ impl PyBoundary {
     #[new]
     #[pyo3(signature = (
         fixed = None, joined = None, sliding = None, contact = None, *, gap = None, touching = None,
-        obstacles = None, conflicts = "error"
+        obstacles = None, liftable = None, conflicts = "error"
     ))]
     #[expect(clippy::too_many_arguments, reason = "one for each keyword of the Python signature")]
     fn new(
@@ -63,6 +66,7 @@ impl PyBoundary {
         gap: Option<&Bound<'_, PyAny>>,
         touching: Option<&Bound<'_, PyAny>>,
         obstacles: Option<&Bound<'_, PyAny>>,
+        liftable: Option<(Bound<'_, PyAny>, Option<String>)>,
         conflicts: &str,
     ) -> PyResult<Self> {
         let fixed = fixed.map_or(Ok(Vec::new()), |f| arrays::nodes(f, Named("fixed", BOUNDARY)))?;
@@ -101,9 +105,13 @@ impl PyBoundary {
         };
         let mut pairs = touching_pairs(touching)?;
         pairs.extend(obstacle_pairs(obstacles)?);
-        let core = Boundary::new(fixed, segments, conflicts)
+        let mut core = Boundary::new(fixed, segments, conflicts)
             .and_then(|boundary| boundary.with_touching(pairs))
             .map_err(Failure)?;
+        if let Some((nodes, segment)) = liftable {
+            let nodes = arrays::nodes(&nodes, Named("liftable", BOUNDARY))?;
+            core = core.with_liftable(&nodes, segment.as_deref()).map_err(Failure)?;
+        }
         Ok(Self { core: Arc::new(core) })
     }
 
@@ -157,6 +165,12 @@ impl PyBoundary {
     #[getter]
     fn segments(&self) -> Vec<String> {
         self.core.segments().iter().map(|s| s.name.clone()).collect()
+    }
+
+    /// Nodes that some plans hold and others free, (k,) uint32, ascending.
+    #[getter]
+    fn liftable<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
+        self.core.liftable().0.to_vec().into_pyarray(py)
     }
 
     /// Number of nodes that were given two kinds, one of which was dropped (with `conflicts="resolve"`).

@@ -20,7 +20,7 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
 from cmfsim.values.scene import Scene, SceneResult
 from cmfsim.values.surface_data import MovedSurface
@@ -65,11 +65,17 @@ def scene_tensors(scene: Scene) -> MassTensors:
     return MassTensors(mesh, _tissue(scene.tissue), element=scene.options.element)
 
 
-def solver_of(scene: Scene, tensors: MassTensors) -> StaticSolver:
-    """The solver of a scene with its tensors, which scenes of other conditions may share."""
+def solver_of(
+    scene: Scene, tensors: MassTensors, liftable: tuple[Indices, str | None] | None = None
+) -> StaticSolver:
+    """The solver of a scene with its tensors, which scenes of other conditions may share.
+
+    liftable: Nodes that plans hold or free, and the segment that they are then joined to, or None
+        where they are fixed: `holding` of the solver then serves the scenes of all plans.
+    """
     options = scene.options.as_dict()
     del options["element"]
-    boundary = _boundary(scene)
+    boundary = _boundary(scene, liftable)
     if boundary.conflicts:
         _log.warning("%d nodes had two kinds; the stronger one was kept", boundary.conflicts)
     solver = StaticSolver(tensors, boundary, options.pop("method"), **options)
@@ -77,7 +83,7 @@ def solver_of(scene: Scene, tensors: MassTensors) -> StaticSolver:
     return solver
 
 
-def _boundary(scene: Scene) -> Boundary:
+def _boundary(scene: Scene, liftable: tuple[Indices, str | None] | None) -> Boundary:
     """The boundary conditions of a scene."""
     segments = scene.segments.items()
     sliding = {name: s.sliding for name, s in segments if np.size(s.sliding)}
@@ -97,6 +103,7 @@ def _boundary(scene: Scene) -> Boundary:
         contact={name: s.contact.searched for name, s in segments if s.contact is not None},
         gap={name: s.gap for name, s in segments if name in sliding},
         conflicts=scene.conflicts,
+        liftable=liftable,
         **one_sided,
     )
 

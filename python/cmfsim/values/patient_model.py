@@ -64,6 +64,11 @@ class LiftedTissue(Frozen):
             normals=self.normals[kept],
         )
 
+    @property
+    def segment(self) -> str | None:
+        """The segment that the nodes are joined to; None where they are fixed."""
+        return self.skull if self.is_joined else None
+
     def free(self, plan: Plan) -> Indices:
         """The nodes that the pieces' motions do not press against the skull, (l,) uint32.
 

@@ -181,6 +181,30 @@ impl PyStaticSolver {
         PySolution::wrap(py, solution, self.core.tensors().mesh().n_nodes())
     }
 
+    /// The solver of the same body that holds these of the boundary's liftable nodes, and frees all others of them.
+    ///
+    /// The factor is shared, so that this takes a small share of the time of a new solver; its solutions are the same
+    /// to rounding.
+    ///
+    /// Parameters
+    /// ----------
+    /// nodes : (k,) array_like of int
+    ///
+    /// Returns
+    /// -------
+    /// StaticSolver
+    ///
+    /// Raises
+    /// ------
+    /// BoundaryError
+    ///     A node that is not liftable.
+    fn holding(&self, py: Python<'_>, nodes: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let nodes = arrays::nodes(nodes, Named("nodes", BOUNDARY))?;
+        let core = self.core.clone();
+        let core = interruptible(py, move |_| core.holding(&nodes))?;
+        Ok(Self { core: Arc::new(core) })
+    }
+
     /// Exact map from rigid plans to the displacements of `nodes` (all by default): 12 columns per segment.
     ///
     /// With sliding nodes, contact is frozen at its equilibrium under `plan` (at rest by default).

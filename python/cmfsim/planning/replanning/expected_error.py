@@ -266,13 +266,13 @@ def solved_plans(planning: PlanningModel, plans: Sequence[Motions]) -> Iterator[
         begun = time.perf_counter()
         shift, failed = None, ""
         try:
-            prediction = planning.solve(plan)
+            found, converged = planning.solve_skin(plan)
         except (ContactError, SolverError) as error:
             failed = str(error)
         else:
             # What stopped above its tolerance is no answer to measure by, or to interpolate.
-            if prediction.result.summary["contact_converged"]:
-                shift = prediction.skin_displacements
+            if converged:
+                shift = found
             else:
                 failed = "contact stopped above its tolerance"
         return SolvedPlan(shift, failed, time.perf_counter() - begun)

@@ -1,5 +1,6 @@
 """A patient's planning model: the face under any rigid plan, by a product or solved exactly."""
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -8,14 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import StaticSolver
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.planning.replanning.columns import PlanColumns, plan_columns
 from cmfsim.planning.replanning.correction import PlanCorrection
-from cmfsim.solving.models import model_scene, predict_patient, solved_patient
-from cmfsim.solving.simulation import scene_plan, scene_solver
+from cmfsim.solving.models import model_scene, predict_patient
+from cmfsim.solving.simulation import scene_plan, scene_tensors, solver_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import rigid_matrix
-from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.patient_model import LiftedTissue, PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.scene import Scene
 from cmfsim.values.skin_motion import carried_points
@@ -123,26 +124,42 @@ class PlanningModel:
     def solve(self, plan: Motions) -> Prediction:
         """The prediction of `predict` under a plan, solved exactly, contact included.
 
-        Tissue is lifted off the bone as by this plan. Where the reference lifts other nodes, the
-        equations are set up again, and solved as a single plan is.
+        Tissue is lifted off the bone as by this plan, with the factor of the reference; where that
+        does not hold and free nodes (quadratic tets, another method, more sliding and lifted nodes
+        than fit into memory), the equations are set up again, and solved as a single plan is.
 
         Raises
         ------
         ContactError, SolverError
             Contact does not converge, or the equations are not solved.
         """
+        patient, solver = self._posed(plan)
+        return predict_patient(patient, self.model, solver=solver)
+
+    def solve_skin(self, plan: Motions) -> tuple[Floats, bool]:
+        """What `solve` finds of the skin, (k, 3) mm, and whether contact converged."""
+        patient, solver = self._posed(plan)
+        scene = model_scene(patient, self.model)
+        solution = solver.solve(scene_plan(scene), loads=scene.loads)
+        return patient.skin_field(solution.displacements), solution.contact_converged
+
+    def _posed(self, plan: Motions) -> tuple[PatientModel, StaticSolver]:
+        """The patient under a plan, and a solver of what it holds and frees."""
         patient = self.patient.with_plan(self.whole(plan))
-        scene, reference = patient.scene, self.patient.scene
-        is_same = np.array_equal(scene.fixed, reference.fixed) and all(
-            np.array_equal(segment.joined, reference.segments[name].joined)
-            for name, segment in scene.segments.items()
+        lifted, scene = patient.lifted, patient.scene
+        if lifted is None:
+            return patient, self.solver
+        held, own = (
+            np.setdiff1d(lifted.nodes, lifted.free(p)) for p in (scene.plan, self.reference)
         )
-        if is_same:
-            return predict_patient(patient, self.model, solver=self.solver)
+        if np.array_equal(held, own):
+            return patient, self.solver
+        if len(self.solver.boundary.liftable):
+            return patient, self.solver.holding(held)
         # A factorisation pays for many plans only.
-        once = replace(scene, options=replace(scene.options, method="auto"))
-        patient = replace(patient, scene=once)
-        return solved_patient(patient, self.model, tensors=self.solver.tensors).prediction
+        options = replace(scene.options, method="auto")
+        patient = replace(patient, scene=replace(scene, options=options))
+        return patient, solver_of(model_scene(patient, self.model), self.solver.tensors)
 
 
 def planning_model(
@@ -200,7 +217,7 @@ def planning_model(
     )
     scene = replace(scene, options=options)
     patient = replace(patient, scene=replace(patient.scene, options=options))
-    solver = scene_solver(scene)
+    solver = _solver(scene, patient.lifted)
     plan = scene_plan(scene)
     operator = solver.plan_operator(nodes=patient.skin_nodes, plan=plan)
     motions: dict[str, NDArray[np.float64]] = {
@@ -212,6 +229,17 @@ def planning_model(
         columns, matrix=end.continued(columns.matrix), offset=end.continued(columns.offset)
     )
     return PlanningModel(patient, model, solver, columns, motions)
+
+
+def _solver(scene: Scene, lifted: LiftedTissue | None) -> StaticSolver:
+    """The solver of a scene, and where it can of those of all plans, whatever they lift."""
+    tensors = scene_tensors(scene)
+    options = scene.options
+    if lifted is not None and options.method == "cholesky" and options.element != "p2":
+        # Too many nodes, or too little memory: plans that lift others are then solved on their own.
+        with contextlib.suppress(SolverError):
+            return solver_of(scene, tensors, (lifted.nodes, lifted.segment))
+    return solver_of(scene, tensors)
 
 
 def _check_scene(scene: Scene) -> None:

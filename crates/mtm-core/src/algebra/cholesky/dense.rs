@@ -1,26 +1,112 @@
 //! Sliding contact by the dense end of the factor: the flexibility of the sliding nodes and its normal part.
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 
+use super::lifting::{Liftable, Lifted, LowRank};
 use super::symmetric::{DenseFactor, DenseSymmetric, Rough};
 use crate::algebra::simd::{Kernel, widest};
+use crate::error::{MtmError, Result};
 
 /// The flexibility of the tail nodes: the whole interaction of the sliding nodes.
 pub struct TailFlexibility {
-    /// S⁻¹, mm/N.
-    flexibility: DenseSymmetric,
+    /// S⁻¹ of the sliding nodes, while all nodes that may be lifted are held, mm/N.
+    flexibility: Arc<DenseSymmetric>,
     /// The same in single precision, for intermediate displacements.
-    rough: Rough,
-    /// Row of the system of each tail node.
-    rows: Vec<u32>,
+    rough: Arc<Rough>,
+    /// Row of the system of each tail node: sliding nodes, then those that may be lifted.
+    rows: Arc<[u32]>,
+    /// The latter, if there are any.
+    lifted: Option<Lifted>,
 }
 
 impl TailFlexibility {
-    /// The flexibility of the tail from `lower`, its part of the factor; `rows` is the row of the system of
-    /// each tail node.
-    pub(super) fn new(lower: DenseFactor, rows: Vec<u32>) -> Self {
-        let flexibility = lower.inverse();
-        Self { rough: Rough::of(&flexibility), flexibility, rows }
+    /// The flexibility of the tail from `lower`, the part of the factor of its sliding nodes; `rows` is the row of the
+    /// system of each tail node. `across` and `own`: the part of the nodes that may be lifted, row by row, in the columns
+    /// of the sliding nodes and in their own; of these nodes, those at the places `held`, ascending, are held.
+    ///
+    /// # Errors
+    /// `NotPositiveDefinite` if the body does not hold the others.
+    pub(super) fn new(
+        lower: DenseFactor,
+        rows: Vec<u32>,
+        (across, own): (Vec<f64>, Vec<f64>),
+        held: &[usize],
+    ) -> Result<Self> {
+        let liftable = (!own.is_empty()).then(|| Arc::new(Liftable::new(&lower, across, &own)));
+        let flexibility = Arc::new(lower.inverse());
+        let rough = Arc::new(Rough::of(&flexibility));
+        Self { flexibility, rough, rows: rows.into(), lifted: None }.with(liftable, held)
+    }
+
+    /// The same with other nodes `held`, by their places among those that may be lifted.
+    pub fn holding(&self, held: &[usize]) -> Result<Self> {
+        let (flexibility, rough) = (self.flexibility.clone(), self.rough.clone());
+        let liftable = self.lifted.as_ref().map(|lifted| lifted.all.clone());
+        Self { flexibility, rough, rows: self.rows.clone(), lifted: None }.with(liftable, held)
+    }
+
+    fn with(mut self, liftable: Option<Arc<Liftable>>, held: &[usize]) -> Result<Self> {
+        let loose = |place| MtmError::NotPositiveDefinite {
+            node: self.row(self.n_sliding() + place),
+            detail: "tissue that is lifted off the bone is not held by the tissue around it".into(),
+        };
+        self.lifted = liftable.map(|all| Lifted::new(all, held).map_err(loose)).transpose()?;
+        Ok(self)
+    }
+
+    /// Number of sliding nodes.
+    pub fn n_sliding(&self) -> usize {
+        self.flexibility.size() / 3
+    }
+
+    /// Row of the system of each tail node.
+    pub fn rows(&self) -> &[u32] {
+        &self.rows
+    }
+
+    /// Whether any node may be lifted.
+    pub fn lifts(&self) -> bool {
+        self.lifted.is_some()
+    }
+
+    /// Displacements of all tail nodes under `forces` on them.
+    pub fn settled(&self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let (sliding, own) = forces.split_at(self.n_sliding());
+        let mut moved = self.flexibility.multiply(sliding.as_flattened());
+        if let Some(lifted) = &self.lifted {
+            let (own, sliding) = (own.as_flattened(), sliding.as_flattened());
+            let mut more = lifted.settled(own, sliding, &mut moved);
+            moved.append(&mut more);
+        }
+        vectors(&moved)
+    }
+
+    /// Forces on the tail nodes that bring them from `moved`, their displacements without contact and with all liftable
+    /// nodes free, to those under `contact`, the forces on sliding nodes at given displacements.
+    pub fn pushes(
+        &self,
+        moved: &[[f64; 3]],
+        contact: impl Fn(&[[f64; 3]]) -> Result<Vec<[f64; 3]>>,
+    ) -> Result<Vec<[f64; 3]>> {
+        let Some(lifted) = &self.lifted else { return contact(moved) };
+        let (sliding, own) = moved.split_at(self.n_sliding());
+        let flat = |free: &[f64]| Ok(contact(&vectors(free))?.into_flattened());
+        Ok(vectors(&lifted.pushes((sliding.as_flattened(), own.as_flattened()), flat)?))
+    }
+
+    /// What lifted nodes add to the flexibility between `directions`: node and unit vector each.
+    pub fn more_along(&self, directions: &[(usize, [f64; 3])]) -> Option<LowRank> {
+        self.lifted.as_ref().map(|lifted| lifted.more.along(directions))
+    }
+
+    /// The displacements `moved` with what lifted nodes add under `forces`.
+    fn with_lifted(&self, mut moved: Vec<f64>, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        if let Some(lifted) = &self.lifted {
+            lifted.more.add_product(forces.as_flattened(), &mut moved);
+        }
+        vectors(&moved)
     }
 
     /// Row of the system of tail node `i`.
@@ -30,10 +116,11 @@ impl TailFlexibility {
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
-        self.flexibility.bytes() + self.rough.bytes()
+        let lifted = self.lifted.as_ref().map_or(0, Lifted::bytes);
+        self.flexibility.bytes() + self.rough.bytes() + lifted
     }
 
-    /// Flexibility of tail node `i` on its own along the unit vector `axis`, mm/N.
+    /// Flexibility of tail node `i` on its own along the unit vector `axis`, mm/N, while all liftable nodes are held.
     pub fn own(&self, i: usize, axis: [f64; 3]) -> f64 {
         let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.column(3 * i + b));
         let [x, y, z] = axis;
@@ -45,12 +132,12 @@ impl TailFlexibility {
 
     /// Displacements of the tail nodes under forces on them alone, S⁻¹ f.
     pub fn respond(&self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        vectors(&self.flexibility.multiply(forces.as_flattened()))
+        self.with_lifted(self.flexibility.multiply(forces.as_flattened()), forces)
     }
 
     /// The same to six digits of the largest, in half the time.
     pub fn respond_roughly(&self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        vectors(&self.rough.multiply(forces.as_flattened()))
+        self.with_lifted(self.rough.multiply(forces.as_flattened()), forces)
     }
 
     /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r constrains tail node i = `nodes[r]` along
@@ -62,6 +149,8 @@ impl TailFlexibility {
         normals: &[[f64; 3]],
         softness: &[f64],
     ) -> DenseSymmetric {
+        let directions: Vec<_> = nodes.iter().copied().zip(normals.iter().copied()).collect();
+        let more = self.more_along(&directions);
         DenseSymmetric::from_columns(nodes.len(), |c, column| {
             let (j, n_j) = (nodes[c], normals[c]);
             // S⁻¹ n_j for node j and those after it. The columns begin on the diagonal, and the part of the
@@ -87,6 +176,11 @@ impl TailFlexibility {
                     (0..3).map(|a| entry(a, 0) + entry(a, 1) + entry(a, 2)).sum()
                 };
             }
+            if let Some(more) = &more {
+                for (r, out) in (c..).zip(column.iter_mut()) {
+                    *out += more.entry(r, c);
+                }
+            }
             column[0] += softness[c];
         })
     }
@@ -94,7 +188,7 @@ impl TailFlexibility {
 
 impl TailFlexibility {
     /// The flexibility between `directions` (tail node and unit vector, nodes ascending) in single precision,
-    /// with `softness` (mm/N) added to its diagonal; `memory`: of an earlier one.
+    /// with `softness` (mm/N) added to its diagonal, while all liftable nodes are held; `memory`: of an earlier one.
     pub fn rough_flexibility(
         &self,
         directions: &[(usize, [f64; 3])],
@@ -180,8 +274,8 @@ mod tests {
                 *v = size(r) * size(c) * if r == c { n as f64 } else { wave(r, c) };
             }
         });
-        let rows = (0..n as u32 / 3).collect();
-        let tail = TailFlexibility { rough: Rough::of(&matrix), flexibility: matrix, rows };
+        let (rough, rows) = (Arc::new(Rough::of(&matrix)), (0..n as u32 / 3).collect());
+        let tail = TailFlexibility { rough, flexibility: Arc::new(matrix), rows, lifted: None };
         let unit = |a: f64, b: f64| [a.sin() * b.cos(), a.sin() * b.sin(), a.cos()];
         let directions: Vec<(usize, [f64; 3])> = [0, 0, 1, 2, 2, 2, 4, 6, 6]
             .iter()

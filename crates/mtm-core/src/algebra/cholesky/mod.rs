@@ -4,6 +4,7 @@
 mod dense;
 #[cfg(test)]
 mod grid;
+mod lifting;
 mod normal;
 mod numeric;
 mod structure;
@@ -18,6 +19,7 @@ use faer::sparse::linalg::cholesky::supernodal;
 use faer::{Conj, MatMut};
 
 pub use dense::TailFlexibility;
+pub use lifting::LowRank;
 pub use normal::{
     FactorPreconditioner, NormalFactor, ProductAccuracy, Progress, ROUGH, RowForces, RowKey,
     conjugate_gradients, hopeless,
@@ -269,10 +271,21 @@ impl Factor {
         self.symbolic.unpermuted(&x)
     }
 
-    /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, order 3·n_tail, mm/N.
-    pub fn tail_flexibility(&self) -> TailFlexibility {
-        let (size, first) = (3 * self.symbolic.n_tail, self.symbolic.first_of_tail());
+    /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, mm/N, of which the last `liftable`
+    /// are free except for those `held`, by their places among them.
+    ///
+    /// # Errors
+    /// `NotPositiveDefinite` if the rows that may be lifted are not held by the body.
+    pub fn tail_flexibility(&self, liftable: usize, held: &[usize]) -> Result<TailFlexibility> {
+        let first = self.symbolic.first_of_tail();
+        let (size, more) = (3 * (self.symbolic.n_tail - liftable), 3 * liftable);
         let mut lower = vec![0.0; size * size];
+        let (mut across, mut own) = (vec![0.0; more * size], vec![0.0; more * more]);
+        let mut put = |row: usize, column: usize, value: f64| match row.checked_sub(size) {
+            None => lower[column * size + row] = value,
+            Some(row) if column < size => across[row * size + column] = value,
+            Some(row) => own[row * more + column - size] = value,
+        };
         let l = supernodal::SupernodalLltRef::new(&self.symbolic.structure, &self.values);
         for s in 0..self.symbolic.structure.n_supernodes() {
             let node = l.supernode(s);
@@ -281,14 +294,14 @@ impl Factor {
             for c in (0..width).filter(|c| start + c >= first) {
                 let column = start + c - first;
                 for r in c..width {
-                    lower[column * size + start + r - first] = val[(r, c)];
+                    put(start + r - first, column, val[(r, c)]);
                 }
                 for (r, &row) in pattern.iter().enumerate() {
-                    lower[column * size + row - first] = val[(width + r, c)];
+                    put(row - first, column, val[(width + r, c)]);
                 }
             }
         }
         let rows = self.symbolic.order[self.symbolic.order.len() - self.symbolic.n_tail..].to_vec();
-        TailFlexibility::new(DenseFactor::from_lower(size, lower), rows)
+        TailFlexibility::new(DenseFactor::from_lower(size, lower), rows, (across, own), held)
     }
 }

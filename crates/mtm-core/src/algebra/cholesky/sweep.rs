@@ -372,7 +372,7 @@ mod tests {
         let b: Vec<[f64; 3]> =
             (0..n * n).map(|j| [(j as f64).cos(), 1.0, (2.0 * j as f64).sin()]).collect();
         let (forces, swept) = factor.on_tail(&b);
-        let there = factor.tail_flexibility().respond(&forces);
+        let there = factor.tail_flexibility(0, &[]).unwrap().respond(&forces);
         let found = factor.above_tail(swept, &there);
         let whole = factor.solve(&b);
         let largest = whole.as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));

@@ -316,6 +316,11 @@ impl DenseFactor {
         DenseSymmetric::from_square(size, values)
     }
 
+    /// L; entries above the diagonal are not to be read.
+    pub(super) fn lower(&self) -> MatRef<'_, f64> {
+        MatRef::from_column_major_slice(&self.values, self.size, self.size)
+    }
+
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         8 * self.values.len()

@@ -6,14 +6,14 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::algebra::blocks::BlockMatrix;
-use crate::algebra::cholesky::{Factor, Symbolic};
+use crate::algebra::cholesky::{Factor, Symbolic, TailFlexibility};
 use crate::algebra::constraints::{Constraint, projected};
 use crate::algebra::krylov::StepAccuracy;
 use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
 use crate::contact::links::Link;
 use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
-use crate::error::{MtmError, Result};
+use crate::error::{ErrorKind, MtmError, Result};
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::{Extremes, Iterative, KeptForNext, SolveMemory, hierarchy};
 use crate::statics::linear::pressed::with_links;
@@ -41,7 +41,7 @@ type Rows = Vec<[f64; 3]>;
 /// What is kept from one plan to the next.
 enum Kept {
     /// The factorisation, and the data for solving contact at the sliding nodes, if there are any.
-    Factor { factor: Factor, contact: ContactFactor },
+    Factor { factor: Arc<Factor>, contact: ContactFactor },
     /// The matrix, in which sliding nodes are constrained.
     Matrix(Unfactored),
 }
@@ -57,6 +57,8 @@ pub(crate) struct BodyRows<'a> {
     pub positions: &'a [[f64; 3]],
     pub sliding: Option<&'a Sliding>,
     pub held: Support,
+    /// Rows that plans hold or free, and the places among them of those that are held.
+    pub liftable: (&'a [u32], &'a [usize]),
     /// Contrast and compressibility of the tissue.
     pub tissue: Extremes,
     /// The hierarchy of a similar matrix under the same conditions, if there is one.
@@ -123,24 +125,30 @@ impl System {
             let slide_rows: Vec<u32> =
                 body.sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
             // If a part is constrained by sliding nodes alone, there is no flexibility without them.
-            let kept = body.held == Support::ByPrescribed && slide_rows.len() <= MAX_KEPT_SLIDING;
-            let symbolic = Arc::new(Symbolic::new(&matrix, if kept { &slide_rows } else { &[] })?);
+            let (liftable, held) = body.liftable;
+            let (n_sliding, tail) = (slide_rows.len(), [&slide_rows[..], liftable].concat());
+            let kept = body.held == Support::ByPrescribed && tail.len() <= MAX_KEPT_SLIDING;
+            if !kept && !liftable.is_empty() {
+                return Err(not_liftable("sliding and liftable nodes", tail.len().to_string()));
+            }
+            let symbolic = Arc::new(Symbolic::new(&matrix, if kept { &tail } else { &[] })?);
             clock.lap("ordering", true);
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let contact_bytes = if kept { ContactFactor::bytes_for(slide_rows.len()) } else { 0 };
+            let contact_bytes =
+                if kept { ContactFactor::bytes_for(n_sliding, liftable.len()) } else { 0 };
             let needed = symbolic.factor_bytes() + contact_bytes;
             let fits = options.memory_limit.is_none_or(|limit| needed <= limit);
-            if fits && !slide_rows.is_empty() && !kept {
+            if fits && n_sliding > 0 && !kept {
                 let refactored = Unfactored::Refactored { symbolic, matrix };
                 return Ok((with(Kept::Matrix(refactored)), method));
             }
             if fits {
-                let factor = symbolic.factor(&matrix)?;
+                let factor = Arc::new(symbolic.factor(&matrix)?);
                 clock.lap("factor", true);
                 let normals = body.sliding.map_or(&[][..], Sliding::rest_normals);
-                let contact = ContactFactor::new(&factor, normals)?;
+                let contact = ContactFactor::new(&factor, normals, (liftable.len(), held))?;
                 clock.lap("contact_factor", body.sliding.is_some());
                 return Ok((with(Kept::Factor { factor, contact }), method));
             }
@@ -154,6 +162,9 @@ impl System {
             }
             method = Method::Pcg;
         }
+        if !body.liftable.0.is_empty() {
+            return Err(not_liftable("method", method.name().into()));
+        }
         let multigrid = match &body.multigrid {
             Some(kept) => kept.clone(),
             None => Arc::new(multigrid(&matrix, body)?),
@@ -161,6 +172,18 @@ impl System {
         let iterative = Iterative::new(matrix, multigrid, body.tissue, method, options);
         clock.lap("preconditioner", true);
         Ok((with(Kept::Matrix(Unfactored::Iterative(Box::new(iterative)))), method))
+    }
+
+    /// The same system with other rows `held`, by their places among those that may be lifted.
+    ///
+    /// # Errors
+    /// Any method without a factor.
+    pub fn holding(&self, held: &[usize]) -> Result<Self> {
+        let Kept::Factor { factor, contact } = &self.kept else {
+            return Err(not_liftable("method", "one without a factorisation".into()));
+        };
+        let kept = Kept::Factor { factor: factor.clone(), contact: contact.holding(held)? };
+        Ok(Self { kept })
     }
 
     /// The hierarchy, if the system is solved by iteration.
@@ -183,8 +206,11 @@ impl System {
     /// A⁻¹ b without contact.
     pub fn solve(&self, b: &[[f64; 3]], solve: &mut PlanSolve<'_>) -> Result<Vec<[f64; 3]>> {
         match &self.kept {
-            Kept::Factor { factor, .. } => {
-                let x = in_pool(|| factor.solve(b));
+            Kept::Factor { factor, contact } => {
+                let x = in_pool(|| match contact.flexibility().lifts() {
+                    true => contact.answers(factor, b).of_all(&[]),
+                    false => factor.solve(b),
+                });
                 solve.effort.error_estimate = direct_error(factor, &x);
                 Ok(x)
             }
@@ -262,7 +288,10 @@ impl System {
         (scales, share): (&[f64], Option<f64>),
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
-        if let Kept::Factor { factor, .. } = &self.kept {
+        if let Kept::Factor { factor, contact } = &self.kept {
+            if contact.flexibility().lifts() {
+                return all_together(factor, contact.flexibility(), columns, |_, _| Ok(Vec::new()));
+            }
             factor.solve_many(&mut columns);
             return Ok(columns);
         }
@@ -310,9 +339,9 @@ impl System {
         match &self.kept {
             Kept::Factor { factor, contact } => {
                 let kept = FrozenContact::new(contact.flexibility(), frozen.rows, frozen.springs)?;
-                let forces = |k, free: &Rows| conditions(k, &mut |c| Ok(kept.forces(free, c)));
+                let forces = |k, free: &[_]| conditions(k, &mut |c| Ok(kept.forces(free, c)));
                 check()?;
-                all_together(factor, sliding, columns, forces)
+                all_together(factor, contact.flexibility(), columns, forces)
             }
             Kept::Matrix(system) => {
                 // All columns have the same constraints, so one trial serves them.
@@ -333,21 +362,33 @@ impl System {
     }
 }
 
+/// The error for liftable nodes where no factor can hold or free them.
+pub(crate) fn not_liftable(what: &'static str, found: String) -> MtmError {
+    MtmError::NotTogether {
+        what,
+        found,
+        with: "liftable nodes",
+        needed: "method \"cholesky\", linear kinematics, corner nodes alone, at most 6000 sliding and liftable \
+                 nodes, and a body that others hold",
+        kind: ErrorKind::Solver,
+    }
+}
+
 /// Displacements for all `columns`, first free and then under the contact `forces` that follow: two solves that
 /// read the factor once for all of them.
 fn all_together(
     factor: &Factor,
-    sliding: &Sliding,
+    tail: &TailFlexibility,
     mut columns: Vec<Rows>,
-    forces: impl Fn(usize, &Rows) -> Result<Rows> + Sync,
+    forces: impl Fn(usize, &[[f64; 3]]) -> Result<Rows> + Sync,
 ) -> Result<Vec<Rows>> {
     factor.solve_many(&mut columns);
-    let rows: Vec<usize> = sliding.nodes().iter().map(|n| n.row as usize).collect();
     let push = |(k, column): (usize, &Rows)| {
-        let free = rows.iter().map(|&row| column[row]).collect();
+        let moved: Rows = tail.rows().iter().map(|&row| column[row as usize]).collect();
         let mut push = vec![[0.0; 3]; column.len()];
-        for (&row, force) in rows.iter().zip(forces(k, &free)?) {
-            push[row] = force;
+        let pushes = tail.pushes(&moved, |free| forces(k, free))?;
+        for (&row, force) in tail.rows().iter().zip(pushes) {
+            push[row as usize] = force;
         }
         Ok(push)
     };

@@ -169,6 +169,7 @@ impl Equilibrium {
                 positions: &positions,
                 sliding: Some(slide.sliding),
                 held: slide.held,
+                liftable: (&[], &[]),
                 tissue: self.tissue,
                 multigrid,
             };

@@ -182,12 +182,14 @@ impl StaticSolver {
             let row = self.reduction.row_of[j as usize];
             for (s, &centre) in centres.iter().enumerate() {
                 for column in 0..COLUMNS {
-                    let u = if row != NO_ROW {
-                        solved[COLUMNS * s + column][row as usize]
-                    } else if kinds[j as usize] == NodeKind::Joined(s) {
-                        Rate::unit(column, centre).at(places[j as usize])
-                    } else {
-                        [0.0; 3]
+                    let u = match kinds[j as usize] {
+                        NodeKind::Free | NodeKind::Sliding(_) => {
+                            solved[COLUMNS * s + column][row as usize]
+                        }
+                        NodeKind::Joined(own) if own == s => {
+                            Rate::unit(column, centre).at(places[j as usize])
+                        }
+                        NodeKind::Joined(_) | NodeKind::Fixed => [0.0; 3],
                     };
                     for i in 0..3 {
                         rows[(3 * at + i) * width + s][column] = u[i];

@@ -86,7 +86,7 @@ impl StaticSolver {
         let frozen = self.sliding.is_some().then_some(frozen);
         let solved = self.solve_columns(fields, (&scales, Some(accuracy)), frozen, interrupted)?;
         let filled = posed.iter().zip(&solved);
-        Ok(filled.map(|(p, rows)| self.reduction.filled(&p.prescribed, rows)).collect())
+        Ok(filled.map(|(p, rows)| self.filled(&p.prescribed, rows)).collect())
     }
 
     /// `change` as prescribed displacements, forces on the rows and change of the contact conditions.

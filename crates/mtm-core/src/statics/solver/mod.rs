@@ -16,7 +16,7 @@ use crate::mechanics::tensors::MassTensors;
 use crate::statics::linear::confirmed::is_doubtful;
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::Extremes;
-use crate::statics::linear::system::{BodyRows, Frozen, SolvedRows, System};
+use crate::statics::linear::system::{BodyRows, Frozen, SolvedRows, System, not_liftable};
 use crate::statics::newton::{Equilibrium, SlidingBody};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart, method_for_touching};
@@ -40,13 +40,15 @@ pub struct StaticSolver {
     /// Whether solutions by factorisation are corrected once.
     refines: bool,
     pub(crate) reduction: Arc<Reduction>,
-    pub(crate) sliding: Option<Sliding>,
+    pub(crate) sliding: Option<Arc<Sliding>>,
+    /// Nodes among the unknowns that the boundary holds: the same factor serves plans that free them.
+    on_bone: Vec<u32>,
     /// What may touch what.
     pairs: Option<Pairs>,
     mechanics: Mechanics,
     held: Support,
     /// Coupling of unknown rows with joined nodes: (row, node, tensor).
-    couplings: Vec<(u32, u32, Block)>,
+    couplings: Arc<[(u32, u32, Block)]>,
     timings: Timings,
 }
 
@@ -90,7 +92,16 @@ impl StaticSolver {
         let places = tensors.element_nodes().positions();
         let node_kinds = with_mid_edges(&tensors, &boundary)?;
         let kinds = node_kinds.kinds(places.len())?;
-        let reduction = Arc::new(Reduction::new(&kinds));
+        let (liftable, held_places) = node_kinds.liftable();
+        if places.len() > mesh.n_nodes() && !liftable.is_empty() {
+            return Err(not_liftable("element", tensors.element_nodes().element().name().into()));
+        }
+        let with_liftable = |kind: NodeKind| {
+            let mut kinds = kinds.clone();
+            liftable.iter().for_each(|&j| kinds[j as usize] = kind);
+            kinds
+        };
+        let reduction = Arc::new(Reduction::new(&with_liftable(NodeKind::Free)));
         let is_unknown = |j: usize| reduction.row_of[j] != NO_ROW;
         let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
         let (rows, mode) = (&reduction.row_of, options.contact.mode);
@@ -101,7 +112,8 @@ impl StaticSolver {
         let held = restraint::check(&mesh, |j| !is_unknown(j), &normals)?;
         clock.lap("restraint", true);
 
-        let couplings = couplings(tensors.matrix(), &reduction.unknowns, &kinds);
+        let outer = with_liftable(node_kinds.liftable_kind());
+        let couplings = couplings(tensors.matrix(), &reduction.unknowns, &outer).into();
         let matrix = reduction.matrix(tensors.matrix());
         clock.lap("reduce", true);
         if interrupted() {
@@ -110,9 +122,13 @@ impl StaticSolver {
         let tissue = Extremes::of(tensors.tissue());
         let made = if options.kinematics == Kinematics::Linear {
             let (positions, sliding) = (&reduction.rows(places), sliding.as_ref());
-            let body = BodyRows { positions, sliding, held, tissue, multigrid: None };
+            let rows: Vec<u32> = liftable.iter().map(|&j| reduction.row_of[j as usize]).collect();
+            let liftable = (&rows[..], &held_places[..]);
+            let body = BodyRows { positions, sliding, held, liftable, tissue, multigrid: None };
             System::new(matrix, &body, &options, &mut clock, interrupted)
                 .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method))
+        } else if !liftable.is_empty() {
+            Err(not_liftable("kinematics", options.kinematics.name().into()))
         } else {
             Equilibrium::new(tensors.clone(), reduction.clone(), &matrix, &options, &mut clock)
                 .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
@@ -121,6 +137,8 @@ impl StaticSolver {
         let refines = method.has_factor()
             && options.kinematics == Kinematics::Linear
             && is_doubtful(tissue.contrast);
+        let on_bone = held_places.iter().map(|&place| liftable[place]).collect();
+        let sliding = sliding.map(Arc::new);
         Ok(Self {
             tensors,
             boundary,
@@ -130,11 +148,46 @@ impl StaticSolver {
             refines,
             reduction,
             sliding,
+            on_bone,
             pairs,
             mechanics,
             held,
             couplings,
             timings: clock.laps,
+        })
+    }
+
+    /// The solver of the same body under a boundary that holds `nodes` of the liftable ones and frees all others,
+    /// with the same factor: its solutions are those of a solver of that boundary.
+    ///
+    /// # Errors
+    /// A node that is not liftable.
+    pub fn holding(&self, nodes: &[u32]) -> Result<Self> {
+        let boundary = Arc::new(self.boundary.holding(nodes)?);
+        let (liftable, held) = boundary.liftable();
+        let on_bone = held.iter().map(|&place| liftable[place]).collect();
+        let system = match &self.mechanics {
+            Mechanics::Linear(system) => system.holding(&held),
+            Mechanics::LargeRotation(_) => {
+                Err(not_liftable("kinematics", self.options.kinematics.name().into()))
+            }
+        };
+        let system = system.map_err(|e| by_node(e, &self.reduction.unknowns))?;
+        Ok(Self {
+            tensors: self.tensors.clone(),
+            node_kinds: boundary.clone(),
+            boundary,
+            options: self.options,
+            method: self.method,
+            refines: self.refines,
+            reduction: self.reduction.clone(),
+            sliding: self.sliding.clone(),
+            on_bone,
+            pairs: None,
+            mechanics: Mechanics::Linear(Box::new(system)),
+            held: self.held,
+            couplings: self.couplings.clone(),
+            timings: self.timings.clone(),
         })
     }
 
@@ -160,7 +213,7 @@ impl StaticSolver {
 
     /// Number of unknowns, three per free or sliding node.
     pub fn n_unknowns(&self) -> usize {
-        3 * self.reduction.unknowns.len()
+        3 * (self.reduction.unknowns.len() - self.on_bone.len())
     }
 
     /// Bytes of the factor or preconditioner that is kept.
@@ -217,6 +270,7 @@ impl StaticSolver {
         let mut u = self.prescribed(&motions)?;
         let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
         let mut b = self.coupled(&u);
+        self.held_rows().for_each(|row| b[row] = [0.0; 3]);
         if let Some(rows) = loads {
             for (b, &j) in b.iter_mut().zip(&self.reduction.unknowns) {
                 *b = [0, 1, 2].map(|i| b[i] + rows[j as usize][i]);
@@ -229,7 +283,7 @@ impl StaticSolver {
         let (SolvedRows { rows, contact, contact_seconds }, touch) =
             self.solve_rows(&posed, &mut solve)?;
         clock.lap("solve", true);
-        u = self.reduction.filled(&u, &rows);
+        u = self.filled(&u, &rows);
         let mut forces = self.forces(&u)?;
         if self.refines && contact.is_none() {
             self.refine(&mut u, &forces, loads, &mut solve)?;
@@ -259,6 +313,20 @@ impl StaticSolver {
             contact_iterations,
             timings,
         })
+    }
+
+    /// Values of every node: those of the `prescribed` ones, and `rows` at the unknown ones.
+    pub(crate) fn filled(&self, prescribed: &[[f64; 3]], rows: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        let mut out = self.reduction.filled(prescribed, rows);
+        for &j in &self.on_bone {
+            out[j as usize] = prescribed[j as usize];
+        }
+        out
+    }
+
+    /// Rows of the system that the boundary holds.
+    fn held_rows(&self) -> impl Iterator<Item = usize> {
+        self.on_bone.iter().map(|&j| self.reduction.row_of[j as usize] as usize)
     }
 
     /// Times of the stages of a plan after those of setting up, s.
@@ -321,7 +389,7 @@ impl StaticSolver {
     /// Forces −K_UB u_B exerted by the prescribed nodes on the unknown rows, N.
     pub(crate) fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let mut b = vec![[0.0; 3]; self.reduction.unknowns.len()];
-        for (row, node, k) in &self.couplings {
+        for (row, node, k) in self.couplings.iter() {
             let v = u[*node as usize];
             let out = &mut b[*row as usize];
             for i in 0..3 {
@@ -364,8 +432,9 @@ impl StaticSolver {
                 reduction: &self.reduction,
                 rows: BodyRows {
                     positions: &self.reduction.rows(self.tensors.element_nodes().positions()),
-                    sliding: self.sliding.as_ref(),
+                    sliding: self.sliding.as_deref(),
                     held: self.held,
+                    liftable: (&[], &[]),
                     tissue: Extremes::of(self.tensors.tissue()),
                     multigrid: None,
                 },
@@ -432,7 +501,7 @@ impl StaticSolver {
             return Err(self.not_linear("a solve for columns"));
         };
         system
-            .solve_columns(columns, accuracy, self.sliding.as_ref().zip(frozen), interrupted)
+            .solve_columns(columns, accuracy, self.sliding.as_deref().zip(frozen), interrupted)
             .map_err(|e| by_node(e, &self.reduction.unknowns))
     }
 }

@@ -27,6 +27,7 @@ impl StaticSolver {
                 loads.map_or(f, |rows| sub(f, rows[j as usize]))
             })
             .collect();
+        self.held_rows().for_each(|row| rest[row] = [0.0; 3]);
         let mut scale: f64 = b.iter().map(|v| dot(*v, *v)).sum();
         for (rest, push) in rest.iter_mut().zip(touching) {
             *rest = sub(*rest, *push);

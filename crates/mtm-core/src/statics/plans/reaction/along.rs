@@ -1,6 +1,6 @@
 //! How contact rows and the axes of unstable springs respond to forces along themselves.
 
-use crate::algebra::cholesky::{Rough, TailFlexibility};
+use crate::algebra::cholesky::{LowRank, Rough, TailFlexibility};
 use crate::contact::Spring;
 use crate::statics::plans::reaction::rows::ConditionRows;
 
@@ -11,6 +11,8 @@ use crate::statics::plans::reaction::rows::ConditionRows;
 pub(super) struct Along {
     /// With the directions in the order of their nodes.
     matrix: Rough,
+    /// What lifted nodes add to it.
+    more: Option<LowRank>,
     /// The direction at each of its rows.
     order: Vec<usize>,
 }
@@ -29,14 +31,18 @@ impl Along {
         let sorted: Vec<(usize, [f64; 3])> = order.iter().map(|&i| directions[i]).collect();
         let soft = |i: usize| rows.softness.get(i).copied().unwrap_or(0.0);
         let softness: Vec<f64> = order.iter().map(|&i| soft(i)).collect();
-        Self { matrix: tail.rough_flexibility(&sorted, &softness, memory), order }
+        let more = tail.more_along(&sorted);
+        Self { matrix: tail.rough_flexibility(&sorted, &softness, memory), more, order }
     }
 
     /// Displacement along each direction, mm, under `forces` along the first of them, N: rows, or rows and axes.
     pub fn multiply(&self, forces: &[f64]) -> Vec<f64> {
         let sorted: Vec<f64> =
             self.order.iter().map(|&i| forces.get(i).copied().unwrap_or(0.0)).collect();
-        let moved = self.matrix.multiply(&sorted);
+        let mut moved = self.matrix.multiply(&sorted);
+        if let Some(more) = &self.more {
+            more.add_product(&sorted, &mut moved);
+        }
         let mut out = vec![0.0; moved.len()];
         for (&i, v) in self.order.iter().zip(moved) {
             out[i] = v;

@@ -54,9 +54,14 @@ pub(crate) struct ContactFactor {
 }
 
 impl ContactFactor {
-    /// The flexibility of the sliding nodes, which are last in the elimination order; `normals`: of each, at rest.
-    pub fn new(factor: &Factor, normals: &[[f64; 3]]) -> Result<Self> {
-        let flexibility = factor.tail_flexibility();
+    /// The flexibility of the sliding nodes, which are last in the elimination order, with those that may be lifted
+    /// after them: `liftable` of them, `held` by their places. `normals`: of each sliding node, at rest.
+    pub fn new(
+        factor: &Factor,
+        normals: &[[f64; 3]],
+        (liftable, held): (usize, &[usize]),
+    ) -> Result<Self> {
+        let flexibility = factor.tail_flexibility(liftable, held)?;
         let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
         let rows: Vec<ContactRow> = normals.iter().enumerate().map(row).collect();
         let offsets = vec![0.0; rows.len()];
@@ -73,11 +78,17 @@ impl ContactFactor {
         Ok(Self { flexibility, rest })
     }
 
+    /// The same with other nodes `held`; the preconditioner stays, which costs a few iterations.
+    pub fn holding(&self, held: &[usize]) -> Result<Self> {
+        Ok(Self { flexibility: self.flexibility.holding(held)?, rest: self.rest.clone() })
+    }
+
     /// Bytes held for `nodes` sliding nodes: their flexibility in double and in single precision, and the inverse of
-    /// its part along the normals in single precision.
-    pub fn bytes_for(nodes: usize) -> usize {
+    /// its part along the normals in single precision; with `liftable` nodes, what these carry and add.
+    pub fn bytes_for(nodes: usize, liftable: usize) -> usize {
         let triangle = |size: usize| size * (size + 1) / 2;
-        12 * triangle(3 * nodes) + 4 * triangle(nodes)
+        let lifted = 8 * 9 * liftable * 2 * (nodes + liftable);
+        12 * triangle(3 * nodes) + 4 * triangle(nodes) + lifted
     }
 
     /// Bytes held.
@@ -88,12 +99,14 @@ impl ContactFactor {
     /// The responses to the constraints of one plan, with forces `b`.
     pub fn answers<'a>(&'a self, factor: &'a Factor, b: &[[f64; 3]]) -> Answers<'a> {
         let (forces, swept) = factor.on_tail(b);
-        let free = self.flexibility.respond(&forces);
+        let mut free = self.flexibility.settled(&forces);
+        free.truncate(self.flexibility.n_sliding());
         let (moved, pushed) = (vec![[0.0; 3]; free.len()], vec![[0.0; 3]; free.len()]);
         Answers {
             contact: self,
             factor,
             swept,
+            carried: forces,
             free,
             pushed,
             moved,
@@ -115,6 +128,8 @@ pub(crate) struct Answers<'a> {
     factor: &'a Factor,
     /// The forces after the forward sweep to the sliding nodes, in elimination order.
     swept: Vec<f64>,
+    /// Their part on the tail.
+    carried: Vec<[f64; 3]>,
     /// Displacements of the sliding nodes without contact forces, mm.
     free: Vec<[f64; 3]>,
     /// Forces on each node in the last response, N.
@@ -325,8 +340,11 @@ impl<'a> Answers<'a> {
 
     /// Displacements of all rows of the system with `forces` on the sliding nodes.
     pub fn of_all(self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let moved = self.contact.flexibility.respond(forces);
-        let there: Vec<_> = moved.iter().zip(&self.free).map(|(r, f)| add(*r, *f)).collect();
+        let mut carried = self.carried;
+        for (to, force) in carried.iter_mut().zip(forces) {
+            *to = add(*to, *force);
+        }
+        let there = self.contact.flexibility.settled(&carried);
         self.factor.above_tail(self.swept, &there)
     }
 }

@@ -1,0 +1,186 @@
+//! Rows at the end of the factor that each plan holds or frees, so that one factor serves all plans.
+//!
+//! The factor T Tᵀ ends with the sliding rows S and, after them, the rows L, of which a plan holds P and frees Q.
+//! G = (T_SS T_SSᵀ)⁻¹ is the flexibility of S while all of L is held, X = T_LS T_SS⁻¹ carries forces on S to L, and
+//! H = T_LL T_LLᵀ is the stiffness of L. Under forces f,
+//!
+//!   H_QQ u_Q = r_Q,   u_P = 0,   r = f_L − X f_S,   u_S = G f_S − Xᵀ u_L.
+//!
+//! The flexibility of S is thus G + Vᵀ V with V = C⁻¹ X_Q and C Cᵀ = H_QQ: freed rows only add to it, so that no
+//! digits cancel.
+
+use std::sync::Arc;
+
+use faer::linalg::matmul::matmul;
+use faer::linalg::triangular_solve::{
+    solve_lower_triangular_in_place, solve_upper_triangular_in_place,
+};
+use faer::{Accum, Mat, MatMut, MatRef, Par};
+
+use super::symmetric::{DenseFactor, DenseSymmetric, add_scaled, dot};
+use super::workspace::parallelism;
+
+/// X and H of all rows that may be held.
+pub(super) struct Liftable {
+    /// Unknowns of S and of L.
+    width: usize,
+    size: usize,
+    /// X, row by row.
+    carried: Vec<f64>,
+    /// H, column by column.
+    stiffness: Vec<f64>,
+}
+
+impl Liftable {
+    /// From the parts of the factor: T_SS; T_LS and T_LL, row by row.
+    pub fn new(end: &DenseFactor, mut carried: Vec<f64>, own: &[f64]) -> Self {
+        let (lower, width, size) = (end.lower(), end.lower().nrows(), own.len().isqrt());
+        if width > 0 {
+            let rows = MatMut::from_column_major_slice_mut(&mut carried, width, size);
+            solve_upper_triangular_in_place(lower.transpose(), rows, parallelism(width));
+        }
+        let row = |l: usize| &own[l * size..(l + 1) * size];
+        let stiffness = (0..size * size).map(|at| dot(row(at / size), row(at % size))).collect();
+        Self { width, size, carried, stiffness }
+    }
+
+    /// Row `l` of X.
+    fn row(&self, l: usize) -> &[f64] {
+        &self.carried[l * self.width..(l + 1) * self.width]
+    }
+
+    /// H v.
+    fn forces(&self, v: &[f64]) -> Vec<f64> {
+        self.stiffness.chunks_exact(self.size).map(|column| dot(column, v)).collect()
+    }
+
+    /// r ← r − X f.
+    fn take_carried(&self, f: &[f64], r: &mut [f64]) {
+        r.iter_mut().enumerate().for_each(|(l, r)| *r -= dot(self.row(l), f));
+    }
+
+    /// y ← y − Xᵀ u.
+    fn take_back(&self, u: &[f64], y: &mut [f64]) {
+        u.iter().enumerate().for_each(|(l, &u)| add_scaled(self.row(l), -u, y));
+    }
+}
+
+/// Those rows with the ones that a plan frees.
+pub(super) struct Lifted {
+    pub all: Arc<Liftable>,
+    /// Unknowns of Q, and of P, among those of L.
+    free: Vec<usize>,
+    held: Vec<usize>,
+    /// C.
+    factor: DenseFactor,
+    /// V.
+    pub more: LowRank,
+}
+
+impl Lifted {
+    /// With the rows `held`, by their places in L; on failure, the place of the first row without a positive pivot.
+    pub fn new(all: Arc<Liftable>, held: &[usize]) -> Result<Self, usize> {
+        let (held, free): (Vec<usize>, Vec<usize>) =
+            (0..all.size).partition(|l| held.binary_search(&(l / 3)).is_ok());
+        let matrix = DenseSymmetric::from_columns(free.len(), |c, column| {
+            for (to, &r) in column.iter_mut().zip(&free[c..]) {
+                *to = all.stiffness[free[c] * all.size + r];
+            }
+        });
+        let factor = matrix.factor().map_err(|at| free[at] / 3)?;
+        let rank = free.len();
+        let mut columns: Vec<f64> = (0..all.width)
+            .flat_map(|s| free.iter().map(move |&l| (l, s)))
+            .map(|(l, s)| all.row(l)[s])
+            .collect();
+        if !columns.is_empty() {
+            let rows = MatMut::from_column_major_slice_mut(&mut columns, rank, all.width);
+            solve_lower_triangular_in_place(factor.lower(), rows, parallelism(all.width));
+        }
+        Ok(Self { all, free, held, factor, more: LowRank { rank, columns } })
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> usize {
+        let Liftable { carried, stiffness, .. } = &*self.all;
+        8 * (self.more.columns.len() + carried.len() + stiffness.len()) + self.factor.bytes()
+    }
+
+    /// Displacements of L under forces `own` on it and `sliding` on S, and `moved`, those of S while L is held, with
+    /// what they add.
+    pub fn settled(&self, own: &[f64], sliding: &[f64], moved: &mut [f64]) -> Vec<f64> {
+        let mut r = own.to_vec();
+        self.all.take_carried(sliding, &mut r);
+        let found = self.hold(&r);
+        self.all.take_back(&found, moved);
+        found
+    }
+
+    /// Forces on S and L that bring the body from a state in which all of L is free, with displacements `sliding`
+    /// and `own` of S and L, to the one in which P is held; `contact`: the forces on S at its displacements there.
+    pub fn pushes<E>(
+        &self,
+        (sliding, own): (&[f64], &[f64]),
+        contact: impl Fn(&[f64]) -> Result<Vec<f64>, E>,
+    ) -> Result<Vec<f64>, E> {
+        let mut r = self.all.forces(own);
+        let (mut way, mut free) = (self.hold(&r), sliding.to_vec());
+        add_scaled(own, -1.0, &mut way);
+        self.all.take_back(&way, &mut free);
+        let mut out = contact(&free)?;
+        self.all.take_carried(&out, &mut r);
+        let reached = self.all.forces(&self.hold(&r));
+        let width = out.len();
+        out.resize(width + own.len(), 0.0);
+        for &l in &self.held {
+            out[width + l] = reached[l] - r[l];
+        }
+        Ok(out)
+    }
+
+    /// Displacements of L under forces r, those of P 0.
+    fn hold(&self, r: &[f64]) -> Vec<f64> {
+        let mut free: Vec<f64> = self.free.iter().map(|&l| r[l]).collect();
+        self.factor.solve(&mut free);
+        let mut out = vec![0.0; r.len()];
+        self.free.iter().zip(free).for_each(|(&l, v)| out[l] = v);
+        out
+    }
+}
+
+/// Vᵀ V, for the columns of V one after the other.
+pub struct LowRank {
+    rank: usize,
+    columns: Vec<f64>,
+}
+
+impl LowRank {
+    fn column(&self, c: usize) -> &[f64] {
+        &self.columns[c * self.rank..(c + 1) * self.rank]
+    }
+
+    /// y ← y + Vᵀ V x.
+    pub fn add_product(&self, x: &[f64], y: &mut [f64]) {
+        let v = MatRef::from_column_major_slice(&self.columns, self.rank, x.len());
+        let (x, rows) = (MatRef::from_column_major_slice(x, x.len(), 1), y.len());
+        let y = MatMut::from_column_major_slice_mut(y, rows, 1);
+        let mut sum = Mat::zeros(self.rank, 1);
+        matmul(sum.as_mut(), Accum::Replace, v, x, 1.0, Par::Seq);
+        matmul(y, Accum::Add, v.transpose(), sum.as_ref(), 1.0, Par::Seq);
+    }
+
+    /// The same between directions: a node of S and a unit vector each.
+    pub fn along(&self, directions: &[(usize, [f64; 3])]) -> Self {
+        let mut columns = Vec::with_capacity(self.rank * directions.len());
+        for &(node, [x, y, z]) in directions {
+            let [a, b, c] = [0, 1, 2].map(|axis| self.column(3 * node + axis));
+            columns.extend((0..self.rank).map(|r| x * a[r] + y * b[r] + z * c[r]));
+        }
+        Self { rank: self.rank, columns }
+    }
+
+    /// Entry of Vᵀ V.
+    pub fn entry(&self, r: usize, c: usize) -> f64 {
+        dot(self.column(r), self.column(c))
+    }
+}
