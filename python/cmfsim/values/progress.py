@@ -32,7 +32,7 @@ BUILDING: Mapping[str, float] = MappingProxyType({
 # The same of the planning page, for its usual options.
 PLANNING: Mapping[str, float] = MappingProxyType({
     "computing the plan operator": 20.0, "solving the case's plan": 3.0,
-    "solving nearby plans to correct the operator": 100.0, "solving a nearby plan exactly": 35.0,
+    "solving nearby plans to correct the operator": 20.0, "solving a nearby plan exactly": 8.0,
     "making the page": 4.0,
 })  # fmt: skip
 # Of a solution by one model, of comparing faces, and of writing one result.
