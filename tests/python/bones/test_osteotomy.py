@@ -9,7 +9,6 @@ import pytest
 import cmfsim
 import real_heads
 from benches.scenes.angles import angle_between
-from cmfsim import _core
 from cmfsim.bones import PROCEDURES, CutOptions
 from cmfsim.bones.cuts import procedures
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
@@ -108,25 +107,6 @@ def test_a_level_that_reaches_the_border_has_a_closed_surface():
     segment = cmfsim.BoneSegment("cranium", level, surface_of_level("cranium", level))
     # From half a voxel or less outside the first voxel's centre.
     assert volume(segment) == pytest.approx(20.5**3, rel=0.05)
-
-
-def test_surfaces_are_decimated_to_the_wanted_size_and_stay_closed():
-    image = cmfsim.ImageData(np.zeros((50, 50, 50)), (1, 1, 1))
-    x, y, z = image.axes()
-    wave = 3.0 * np.sin(x / 3) * np.sin(y / 3)
-    ball = 20 - np.sqrt((x - 25) ** 2 + (y - 25) ** 2 + (z - 25 - wave) ** 2)
-    level = image.with_values(np.clip(ball, -2, 2))
-    fine = surface_of_level("ball", level)
-    coarse = surface_of_level("ball", level, SurfaceOptions(max_triangles=1500))
-    assert len(fine.triangles) > 6000
-    assert abs(len(coarse.triangles) - 1500) < 50
-    surfaces = [cmfsim.Surface(s.vertices, s.triangles) for s in (fine, coarse)]
-    assert all(s.is_closed for s in surfaces)
-    assert surfaces[1].volume == pytest.approx(surfaces[0].volume, rel=0.01)
-    closest, _, _ = surfaces[1].closest(fine.vertices)
-    assert np.linalg.norm(closest - fine.vertices, axis=1).max() < 1.0
-    with pytest.raises(cmfsim.MeshError, match=r"triangles have vertex 9; there are 3"):
-        _core.decimated(np.zeros((3, 3)), [[0, 1, 9]], 1)
 
 
 def test_a_contact_surface_bridges_the_gaps_between_teeth(box):
