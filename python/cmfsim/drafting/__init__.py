@@ -8,6 +8,7 @@ turn what they cannot decide into questions; `draft` writes the case file.
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -17,8 +18,11 @@ from cmfsim.drafting.finds import CASE_FILE, EXTRACTED
 from cmfsim.drafting.gathering import gather
 from cmfsim.drafting.motions import TypedPlan, read_moves
 from cmfsim.drafting.written import check_written
-from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io import replacing
+from cmfsim.errors import CaseInputError, CmfsimError, LandmarkError
+from cmfsim.io import Case, replacing
+from cmfsim.pipeline.building.inputs import read_anatomy
+from cmfsim.pipeline.proposing import proposed_head
+from cmfsim.values.proposed_landmarks import ProposedSite
 
 __all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case", "read_moves"]
 
@@ -45,7 +49,8 @@ def init_case(
         Procedures, such as "le_fort_1", besides those that the plan needs.
     moves : mapping of str to mapping of str to float
         How segments move: forwards, backwards, up, down, left, right in mm; pitch (front up), yaw
-        (front to the left) and roll (left side up) in degrees, about the teeth or the chin.
+        (front to the left) and roll (left side up) in degrees, about the teeth or the chin, which
+        are found automatically if no file of landmarks is there.
     progress : callable
         Called with the name of each stage.
 
@@ -124,4 +129,28 @@ def _drafted(
             "DICOM, NRRD, NIfTI, MetaImage, STL, PLY, OBJ, VTP, VTK, .seg.nrrd, .mrml and .mrb"
         )
     progress("identifying the files")
-    return draft_case(found, unpacked, folder.resolve().name or "case", typed)
+    name = folder.resolve().name or "case"
+    sites: Mapping[str, ProposedSite] = {}
+    if typed.turns and not found.landmarks:
+        draft = draft_case(found, unpacked, name, replace(typed, moves={}))
+        if not draft.questions and not draft.files:
+            sites = _found_sites(folder, draft, progress)
+    return draft_case(found, unpacked, name, typed, sites)
+
+
+def _found_sites(
+    folder: Path, draft: CaseDraft, progress: Callable[[str], None]
+) -> Mapping[str, ProposedSite]:
+    """The landmarks of the skull as `cmfsim predict` would find them; none where it finds none."""
+    handle, beside = tempfile.mkstemp(".toml", ".cmfsim-init-", folder)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(draft.text.encode())
+        case = Case.load(beside)
+        anatomy, _ = read_anatomy(case, {}, progress)
+        progress("finding the landmarks")
+        return proposed_head(case, anatomy, progress).landmarks.skull
+    except LandmarkError:
+        return {}
+    finally:
+        Path(beside).unlink()

@@ -1,8 +1,9 @@
 """A case file drafted from what lies in a folder: what each thing was taken for, and why."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from cmfsim.drafting.written import (
 )
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats
+from cmfsim.values.proposed_landmarks import ProposedSite
 
 # Middles of the skins before and after that are farther apart are those of two scans, mm.
 APART = 20.0
@@ -88,19 +90,25 @@ class CaseDraft:
 
 
 def draft_case(
-    found: Gathered, unpacked: Path, name: str, typed: TypedPlan | None = None
+    found: Gathered,
+    unpacked: Path,
+    name: str,
+    typed: TypedPlan | None = None,
+    sites: Mapping[str, ProposedSite] = MappingProxyType({}),
 ) -> CaseDraft:
     """The case file of what was gathered.
 
     unpacked: Where the files of a bundle lie for now.
     name: Of the case.
     typed: Cuts and motions besides those that files state.
+    sites: Landmarks of the skull that were found automatically, about which typed motions turn.
     Raises `CaseError`: What is there makes no case: neither a CT, nor a skin with a bone; cuts or
         motions that do not suit it.
     """
     typed = typed or TypedPlan()
     draft = _decide(found, unpacked)
     is_turned = not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
+    draft.plan.sites = sites
     add_typed(draft.plan, typed, _bones_of(draft), is_turned=is_turned)
     taken = _taken(draft)
     text = draft.text

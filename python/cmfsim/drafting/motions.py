@@ -16,7 +16,11 @@ from cmfsim.io.slicer.transforms import is_itk_file, motion_in_lps, read_transfo
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.clinical_motion import clinical_motion, planned_motion
+from cmfsim.values.proposed_landmarks import ProposedSite
 
+# A landmark that was found automatically is the centre of a turn up to this expected error, mm:
+# a turn by 5° is then 0.4 mm off at most as a translation.
+SURE = 5.0
 # A motion below this, mm and as entries of a rotation, is none.
 NOTHING = 1e-9
 # What each word does: which number of a motion it is, and its sign.
@@ -58,6 +62,7 @@ class Plan:
     anatomy: The surfaces that move.
     landmarks: mapping of str to (3,), mm, LPS, of the skull, before the operation.
     links: The names of the transforms of the scene that are motions of segments.
+    sites: Landmarks that were found automatically, where no file has any.
     """
 
     anatomy: Anatomy
@@ -66,12 +71,16 @@ class Plan:
     taken: list[Taken] = field(default_factory=list)
     others: list[OtherFind] = field(default_factory=list)
     links: set[str] = field(default_factory=set)
+    sites: Mapping[str, ProposedSite] = field(default_factory=dict)
 
-    def words(self, segment: str, matrix: Floats) -> str:
-        """A motion in words."""
+    def words(
+        self, segment: str, matrix: Floats, landmarks: Mapping[str, Floats] | None = None
+    ) -> str:
+        """A motion in words, at landmarks of files or at others."""
         find = self.anatomy.bones.get(segment)
         vertices = None if find is None else self.anatomy.placed(find)
-        stated = clinical_motion(segment, matrix, landmarks=self.landmarks, vertices=vertices)
+        places = self.landmarks if landmarks is None else landmarks
+        stated = clinical_motion(segment, matrix, landmarks=places, vertices=vertices)
         return f"moves the {segment.replace('_', ' ')} {stated.text}"
 
 
@@ -335,6 +344,11 @@ class TypedPlan:
                 if one in numbers and other in numbers:
                     raise CaseInputError(f"move of {segment} has {one} and {other}: give one")
 
+    @property
+    def turns(self) -> bool:
+        """Whether anything is turned."""
+        return any(numbers.get(word) for numbers in self.moves.values() for word in TURNS)
+
 
 def read_moves(given: Iterable[Iterable[str]]) -> dict[str, dict[str, float]]:
     """The numbers of `--move SEGMENT WORD=NUMBER …`, by segment.
@@ -402,9 +416,13 @@ def _motion(
             shift[index] = sign * value
     find = plan.anatomy.bones.get(segment)
     vertices = None if find is None else plan.anatomy.placed(find)
-    still = clinical_motion(segment, np.eye(4), landmarks=plan.landmarks, vertices=vertices)
+    places = plan.landmarks
+    if turn.any() and not places:
+        places = {name: site.point for name, site in plan.sites.items() if site.error <= SURE}
+    still = clinical_motion(segment, np.eye(4), landmarks=places, vertices=vertices)
     if turn.any() and (still.point is None or is_turned):
         why = "a scene turns the head" if is_turned else "no file of landmarks names it"
+        why += "" if is_turned or plan.landmarks else ", and it was not found in the head"
         raise CaseInputError(
             f"--move {segment}: pitch, yaw and roll turn it about its teeth or chin, whose place "
             f"is not known yet, because {why}; give mm alone, and turn it on the page of cmfsim "
@@ -413,13 +431,17 @@ def _motion(
     at = np.zeros(3) if still.point is None else still.point
     matrix = planned_motion(at, shift=shift, turn=turn)
     typed = " ".join(f"{word}={value:g}" for word, value in numbers.items())
-    source = (f"As typed: --move {segment} {typed}",)
+    source = f"As typed: --move {segment} {typed}"
+    if turn.any() and places is not plan.landmarks:
+        error = next(s.error for s in plan.sites.values() if np.array_equal(s.point, at))
+        source += f"; {still.place} found automatically, to within {error:.1f} mm"
     lines = {"translation": _row([shift[2], -shift[0], shift[1]])}
     if turn.any():
         vector = np.array([-turn[0], -turn[2], turn[1]])
         angle = float(np.linalg.norm(vector))
         lines |= {"angle": repr(angle), "axis": _row(vector / angle), "centre": _row(at)}
-    return DraftMotion(plan.words(segment, matrix), source, matrix, shown=matrix, typed=lines)
+    words = plan.words(segment, matrix, places)
+    return DraftMotion(words, (source,), matrix, shown=matrix, typed=lines)
 
 
 def _row(values: Iterable[float] | Floats) -> str:

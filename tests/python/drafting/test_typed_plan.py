@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim import drafting
 from cmfsim.cli import main
 from cmfsim.drafting import init_case
 from dicom_series import axial, write_series
@@ -76,10 +77,27 @@ def test_a_piece_that_is_there_is_not_cut_again(head):
         init_case(head, cuts=("le_fort_1",))
 
 
-def test_a_turn_about_teeth_that_nobody_has_placed_is_refused(tmp_path):
+def test_a_ct_without_landmarks_turns_about_the_teeth_that_are_found_in_it(tmp_path):
+    head = cmfsim.make_head()
+    cmfsim.write_image(head.ct(3.0), tmp_path / "ct.nrrd")
+    draft = init_case(tmp_path, moves={"maxilla": {"forwards": 4.0, "pitch": 5.0}})
+    teeth = head.skull_landmarks["supradentale"]
+    motion = cmfsim.Case.load(tmp_path).plan["maxilla"].matrix
+    np.testing.assert_allclose(
+        motion[:3, :3], cmfsim.planned_motion(teeth, turn=(5.0, 0.0, 0.0))[:3, :3], atol=1e-12
+    )
+    # Within what a turn of 5 degrees makes of the error of the landmark.
+    moved = motion[:3, :3] @ teeth + motion[:3, 3] - teeth
+    np.testing.assert_allclose(moved, [0.0, -4.0, 0.0], atol=0.3)
+    assert "(supradentale) found automatically, to within" in " ".join(draft.text.split("\n# "))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["case.toml", "ct.nrrd"]
+
+
+def test_a_turn_about_teeth_that_nobody_has_placed_is_refused(tmp_path, monkeypatch):
     """A translation is the same everywhere; a turn needs the place of the teeth."""
     write_series(tmp_path / "ct", axial(made_head(6.0).image))
-    with pytest.raises(cmfsim.CaseError, match="whose place is not known yet"):
+    monkeypatch.setattr(drafting, "_found_sites", lambda *_: {})
+    with pytest.raises(cmfsim.CaseError, match=r"not known yet.*it was not found in the head"):
         init_case(tmp_path, moves={"maxilla": {"pitch": 2.0}})
     init_case(tmp_path, moves={"maxilla": {"forwards": 3.0}})
     case = cmfsim.Case.load(tmp_path)
