@@ -17,7 +17,7 @@ use crate::error::{ErrorKind, MtmError, Result, check_coordinates};
 use crate::geometry::topology::{NO_TRIANGLE, Topology};
 use crate::geometry::triangle::Feature;
 use crate::geometry::triangle::{self, Facet, TrianglePoint};
-use crate::vector::{Vec3, norm, sub};
+use crate::vector::Vec3;
 
 /// Angle between facet normals above which an edge is a crease, rad (60°): edges of boxes and teeth stay sharp,
 /// coarse round shapes stay smooth.
@@ -216,31 +216,17 @@ impl Surface {
     ///
     /// Exact to rounding: the tree only skips triangles that cannot be closer.
     pub fn closest_one(&self, point: [f64; 3]) -> Closest {
-        let p = Vec3::from(point);
-        let (t, found) = self.nearest(&p, 0);
-        self.describe(&p, t, &found)
-    }
-
-    /// Distance of `point` (mm, finite) from the surface, mm, and the closest triangle.
-    ///
-    /// `near`: a triangle to begin with, on which the result does not depend.
-    pub(crate) fn distance_from(&self, point: [f64; 3], near: u32) -> (f64, u32) {
-        let (t, found) = self.nearest(&Vec3::from(point), near);
-        (norm(sub(found.point.into(), point)), t)
-    }
-
-    /// The closest triangle and its closest point: `near` is the first candidate, the lowest wins a tie.
-    fn nearest(&self, p: &Vec3, near: u32) -> (u32, TrianglePoint) {
-        let query = Vector::new(p.x, p.y, p.z);
-        let start = self.closest_on(p, near);
+        let (p, query) = (Vec3::from(point), Vector::from(point));
+        // Triangle 0 is the candidate until something closer is found, and wins every tie.
+        let start = self.closest_on(&p, 0);
         let start_squared = (p - start.point).norm_squared();
-        let best = Cell::new((start_squared, near, start));
+        let best = Cell::new((start_squared, 0, start));
         let bound = |node: &BvhNode, _: f64| {
             let outside = (node.mins() - query).max(query - node.maxs()).max(Vector::ZERO);
             outside.length_squared() * BOUND_SLACK
         };
         let leaf = |t: u32, _: f64| {
-            let candidate = self.closest_on(p, t);
+            let candidate = self.closest_on(&p, t);
             let squared = (p - candidate.point).norm_squared();
             let (best_squared, best_triangle, _) = best.get();
             if squared < best_squared || (squared == best_squared && t < best_triangle) {
@@ -252,7 +238,7 @@ impl Surface {
         let _: Option<(u32, f64)> =
             self.shape.bvh.find_best(start_squared + f64::MIN_POSITIVE, bound, leaf);
         let (_, t, found) = best.get();
-        (t, found)
+        self.describe(&p, t, &found)
     }
 
     /// The point of a triangle with the weights `barycentric` of its corners, mm.

@@ -6,12 +6,10 @@ use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::Surface;
 use crate::geometry::winding::WindingTree;
 use crate::meshing::stuffing::level::{Grid, LevelImage};
+use crate::vector::{norm, sub};
 
 /// Winding number that separates inside from outside.
 const INSIDE: f64 = 0.5;
-
-/// Share of a step by which two distances have to exceed it to cover it despite rounding.
-const ROUNDING: f64 = 1e-9;
 
 /// Signed distance to `surface` on `grid`, positive inside, clipped at ±`band` (mm).
 ///
@@ -33,24 +31,19 @@ pub fn signed_distance(surface: &Surface, grid: Grid, band: f64) -> Result<Level
     }
     let winding = WindingTree::new(surface);
     let sign = |x: [f64; 3]| if winding.winding_number_one(x) > INSIDE { 1.0 } else { -1.0 };
-    // No surface lies in the balls of these radii about two neighbours: if they cover the way from one to the
-    // other, both are on one side. Through holes the side changes away from the surface, where the winding
-    // number is looked at more often.
-    let closed = surface.is_closed();
+    let distance = |x: [f64; 3]| norm(sub(surface.closest_one(x).point, x));
     let nz = grid.shape[2];
     let step = grid.spacing[2];
-    let free = step * (1.0 + ROUNDING);
     let mut values = vec![0.0_f32; grid.len()];
     values.par_chunks_mut(nz).enumerate().for_each(|(row, out)| {
         let mut k = 0;
         let mut previous: Option<(f64, f64)> = None;
-        let mut near = 0;
         while k < nz {
             let x = grid.centre(row * nz + k);
-            let d;
-            (d, near) = surface.distance_from(x, near);
+            let d = distance(x);
+            // If the surface is further away than one step, the next voxel lies on the same side.
             let side = match previous {
-                Some((side, before)) if before + if closed { d } else { 0.0 } > free => side,
+                Some((side, d)) if d > step => side,
                 _ => sign(x),
             };
             // The distance decreases by at most one step per voxel: all voxels up to here are beyond the band
@@ -58,7 +51,7 @@ pub fn signed_distance(surface: &Surface, grid: Grid, band: f64) -> Result<Level
             let beyond = ((d - band) / step).floor().max(0.0) as usize;
             let end = (k + 1 + beyond).min(nz);
             out[k..end].fill((side * d.min(band)) as f32);
-            previous = (closed || beyond == 0).then_some((side, d - beyond as f64 * step));
+            previous = (beyond == 0).then_some((side, d));
             k = end;
         }
     });
