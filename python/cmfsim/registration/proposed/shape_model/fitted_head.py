@@ -55,8 +55,10 @@ FITS = 4.0
 # Share of the visible face that must fit: heads have 0.7 to 0.8, a crude
 # one of a few ellipsoids 0.54, balls and tubes 0.4.
 LEAST_FIT, FACE_BACK, FACE_TOP = 0.48, 0.0, 60.0
-# Of a head that lies otherwise up to 0.47 fits: below this, it is compared with such heads.
-SURE_FIT = 0.6
+# Of a head that lies otherwise up to 0.47 fits, and 0.79 once the search has turned it by 50 to 90
+# degrees into a pose beside the right one: below this fit, or beyond this turn, it is compared with
+# such heads.
+SURE_FIT, SURE_TURN = 0.6, np.radians(50.0)
 QUARTER = 0.5 * np.pi
 # A part of the face and the skull's base that the head's own frame is taken from, mm: back, up.
 FRAME_BACK, FRAME_TOP, FRAME_DISTANCE, FRAME_ROUNDS = 20.0, 70.0, 4.0, 10
@@ -204,6 +206,12 @@ class FittedHead:
         return Pose(origin, linear / scale, 1.0 / scale, self.gap)
 
     @property
+    def turn(self) -> float:
+        """The angle by which the patient is turned against an upright head, radians."""
+        cosine = 0.5 * (np.trace(self.state.linear) / self.state.scale - 1.0)
+        return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+    @property
     def jaw(self) -> Floats:
         """The motion that opens the average head's jaw as the patient's is, (4, 4), mm.
 
@@ -242,7 +250,7 @@ def fit_head(samples: HeadSamples) -> FittedHead:
     """
     model = head_model()
     best = _best(model, samples)
-    if best.fits >= SURE_FIT:
+    if best.fits >= SURE_FIT and best.turn <= SURE_TURN:
         return best
     coarse, few = model.coarse, samples.fewer(COARSE_POINTS)
     scores = {how: found_poses(coarse, few, turn)[0].score for how, turn in LYING.items()}
