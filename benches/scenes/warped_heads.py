@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cmfsim import SurfaceData
-from cmfsim.errors import third_party
+from cmfsim import SurfaceData, _core
 
 Points = Mapping[str, np.ndarray]
 Move = Callable[[np.ndarray], np.ndarray]
@@ -135,11 +134,7 @@ def _rough(surface: SurfaceData) -> SurfaceData:
 
 
 def _fewer(surface: SurfaceData, count: int) -> SurfaceData:
-    library = third_party("fast_simplification", "surfaces are decimated", "imaging")
-    vertices, triangles = library.simplify(
-        surface.vertices.astype(np.float32), surface.triangles.astype(np.int32), target_count=count
-    )
-    return SurfaceData(vertices, triangles.astype(np.uint32))
+    return SurfaceData(*_core.decimated(surface.vertices, surface.triangles, count))
 
 
 def _holed(surface: SurfaceData) -> SurfaceData:
