@@ -379,6 +379,11 @@ fn check(
             });
         }
     }
+    check_options(options, matches!(fixed, Fixed::Surface(_)), normals.is_some())
+}
+
+fn check_options(options: &IcpOptions, is_surface: bool, has_normals: bool) -> Result<()> {
+    let kind = ErrorKind::Registration;
     let refuse = |what: &str, value: f64, allowed: &'static str| {
         Err(MtmError::OutOfRange { what: what.to_owned(), index: 0, value, allowed, kind })
     };
@@ -396,12 +401,11 @@ fn check(
     {
         return refuse("max_distance", distance, "above 0 mm");
     }
-    let is_surface = matches!(fixed, Fixed::Surface(_));
     if let Some(angle) = options.max_angle {
         if !(angle > 0.0 && angle <= std::f64::consts::PI) {
             return refuse("max_angle", angle, "above 0 to pi rad");
         }
-        if !is_surface || normals.is_none() {
+        if !is_surface || !has_normals {
             return refuse("max_angle", angle, "none unless both sides are surfaces with normals");
         }
     }

@@ -187,8 +187,7 @@ def part_jaws(
     # Pieces that the flood left to the skull, but that only the mandible holds, are the mandible's.
     rest = bone.mask[box] & ~mandible[box]
     mandible[box] |= reached(rest & ~_largest_piece(rest), grown(mandible[box]))
-    side = _side(mandible, bone.mask)
-    return Jaws(side, mandible, height, tuple(findings))
+    return Jaws(_side(mandible, bone.mask), mandible, height, tuple(findings))
 
 
 def _largest_piece(mask: Mask) -> Mask:

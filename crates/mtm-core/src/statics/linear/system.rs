@@ -136,9 +136,8 @@ impl System {
             if interrupted() {
                 return Err(MtmError::Interrupted);
             }
-            let contact_bytes =
-                if kept { ContactFactor::bytes_for(n_sliding, liftable.len()) } else { 0 };
-            let needed = symbolic.factor_bytes() + contact_bytes;
+            let contact = kept.then(|| ContactFactor::bytes_for(n_sliding, liftable.len()));
+            let needed = symbolic.factor_bytes() + contact.unwrap_or(0);
             let fits = options.memory_limit.is_none_or(|limit| needed <= limit);
             if fits && n_sliding > 0 && !kept {
                 let refactored = Unfactored::Refactored { symbolic, matrix };

@@ -81,10 +81,8 @@ impl Equilibrium {
             if (solve.interrupted)() {
                 return Err(MtmError::Interrupted);
             }
-            let mut allowed = self.allowed(&pose, target, length);
-            if ending.is_some() {
-                allowed = allowed.min(finest);
-            }
+            let allowed = self.allowed(&pose, target, length);
+            let allowed = ending.map_or(allowed, |_| allowed.min(finest));
             let first = if length <= near { Exact } else { Definite };
             let (step, kind) = self.safe_step((&pose, target), (first, allowed), length, steps)?;
             if kind != first {
@@ -94,13 +92,11 @@ impl Equilibrium {
             let before = std::mem::replace(&mut length, step.length());
             solve.effort.history.push(length);
             let goal = self.options.tolerance * reach(&pose, target);
-            let left = if self.tissue.contrast > STIFF_PARTS {
-                left_after(&solve.effort.history[start..], goal)
-            } else {
-                left_at_rate(length, before)
-            };
-            let bound = left + allowed;
-            let bound = ending.filter(|_| length <= goal).unwrap_or(bound);
+            let (lengths, is_stiff) =
+                (&solve.effort.history[start..], self.tissue.contrast > STIFF_PARTS);
+            let left =
+                if is_stiff { left_after(lengths, goal) } else { left_at_rate(length, before) };
+            let bound = ending.filter(|_| length <= goal).unwrap_or(left + allowed);
             ending = (bound <= goal).then_some(bound);
             if ending.is_some() && allowed <= finest {
                 let end = moved_by(&self.reduction, &pose.u, &step.rows, 1.0);

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::boundary::{Boundary, Motion, NodeKind, Plan};
 use crate::contact::pairs::Pairs;
-use crate::contact::{ContactState, Sliding};
+use crate::contact::{ContactMode, ContactState, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, check_forces};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::tensors::MassTensors;
@@ -71,6 +71,39 @@ struct PosedPlan<'a> {
     start: Option<&'a Solution>,
 }
 
+/// What of a body slides on bone, and on other tissue.
+fn contacts_of(
+    tensors: &MassTensors,
+    kinds: &Boundary,
+    rows: &[u32],
+    mode: ContactMode,
+) -> Result<(Option<Sliding>, Option<Pairs>)> {
+    let (mesh, places) = (tensors.mesh(), tensors.element_nodes().positions());
+    let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
+    let sliding = Sliding::new(kinds, mesh, places, rows, stiffness, mode)?;
+    Ok((sliding, Pairs::new(kinds, mesh, places, rows, stiffness)?))
+}
+
+/// The equations of a body, whose matrix is that at rest, and the method by which they are solved. Errors refer to
+/// rows.
+fn mechanics_of(
+    (tensors, reduction, matrix): (&Arc<MassTensors>, &Arc<Reduction>, BlockMatrix),
+    body: &BodyRows<'_>,
+    options: &StaticOptions,
+    clock: &mut Clock,
+    interrupted: Interrupt<'_>,
+) -> Result<(Mechanics, Method)> {
+    if options.kinematics == Kinematics::Linear {
+        return System::new(matrix, body, options, clock, interrupted)
+            .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method));
+    }
+    if !body.liftable.0.is_empty() {
+        return Err(not_liftable("kinematics", options.kinematics.name().into()));
+    }
+    Equilibrium::new(tensors.clone(), reduction.clone(), &matrix, options, clock)
+        .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
+}
+
 impl StaticSolver {
     /// The solver of `tensors` under `boundary`.
     ///
@@ -102,14 +135,11 @@ impl StaticSolver {
             kinds
         };
         let reduction = Arc::new(Reduction::new(&with_liftable(NodeKind::Free)));
-        let is_unknown = |j: usize| reduction.row_of[j] != NO_ROW;
-        let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
-        let (rows, mode) = (&reduction.row_of, options.contact.mode);
-        let sliding = Sliding::new(&node_kinds, &mesh, places, rows, stiffness, mode)?;
-        let pairs = Pairs::new(&node_kinds, &mesh, places, rows, stiffness)?;
+        let rows = &reduction.row_of;
+        let (sliding, pairs) = contacts_of(&tensors, &node_kinds, rows, options.contact.mode)?;
         clock.lap("contact_setup", sliding.is_some() || pairs.is_some());
         let normals = corner_normals(sliding.as_ref(), mesh.n_nodes());
-        let held = restraint::check(&mesh, |j| !is_unknown(j), &normals)?;
+        let held = restraint::check(&mesh, |j| rows[j] == NO_ROW, &normals)?;
         clock.lap("restraint", true);
 
         let outer = with_liftable(node_kinds.liftable_kind());
@@ -120,20 +150,14 @@ impl StaticSolver {
             return Err(MtmError::Interrupted);
         }
         let tissue = Extremes::of(tensors.tissue());
-        let made = if options.kinematics == Kinematics::Linear {
-            let (positions, sliding) = (&reduction.rows(places), sliding.as_ref());
-            let rows: Vec<u32> = liftable.iter().map(|&j| reduction.row_of[j as usize]).collect();
-            let liftable = (&rows[..], &held_places[..]);
-            let body = BodyRows { positions, sliding, held, liftable, tissue, multigrid: None };
-            System::new(matrix, &body, &options, &mut clock, interrupted)
-                .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method))
-        } else if !liftable.is_empty() {
-            Err(not_liftable("kinematics", options.kinematics.name().into()))
-        } else {
-            Equilibrium::new(tensors.clone(), reduction.clone(), &matrix, &options, &mut clock)
-                .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
-        };
-        let (mechanics, method) = made.map_err(|e| by_node(e, &reduction.unknowns))?;
+        let (positions, slides) = (&reduction.rows(places), sliding.as_ref());
+        let rows: Vec<u32> = liftable.iter().map(|&j| reduction.row_of[j as usize]).collect();
+        let lifts = (&rows[..], &held_places[..]);
+        let body =
+            BodyRows { positions, sliding: slides, held, liftable: lifts, tissue, multigrid: None };
+        let made = (&tensors, &reduction, matrix);
+        let (mechanics, method) = mechanics_of(made, &body, &options, &mut clock, interrupted)
+            .map_err(|e| by_node(e, &reduction.unknowns))?;
         let refines = method.has_factor()
             && options.kinematics == Kinematics::Linear
             && is_doubtful(tissue.contrast);
@@ -292,10 +316,8 @@ impl StaticSolver {
         let residual = self.residual(&forces, loads, (contact.as_ref(), &touch.forces), &b);
         let effort = solve.effort;
         if !(residual.is_finite() && effort.error_estimate.is_finite()) {
-            return Err(MtmError::Overflow {
-                what: "the solution",
-                why: "the plan or the moduli are too large for f64",
-            });
+            let why = "the plan or the moduli are too large for f64";
+            return Err(MtmError::Overflow { what: "the solution", why });
         }
         clock.lap("forces", true);
 
