@@ -432,9 +432,10 @@ def _motion(
     matrix = planned_motion(at, shift=shift, turn=turn)
     typed = " ".join(f"{word}={value:g}" for word, value in numbers.items())
     source = f"As typed: --move {segment} {typed}"
-    if turn.any() and places is not plan.landmarks:
-        error = next(s.error for s in plan.sites.values() if np.array_equal(s.point, at))
-        source += f"; {still.place} found automatically, to within {error:.1f} mm"
+    # The middle of a surface, about which a piece without landmarks turns, is no such site.
+    errors = [s.error for s in plan.sites.values() if np.array_equal(s.point, at)]
+    if turn.any() and errors:
+        source += f"; {still.place} found automatically, to within {errors[0]:.1f} mm"
     lines = {"translation": _row([shift[2], -shift[0], shift[1]])}
     if turn.any():
         vector = np.array([-turn[0], -turn[2], turn[1]])

@@ -103,3 +103,13 @@ def test_a_turn_about_teeth_that_nobody_has_placed_is_refused(tmp_path, monkeypa
     case = cmfsim.Case.load(tmp_path)
     np.testing.assert_allclose(case.plan["maxilla"].matrix[:3, 3], [0.0, -3.0, 0.0])
     assert [cut.procedure for cut in case.osteotomies] == ["le_fort_1"]
+
+
+def test_a_piece_without_landmarks_turns_about_the_middle_of_its_surface(head, monkeypatch):
+    for file in head.glob("*.json"):
+        file.unlink()
+    monkeypatch.setattr(drafting, "_found_sites", lambda *_: {})
+    draft = init_case(head, moves={"mandible": {"pitch": 2.0}})
+    assert "found automatically, to within" not in draft.text
+    motion = cmfsim.Case.load(head).plan["mandible"].matrix
+    assert np.trace(motion[:3, :3]) == pytest.approx(1.0 + 2.0 * np.cos(np.radians(2.0)))
