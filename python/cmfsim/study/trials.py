@@ -31,7 +31,7 @@ LANDMARK_SD = 2.0
 
 @dataclass(frozen=True, eq=False)
 class LandmarkTrial:
-    """One trial: landmarks placed anew, and what that changes.
+    """One trial: landmarks placed again, and what that changes.
 
     landmarks: mapping of str to (3,), mm.
     landmark_deviation: mm. Mean distance of the landmarks from those of the case.
@@ -207,7 +207,7 @@ def _trial(
         raise LandmarkInputError(
             f"a trial has the landmark {unknown[0]!r}, which the case does not have"
         )
-    # A trial may place some landmarks anew; the others stay.
+    # A trial may place some landmarks again; the others stay.
     placed = {**known, **placed}
     changed = with_muscles(patient, given, landmarks=placed)
     again = predict_patient(changed, model)

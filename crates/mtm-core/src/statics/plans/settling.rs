@@ -1,4 +1,4 @@
-//! A body under contact conditions: systems solved anew for each set of them, and the responses of bodies by a
+//! A body under contact conditions: systems solved again for each set of them, and the responses of bodies by a
 //! kept flexibility or by iteration.
 
 use std::borrow::Cow;
