@@ -240,13 +240,11 @@ impl Boundary {
         let (liftable, own) = &self.liftable;
         let is_liftable = |node: &u32| liftable.binary_search(node).is_ok();
         if let Some(node) = nodes.iter().find(|node| !is_liftable(node)) {
-            return Err(MtmError::NotTogether {
-                what: "held node",
-                found: node.to_string(),
-                with: "a solver for other plans",
-                needed: "nodes that its boundary was given as liftable",
-                kind: ErrorKind::Boundary,
-            });
+            return Err(ErrorKind::Boundary.not_together(
+                ("held node", &node.to_string()),
+                "a solver for other plans",
+                "nodes that its boundary was given as liftable",
+            ));
         }
         let mut out = self.clone();
         let (held, given) = match *own {
@@ -400,14 +398,7 @@ impl Boundary {
         let mut set = |what: String, nodes: &[u32], kind: NodeKind| -> Result<()> {
             for (row, &node) in nodes.iter().enumerate() {
                 let Some(slot) = kinds.get_mut(node as usize) else {
-                    return Err(MtmError::IndexOutOfRange {
-                        what,
-                        row,
-                        item: "node",
-                        index: node as usize,
-                        count: n,
-                        kind: ErrorKind::Boundary,
-                    });
+                    return Err(ErrorKind::Boundary.no_such((what, row), "node", node, n));
                 };
                 *slot = kind;
             }

@@ -75,14 +75,7 @@ impl TetMesh {
         check_coordinates("nodes", &nodes, ErrorKind::Mesh)?;
         for (row, tet) in tets.iter().enumerate() {
             if let Some(&node) = tet.iter().find(|&&v| v as usize >= nodes.len()) {
-                return Err(MtmError::IndexOutOfRange {
-                    what: "tets".into(),
-                    row,
-                    item: "node",
-                    index: node as usize,
-                    count: nodes.len(),
-                    kind: ErrorKind::Mesh,
-                });
+                return Err(ErrorKind::Mesh.no_such(("tets", row), "node", node, nodes.len()));
             }
             for a in 0..3 {
                 if tet[a + 1..].contains(&tet[a]) {
@@ -264,13 +257,12 @@ fn check_volumes(nodes: &[[f64; 3]], tets: &[[u32; 4]], volumes: &[f64]) -> Resu
     });
     let Some((tet, edge, limit)) = worst else { return Ok(()) };
     if edge < SHORTEST_EDGE {
-        return Err(MtmError::OutOfRange {
-            what: "longest edge of tets".into(),
-            index: tet,
-            value: edge,
-            allowed: "1e-9 mm or more; check the units",
-            kind: ErrorKind::Mesh,
-        });
+        return Err(ErrorKind::Mesh.out_of_range(
+            "longest edge of tets",
+            tet,
+            edge,
+            "1e-9 mm or more; check the units",
+        ));
     }
     if volumes[tet] < -limit {
         let count = volumes.iter().filter(|&&v| v < 0.0).count();

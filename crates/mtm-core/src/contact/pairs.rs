@@ -21,7 +21,7 @@ use crate::contact::links::Link;
 use crate::contact::overlap::Overlap;
 use crate::contact::planes::{Meeting, Plane, Planes};
 use crate::contact::walls::{MovedWall, Outside, Wall};
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::Closest;
 use crate::mesh::TetMesh;
@@ -169,7 +169,8 @@ impl Pairs {
             };
             for &node in pair.nodes.iter().filter(|node| own.binary_search(node).is_err()) {
                 let Some(&place) = places.get(node as usize) else {
-                    return Err(out_of_range(p, node, places.len()));
+                    let what = format!("nodes of touching pair {p}");
+                    return Err(ErrorKind::Boundary.no_such((what, 0), "node", node, places.len()));
                 };
                 let closest = wall.surface().closest_one(place);
                 let mean_edge = wall.surface().mean_edge_length();
@@ -450,15 +451,4 @@ fn over(closest: &Closest, way: [f64; 3], mean_edge: f64) -> Option<f64> {
     let along = dot(closest.normal, way);
     let aside = norm(sub(way, scaled(closest.normal, along)));
     (aside <= BORDER_REACH * mean_edge).then_some(along)
-}
-
-fn out_of_range(pair: usize, node: u32, count: usize) -> MtmError {
-    MtmError::IndexOutOfRange {
-        what: format!("nodes of touching pair {pair}"),
-        row: 0,
-        item: "node",
-        index: node as usize,
-        count,
-        kind: ErrorKind::Boundary,
-    }
 }

@@ -1,6 +1,6 @@
 //! The families of errors, and which of them are the input's fault.
 
-use crate::error::MtmError;
+use crate::error::{MtmError, Result};
 
 /// The family an error belongs to; the Python exceptions carry the same names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -77,5 +77,79 @@ impl MtmError {
                 | Self::NoThreads { .. }
                 | Self::Interrupted
         )
+    }
+}
+
+/// Errors of a family.
+impl ErrorKind {
+    pub(crate) fn out_of_range(
+        self,
+        what: impl Into<String>,
+        index: usize,
+        value: f64,
+        allowed: &'static str,
+    ) -> MtmError {
+        MtmError::OutOfRange { what: what.into(), index, value, allowed, kind: self }
+    }
+
+    /// Rejects a parameter unless `is_allowed`.
+    pub(crate) fn require(
+        self,
+        is_allowed: bool,
+        what: &str,
+        value: f64,
+        allowed: &'static str,
+    ) -> Result<()> {
+        if is_allowed { Ok(()) } else { Err(self.out_of_range(what, 0, value, allowed)) }
+    }
+
+    pub(crate) fn not_finite(self, what: &str, index: usize, value: f64) -> MtmError {
+        MtmError::NotFinite { what: what.to_owned(), index, value, kind: self }
+    }
+
+    pub(crate) fn length(
+        self,
+        what: impl Into<String>,
+        found: usize,
+        expected: usize,
+        why: &'static str,
+    ) -> MtmError {
+        MtmError::Length { what: what.into(), found, expected, why, kind: self }
+    }
+
+    /// Rejects an array of another length.
+    pub(crate) fn require_length(
+        self,
+        what: &str,
+        found: usize,
+        expected: usize,
+        why: &'static str,
+    ) -> Result<()> {
+        if found == expected { Ok(()) } else { Err(self.length(what, found, expected, why)) }
+    }
+
+    /// `row` of `what` refers to item `index` of `count`.
+    pub(crate) fn no_such(
+        self,
+        (what, row): (impl Into<String>, usize),
+        item: &'static str,
+        index: u32,
+        count: usize,
+    ) -> MtmError {
+        let index = index as usize;
+        MtmError::IndexOutOfRange { what: what.into(), row, item, index, count, kind: self }
+    }
+
+    pub(crate) fn unknown(self, what: &'static str, name: &str, known: &'static str) -> MtmError {
+        MtmError::UnknownName { what, found: name.to_owned(), known, kind: self }
+    }
+
+    pub(crate) fn not_together(
+        self,
+        (what, found): (&'static str, &str),
+        with: &'static str,
+        needed: &'static str,
+    ) -> MtmError {
+        MtmError::NotTogether { what, found: found.to_owned(), with, needed, kind: self }
     }
 }

@@ -118,15 +118,8 @@ impl Surface {
         crease_angle: f64,
     ) -> Result<Self> {
         let kind = ErrorKind::Mesh;
-        if !(0.0..=PI).contains(&crease_angle) {
-            return Err(MtmError::OutOfRange {
-                what: "crease angle".to_owned(),
-                index: 0,
-                value: crease_angle,
-                allowed: "0 to pi rad",
-                kind,
-            });
-        }
+        let allowed = "0 to pi rad";
+        kind.require((0.0..=PI).contains(&crease_angle), "crease angle", crease_angle, allowed)?;
         if vertices.is_empty() {
             return Err(MtmError::Empty { what: "surface vertices", kind });
         }
@@ -136,14 +129,12 @@ impl Surface {
         check_coordinates("surface vertices", &vertices, kind)?;
         for (row, vertex) in triangles.iter().enumerate() {
             if let Some(&index) = vertex.iter().find(|&&v| v as usize >= vertices.len()) {
-                return Err(MtmError::IndexOutOfRange {
-                    what: "surface triangles".to_owned(),
-                    row,
-                    item: "vertex",
-                    index: index as usize,
-                    count: vertices.len(),
-                    kind,
-                });
+                return Err(kind.no_such(
+                    ("surface triangles", row),
+                    "vertex",
+                    index,
+                    vertices.len(),
+                ));
             }
         }
         let facets = facets(&vertices, &triangles)?;
@@ -163,15 +154,8 @@ impl Surface {
     /// [`MtmError::Length`], [`MtmError::NotFinite`], [`MtmError::DegenerateTriangle`].
     pub fn moved(&self, vertices: Vec<[f64; 3]>) -> Result<Self> {
         let expected = self.shape.vertices.len();
-        if vertices.len() != expected {
-            return Err(MtmError::Length {
-                what: "moved vertices".to_owned(),
-                found: vertices.len(),
-                expected,
-                why: "one for each vertex of the surface at rest",
-                kind: ErrorKind::Boundary,
-            });
-        }
+        let why = "one for each vertex of the surface at rest";
+        ErrorKind::Boundary.require_length("moved vertices", vertices.len(), expected, why)?;
         check_coordinates("moved vertices", &vertices, ErrorKind::Boundary)?;
         let facets = facets(&vertices, &self.topology.triangles)?;
         // The tree of the rest shape with new boxes: neighbours stay neighbours.

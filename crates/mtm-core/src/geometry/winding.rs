@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 
 use rayon::prelude::*;
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::geometry::surface::Surface;
 use crate::vector::Vec3;
 
@@ -94,18 +94,15 @@ impl WindingTree {
     /// Tree of a surface with given options.
     ///
     /// # Errors
-    /// [`MtmError::OutOfRange`] for a `beta` below 1.
+    /// [`crate::MtmError::OutOfRange`] for a `beta` below 1.
     pub fn with_options(surface: &Surface, options: &WindingOptions) -> Result<Self> {
         let beta = options.beta;
-        if !(beta.is_finite() && beta >= 1.0) {
-            return Err(MtmError::OutOfRange {
-                what: "winding number beta".to_owned(),
-                index: 0,
-                value: beta,
-                allowed: "1 or more",
-                kind: ErrorKind::Mesh,
-            });
-        }
+        ErrorKind::Mesh.require(
+            beta.is_finite() && beta >= 1.0,
+            "winding number beta",
+            beta,
+            "1 or more",
+        )?;
         Ok(Self::build(surface, beta))
     }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::mesh::{Incidence, TetGeometry, TetMesh};
 use crate::vector::{add, scaled};
 
@@ -38,12 +38,7 @@ impl Element {
             "p1" => Ok(Self::Linear),
             "anp" => Ok(Self::NodalPressure),
             "p2" => Ok(Self::Quadratic),
-            _ => Err(MtmError::UnknownName {
-                what: "element",
-                found: name.to_owned(),
-                known: ELEMENTS,
-                kind: ErrorKind::Mesh,
-            }),
+            _ => Err(ErrorKind::Mesh.unknown("element", name, ELEMENTS)),
         }
     }
 

@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::mechanics::hyperelastic::HyperelasticLaw;
 
 /// How strain follows from displacement.
@@ -37,16 +37,11 @@ impl Kinematics {
     /// The kinematics called `name`.
     ///
     /// # Errors
-    /// [`MtmError::UnknownName`] with the available names.
+    /// [`crate::MtmError::UnknownName`] with the available names.
     pub fn from_name(name: &str) -> Result<Self> {
-        Self::all().find(|kinematics| kinematics.name() == name).ok_or_else(|| {
-            MtmError::UnknownName {
-                what: "kinematics",
-                found: name.to_owned(),
-                known: KINEMATICS.as_str(),
-                kind: ErrorKind::Solver,
-            }
-        })
+        Self::all()
+            .find(|kinematics| kinematics.name() == name)
+            .ok_or_else(|| ErrorKind::Solver.unknown("kinematics", name, KINEMATICS.as_str()))
     }
 
     /// Its name.

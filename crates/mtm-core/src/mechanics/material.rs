@@ -135,7 +135,7 @@ impl Preset {
 }
 
 fn unknown(what: &'static str, found: &str, known: &'static str) -> MtmError {
-    MtmError::UnknownName { what, found: found.to_owned(), known, kind: ErrorKind::Material }
+    ErrorKind::Material.unknown(what, found, known)
 }
 
 impl From<Elastic> for Lame {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::algebra::blocks::{Block, BlockMatrix};
-use crate::error::{ErrorKind, MtmError, Result, check_displacements};
+use crate::error::{ErrorKind, Result, check_displacements};
 use crate::mechanics::element::{Element, ElementNodes};
 use crate::mechanics::material::{Lame, Spencer, Voigt};
 use crate::mechanics::nodal_pressure::{Patches, split};
@@ -57,13 +57,8 @@ impl MassTensors {
     pub fn with_element(mesh: Arc<TetMesh>, tissue: Arc<Tissue>, element: Element) -> Result<Self> {
         let rows = tissue.n_rows();
         if rows != 1 && rows != mesh.n_tets() {
-            return Err(MtmError::Length {
-                what: "tissue".into(),
-                found: rows,
-                expected: mesh.n_tets(),
-                why: "one row for all tets, or one per tet of the mesh",
-                kind: ErrorKind::Material,
-            });
+            let why = "one row for all tets, or one per tet of the mesh";
+            return Err(ErrorKind::Material.length("tissue", rows, mesh.n_tets(), why));
         }
         let patches = (element == Element::NodalPressure).then(|| Patches::new(&mesh, &tissue));
         let nodes = ElementNodes::new(element, mesh);
@@ -210,15 +205,8 @@ impl MassTensors {
 
     pub(crate) fn check_displacements(&self, displacements: &[[f64; 3]]) -> Result<()> {
         let kind = ErrorKind::Mesh;
-        if displacements.len() != self.nodes.n_nodes() {
-            return Err(MtmError::Length {
-                what: "displacements".into(),
-                found: displacements.len(),
-                expected: self.nodes.n_nodes(),
-                why: "one row per node, mid-edge nodes included",
-                kind,
-            });
-        }
+        let why = "one row per node, mid-edge nodes included";
+        kind.require_length("displacements", displacements.len(), self.nodes.n_nodes(), why)?;
         check_displacements("displacements", displacements, kind)
     }
 }

@@ -115,14 +115,10 @@ impl Tissue {
         check_rows(n_tets)?;
         let mut row_of = vec![NO_ROW; n_tets];
         for (row, &tet) in tets.iter().enumerate() {
-            *row_of.get_mut(tet as usize).ok_or_else(|| MtmError::IndexOutOfRange {
-                what: "tets".into(),
-                row,
-                item: "tet",
-                index: tet as usize,
-                count: n_tets,
-                kind: ErrorKind::Material,
-            })? = row as u32;
+            *row_of
+                .get_mut(tet as usize)
+                .ok_or_else(|| ErrorKind::Material.no_such(("tets", row), "tet", tet, n_tets))? =
+                row as u32;
         }
         let failure = tets
             .par_iter()
@@ -145,13 +141,7 @@ impl Tissue {
         check_rows(fraction.len())?;
         for (index, &value) in fraction.iter().enumerate() {
             if !(0.0..=1.0).contains(&value) {
-                return Err(MtmError::OutOfRange {
-                    what: "fraction".into(),
-                    index,
-                    value,
-                    allowed: "0 to 1",
-                    kind: ErrorKind::Material,
-                });
+                return Err(ErrorKind::Material.out_of_range("fraction", index, value, "0 to 1"));
             }
         }
         check_matching(fraction.len(), fibre.len())?;
@@ -282,13 +272,8 @@ fn check_rows(len: usize) -> Result<()> {
 
 fn check_matching(constants: usize, fibres: usize) -> Result<()> {
     if constants != fibres && constants != 1 && fibres != 1 {
-        return Err(MtmError::Length {
-            what: "fibre".into(),
-            found: fibres,
-            expected: constants,
-            why: "one direction, or one per tet",
-            kind: ErrorKind::Material,
-        });
+        let why = "one direction, or one per tet";
+        return Err(ErrorKind::Material.length("fibre", fibres, constants, why));
     }
     Ok(())
 }
@@ -297,28 +282,16 @@ fn check_young(what: &'static str, index: usize, value: f64) -> Result<()> {
     if (SOFTEST..=STIFFEST).contains(&value) {
         return Ok(());
     }
-    let kind = ErrorKind::Material;
-    Err(MtmError::OutOfRange {
-        what: what.into(),
-        index,
-        value,
-        allowed: "positive, 1e-15 to 1e12 MPa; check the units",
-        kind,
-    })
+    let allowed = "positive, 1e-15 to 1e12 MPa; check the units";
+    Err(ErrorKind::Material.out_of_range(what, index, value, allowed))
 }
 
 fn check_poisson(index: usize, value: f64) -> Result<()> {
     if value > -1.0 && value < 0.5 {
         return Ok(());
     }
-    let kind = ErrorKind::Material;
-    Err(MtmError::OutOfRange {
-        what: "poisson".into(),
-        index,
-        value,
-        allowed: "above -1 and below 0.5; 0.4999 is the practical limit",
-        kind,
-    })
+    let allowed = "above -1 and below 0.5; 0.4999 is the practical limit";
+    Err(ErrorKind::Material.out_of_range("poisson", index, value, allowed))
 }
 
 fn check_definite(
@@ -355,7 +328,7 @@ fn unit_fibres(fibre: &[[f64; 3]], needed: &[bool]) -> Result<Vec<[f64; 3]>> {
         }
         let kind = ErrorKind::Material;
         if let Some(&value) = a.iter().find(|v| !v.is_finite()) {
-            return Err(MtmError::NotFinite { what: "fibre".into(), index: tet, value, kind });
+            return Err(kind.not_finite("fibre", tet, value));
         }
         let length = norm(*a);
         if (length - 1.0).abs() > FIBRE_TOLERANCE {
@@ -374,21 +347,11 @@ fn check_voigt(tet: usize, c: &Voigt) -> Result<()> {
         for column in 0..6 {
             let value = c[row][column];
             if !value.is_finite() {
-                return Err(MtmError::NotFinite {
-                    what: "stiffness".into(),
-                    index: tet,
-                    value,
-                    kind,
-                });
+                return Err(kind.not_finite("stiffness", tet, value));
             }
             if value.abs() > STIFFEST || (row == column && value > 0.0 && value < SOFTEST) {
-                return Err(MtmError::OutOfRange {
-                    what: "stiffness".into(),
-                    index: tet,
-                    value,
-                    allowed: "1e-15 to 1e12 MPa on the diagonal, at most 1e12 MPa next to it",
-                    kind,
-                });
+                let allowed = "1e-15 to 1e12 MPa on the diagonal, at most 1e12 MPa next to it";
+                return Err(kind.out_of_range("stiffness", tet, value, allowed));
             }
             let lower = c[column][row];
             if (value - lower).abs() > SYMMETRY_TOLERANCE * largest {

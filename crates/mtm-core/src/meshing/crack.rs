@@ -10,7 +10,7 @@ mod snapping;
 
 use std::collections::HashMap;
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::geometry::surface::Surface;
 use crate::mesh::TetMesh;
 use crate::vector::{add, dot, norm, scaled, sub};
@@ -33,7 +33,7 @@ pub struct Parted {
 /// `mesh` with a crack along `surface`.
 ///
 /// # Errors
-/// [`MtmError::OutOfRange`] if the surface runs between no two tets.
+/// [`crate::MtmError::OutOfRange`] if the surface runs between no two tets.
 pub fn part(mesh: &TetMesh, surface: &Surface) -> Result<Parted> {
     let mut nodes = mesh.nodes().to_vec();
     let heights = snapping::snap(mesh, surface, &mut nodes);
@@ -47,15 +47,12 @@ pub fn part(mesh: &TetMesh, surface: &Surface) -> Result<Parted> {
     let sides = sides(&clipped, surface, &heights);
     let (mut tets, mut copied) = (tets, Vec::new());
     double(&clipped, (&sides, &on_surface), &mut tets, &mut copied);
-    if copied.is_empty() {
-        return Err(MtmError::OutOfRange {
-            what: "nodes doubled by the parting surface".into(),
-            index: 0,
-            value: 0.0,
-            allowed: "1 or more: the surface must run through the tissue, in the frame of the mesh",
-            kind: ErrorKind::Mesh,
-        });
-    }
+    ErrorKind::Mesh.require(
+        !copied.is_empty(),
+        "nodes doubled by the parting surface",
+        0.0,
+        "1 or more: the surface must run through the tissue, in the frame of the mesh",
+    )?;
     let first_cut = mesh.n_nodes();
     let mut parents = cut;
     for &j in &copied {

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::geometry::surface::Surface;
 use crate::geometry::winding::WindingTree;
 use crate::meshing::stuffing::level::{Grid, LevelImage};
@@ -20,15 +20,8 @@ const INSIDE: f64 = 0.5;
 /// # Errors
 /// A band that is not positive.
 pub fn signed_distance(surface: &Surface, grid: Grid, band: f64) -> Result<LevelImage> {
-    if !(band > 0.0 && band.is_finite()) {
-        return Err(MtmError::OutOfRange {
-            what: "band".into(),
-            index: 0,
-            value: band,
-            allowed: "above 0 mm and finite",
-            kind: ErrorKind::Mesh,
-        });
-    }
+    let allowed = "above 0 mm and finite";
+    ErrorKind::Mesh.require(band > 0.0 && band.is_finite(), "band", band, allowed)?;
     let winding = WindingTree::new(surface);
     let sign = |x: [f64; 3]| if winding.winding_number_one(x) > INSIDE { 1.0 } else { -1.0 };
     let distance = |x: [f64; 3]| norm(sub(surface.closest_one(x).point, x));

@@ -13,7 +13,7 @@ use crate::geometry::motion::{RigidMotion, rigid_matrix};
 use crate::geometry::surface::Surface;
 use crate::registration::nearest::PointTree;
 use crate::registration::rigid::{LEAST_PAIRS, Pose, fit_pairs};
-use crate::registration::spread::{check_coordinates, check_not_in_line};
+use crate::registration::spread::{check_coordinates, check_count, check_not_in_line};
 use crate::vector::Vec3;
 
 /// Number of pairs that determine a motion by their tangent planes.
@@ -60,12 +60,7 @@ impl IcpMethod {
         match name {
             "plane" => Ok(Self::Plane),
             "point" => Ok(Self::Point),
-            _ => Err(MtmError::UnknownName {
-                what: "icp method",
-                found: name.to_owned(),
-                known: METHODS,
-                kind: ErrorKind::Registration,
-            }),
+            _ => Err(ErrorKind::Registration.unknown("icp method", name, METHODS)),
         }
     }
 }
@@ -357,66 +352,36 @@ fn check(
 ) -> Result<()> {
     let kind = ErrorKind::Registration;
     check_coordinates("moving", moving)?;
-    if moving.len() < LEAST_PAIRS {
-        return Err(MtmError::TooFewPoints {
-            what: "icp",
-            found: moving.len(),
-            needed: LEAST_PAIRS,
-            shape: "moving points that are not in one line",
-        });
-    }
+    check_count("icp", moving.len(), LEAST_PAIRS, "moving points that are not in one line")?;
     let places: Vec<Vec3> = moving.iter().map(|&p| Vec3::from(p)).collect();
     check_not_in_line("moving points", &places)?;
     if let Some(normals) = normals {
         check_finite_rows("normals", normals, kind)?;
-        if normals.len() != moving.len() {
-            return Err(MtmError::Length {
-                what: "normals".to_owned(),
-                found: normals.len(),
-                expected: moving.len(),
-                why: "one for each moving point",
-                kind,
-            });
-        }
+        kind.require_length("normals", normals.len(), moving.len(), "one for each moving point")?;
     }
     check_options(options, matches!(fixed, Fixed::Surface(_)), normals.is_some())
 }
 
 fn check_options(options: &IcpOptions, is_surface: bool, has_normals: bool) -> Result<()> {
     let kind = ErrorKind::Registration;
-    let refuse = |what: &str, value: f64, allowed: &'static str| {
-        Err(MtmError::OutOfRange { what: what.to_owned(), index: 0, value, allowed, kind })
-    };
-    if !(0.0..1.0).contains(&options.trim) {
-        return refuse("trim", options.trim, "0 to below 1");
-    }
-    if options.max_iterations == 0 {
-        return refuse("max_iterations", 0.0, "1 or more");
-    }
-    if !(options.tolerance >= 0.0 && options.tolerance.is_finite()) {
-        return refuse("tolerance", options.tolerance, "0 or more, finite");
-    }
-    if let Some(distance) = options.max_distance
-        && (distance.is_nan() || distance <= 0.0)
-    {
-        return refuse("max_distance", distance, "above 0 mm");
+    let require = |is_allowed, what, value, allowed| kind.require(is_allowed, what, value, allowed);
+    require((0.0..1.0).contains(&options.trim), "trim", options.trim, "0 to below 1")?;
+    require(options.max_iterations > 0, "max_iterations", 0.0, "1 or more")?;
+    let tolerance = options.tolerance;
+    let is_allowed = tolerance >= 0.0 && tolerance.is_finite();
+    require(is_allowed, "tolerance", tolerance, "0 or more, finite")?;
+    if let Some(distance) = options.max_distance {
+        require(distance > 0.0, "max_distance", distance, "above 0 mm")?;
     }
     if let Some(angle) = options.max_angle {
-        if !(angle > 0.0 && angle <= std::f64::consts::PI) {
-            return refuse("max_angle", angle, "above 0 to pi rad");
-        }
-        if !is_surface || !has_normals {
-            return refuse("max_angle", angle, "none unless both sides are surfaces with normals");
-        }
+        let is_allowed = angle > 0.0 && angle <= std::f64::consts::PI;
+        require(is_allowed, "max_angle", angle, "above 0 to pi rad")?;
+        let allowed = "none unless both sides are surfaces with normals";
+        require(is_surface && has_normals, "max_angle", angle, allowed)?;
     }
     if options.method == Some(IcpMethod::Plane) && !is_surface {
-        return Err(MtmError::NotTogether {
-            what: "icp method",
-            found: "plane".to_owned(),
-            with: "a set of fixed points without a surface",
-            needed: "point",
-            kind,
-        });
+        let without = "a set of fixed points without a surface";
+        return Err(kind.not_together(("icp method", "plane"), without, "point"));
     }
     Ok(())
 }

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Matrix4, Quaternion, UnitQuaternion};
 
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::registration::spread::{check_coordinates, check_not_in_line};
+use crate::registration::spread::{check_coordinates, check_count, check_not_in_line};
 use crate::vector::Vec3;
 
 /// Number of pairs that determine a rigid motion, if they are not collinear.
@@ -170,38 +170,17 @@ fn best_rotation(m: &Matrix3<f64>) -> Result<UnitQuaternion<f64>> {
 fn check_pairs(moving: &[[f64; 3]], fixed: &[[f64; 3]], weights: &[f64]) -> Result<()> {
     let kind = ErrorKind::Registration;
     for (what, found) in [("fixed", fixed.len()), ("weights", weights.len())] {
-        if found != moving.len() {
-            return Err(MtmError::Length {
-                what: what.to_owned(),
-                found,
-                expected: moving.len(),
-                why: "one for each moving point",
-                kind,
-            });
-        }
+        kind.require_length(what, found, moving.len(), "one for each moving point")?;
     }
     if let Some(index) = weights.iter().position(|w| !(w.is_finite() && *w >= 0.0)) {
-        return Err(MtmError::OutOfRange {
-            what: "weights".to_owned(),
-            index,
-            value: weights[index],
-            allowed: "0 or more, finite",
-            kind,
-        });
+        return Err(kind.out_of_range("weights", index, weights[index], "0 or more, finite"));
     }
     let weighing = |points: &[[f64; 3]]| -> Vec<Vec3> {
         let pairs = points.iter().zip(weights);
         pairs.filter(|&(_, &w)| w > 0.0).map(|(&p, _)| Vec3::from(p)).collect()
     };
     let (moving, fixed) = (weighing(moving), weighing(fixed));
-    if moving.len() < LEAST_PAIRS {
-        return Err(MtmError::TooFewPoints {
-            what: "a rigid fit",
-            found: moving.len(),
-            needed: LEAST_PAIRS,
-            shape: "pairs of points with a weight above 0",
-        });
-    }
+    check_count("a rigid fit", moving.len(), LEAST_PAIRS, "pairs of points with a weight above 0")?;
     check_not_in_line("moving points", &moving)?;
     check_not_in_line("fixed points", &fixed)
 }

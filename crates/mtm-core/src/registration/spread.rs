@@ -15,6 +15,20 @@ pub(crate) fn check_coordinates(what: &str, points: &[[f64; 3]]) -> Result<()> {
     error::check_coordinates(what, points, ErrorKind::Registration)
 }
 
+/// Rejects fewer than `needed` points.
+pub(crate) fn check_count(
+    what: &'static str,
+    found: usize,
+    needed: usize,
+    shape: &'static str,
+) -> Result<()> {
+    if found >= needed {
+        Ok(())
+    } else {
+        Err(MtmError::TooFewPoints { what, found, needed, shape })
+    }
+}
+
 /// Extents of points along their principal axes, ascending, mm: thickness, width, length.
 pub(crate) fn extents(points: &[Vec3]) -> [f64; 3] {
     let mean = points.iter().sum::<Vec3>() / points.len().max(1) as f64;

@@ -15,7 +15,7 @@ use nalgebra::{Cholesky, DMatrix, Dyn, Matrix3};
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
-use crate::registration::spread::{check_coordinates, check_not_in_plane, extents};
+use crate::registration::spread::{check_coordinates, check_count, check_not_in_plane, extents};
 use crate::vector::Vec3;
 
 /// Number of landmarks that a spline needs: four that are not coplanar determine its affine part.
@@ -385,41 +385,21 @@ fn closest_pair(points: &[Vec3]) -> Pair {
 fn check_landmarks(source: &[[f64; 3]], target: &[[f64; 3]], smoothing: f64) -> Result<()> {
     let kind = ErrorKind::Registration;
     let n = source.len();
-    if target.len() != n {
-        return Err(MtmError::Length {
-            what: "target landmarks".to_owned(),
-            found: target.len(),
-            expected: n,
-            why: "one for each source landmark",
-            kind,
-        });
-    }
-    if n < LEAST_LANDMARKS {
-        return Err(MtmError::TooFewPoints {
-            what: "a thin-plate spline",
-            found: n,
-            needed: LEAST_LANDMARKS,
-            shape: "landmarks that do not lie in one plane",
-        });
-    }
-    if n > MOST_LANDMARKS {
-        return Err(MtmError::OutOfRange {
-            what: "number of landmarks".to_owned(),
-            index: 0,
-            value: n as f64,
-            allowed: "4 to 4096; take fewer points, spread evenly",
-            kind,
-        });
-    }
-    if !(smoothing.is_finite() && smoothing >= 0.0) {
-        return Err(MtmError::OutOfRange {
-            what: "smoothing".to_owned(),
-            index: 0,
-            value: smoothing,
-            allowed: "0 mm or more, finite",
-            kind,
-        });
-    }
+    kind.require_length("target landmarks", target.len(), n, "one for each source landmark")?;
+    check_count(
+        "a thin-plate spline",
+        n,
+        LEAST_LANDMARKS,
+        "landmarks that do not lie in one plane",
+    )?;
+    kind.require(
+        n <= MOST_LANDMARKS,
+        "number of landmarks",
+        n as f64,
+        "4 to 4096; take fewer points, spread evenly",
+    )?;
+    let allowed = "0 mm or more, finite";
+    kind.require(smoothing.is_finite() && smoothing >= 0.0, "smoothing", smoothing, allowed)?;
     check_coordinates("source landmarks", source)?;
     check_coordinates("target landmarks", target)
 }

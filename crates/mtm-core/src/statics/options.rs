@@ -3,7 +3,7 @@
 use std::sync::LazyLock;
 
 use crate::contact::ContactOptions;
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::mechanics::kinematics::Kinematics;
 
 /// Called now and then; true to stop.
@@ -76,16 +76,12 @@ impl Method {
     /// The method called `name`.
     ///
     /// # Errors
-    /// [`MtmError::UnknownName`] with the available names.
+    /// [`crate::MtmError::UnknownName`] with the available names.
     pub fn from_name(name: &str) -> Result<Self> {
-        Self::ALL.into_iter().find(|method| method.name() == name).ok_or_else(|| {
-            MtmError::UnknownName {
-                what: "method",
-                found: name.to_owned(),
-                known: METHODS.as_str(),
-                kind: ErrorKind::Solver,
-            }
-        })
+        Self::ALL
+            .into_iter()
+            .find(|method| method.name() == name)
+            .ok_or_else(|| ErrorKind::Solver.unknown("method", name, METHODS.as_str()))
     }
 
     /// Whether it uses a factorisation; [`Method::Auto`] has to be resolved first.
@@ -126,43 +122,26 @@ impl Method {
 
 impl StaticOptions {
     pub(crate) fn check(&self) -> Result<()> {
-        let positive = |what: &str, value: f64| {
-            if value.is_finite() && value > 0.0 && value < 1.0 {
-                return Ok(());
-            }
-            Err(MtmError::OutOfRange {
-                what: what.into(),
-                index: 0,
-                value,
-                allowed: "above 0 and below 1 (relative)",
-                kind: ErrorKind::Solver,
-            })
-        };
-        positive("tolerance", self.tolerance)?;
+        let tolerance = self.tolerance;
+        ErrorKind::Solver.require(
+            tolerance > 0.0 && tolerance < 1.0,
+            "tolerance",
+            tolerance,
+            "above 0 and below 1 (relative)",
+        )?;
         let within = self.contact.tolerance;
-        if !(within > 0.0 && within <= MOST_CONTACT_TOLERANCE) {
-            return Err(MtmError::OutOfRange {
-                what: "contact_tolerance".into(),
-                index: 0,
-                value: within,
-                allowed: "above 0, at most 1 mm",
-                kind: ErrorKind::Solver,
-            });
-        }
+        ErrorKind::Solver.require(
+            within > 0.0 && within <= MOST_CONTACT_TOLERANCE,
+            "contact_tolerance",
+            within,
+            "above 0, at most 1 mm",
+        )?;
         let counts = [
             ("max_iterations", self.max_iterations),
             ("contact_iterations", Some(self.contact.max_iterations)),
         ];
         for (what, value) in counts {
-            if value == Some(0) {
-                return Err(MtmError::OutOfRange {
-                    what: what.into(),
-                    index: 0,
-                    value: 0.0,
-                    allowed: "1 or more",
-                    kind: ErrorKind::Solver,
-                });
-            }
+            ErrorKind::Solver.require(value != Some(0), what, 0.0, "1 or more")?;
         }
         Ok(())
     }

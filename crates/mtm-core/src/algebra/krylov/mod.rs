@@ -140,15 +140,7 @@ impl PcgOutcome {
 
 /// Checks that there are `n` finite `rows` called `what`.
 fn check_rows(what: &str, rows: &[[f64; 3]], n: usize) -> Result<()> {
-    if rows.len() != n {
-        return Err(MtmError::Length {
-            what: what.to_owned(),
-            found: rows.len(),
-            expected: n,
-            why: "one row per block row of the matrix",
-            kind: ErrorKind::Solver,
-        });
-    }
+    ErrorKind::Solver.require_length(what, rows.len(), n, "one row per block row of the matrix")?;
     check_finite_rows(what, rows, ErrorKind::Solver)
 }
 

@@ -74,26 +74,16 @@ impl Multigrid {
         normals: &[(usize, [f64; 3])],
         options: &MultigridOptions,
     ) -> Result<Self> {
-        if nodes.len() != a.n_rows() {
-            return Err(MtmError::Length {
-                what: "node coordinates".to_owned(),
-                found: nodes.len(),
-                expected: a.n_rows(),
-                why: "one per block row of the matrix",
-                kind: ErrorKind::Solver,
-            });
-        }
-        if let Some((row, &(index, _))) =
-            normals.iter().enumerate().find(|(_, (j, _))| *j >= a.n_rows())
-        {
-            return Err(MtmError::IndexOutOfRange {
-                what: "normals".to_owned(),
-                row,
-                item: "block row",
+        let why = "one per block row of the matrix";
+        ErrorKind::Solver.require_length("node coordinates", nodes.len(), a.n_rows(), why)?;
+        if let Some(row) = normals.iter().position(|(j, _)| *j >= a.n_rows()) {
+            let index = normals[row].0 as u32;
+            return Err(ErrorKind::Solver.no_such(
+                ("normals", row),
+                "block row",
                 index,
-                count: a.n_rows(),
-                kind: ErrorKind::Solver,
-            });
+                a.n_rows(),
+            ));
         }
         in_pool(|| Self::build(a, nodes, normals, options))
     }

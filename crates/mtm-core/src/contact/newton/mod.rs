@@ -57,15 +57,13 @@ impl Sliding {
         interrupted: &(dyn Fn() -> bool + Sync),
         body: &mut dyn Body,
     ) -> Result<ContactState> {
-        if options.max_iterations == 0 {
-            return Err(MtmError::OutOfRange {
-                what: "contact_iterations".into(),
-                index: 0,
-                value: 0.0,
-                allowed: "1 or more",
-                kind: ErrorKind::Solver,
-            });
-        }
+        let allowed = "1 or more";
+        ErrorKind::Solver.require(
+            options.max_iterations > 0,
+            "contact_iterations",
+            0.0,
+            allowed,
+        )?;
         let seats = Seats::new(self, motions)?;
         let problem = ContactProblem { sliding: self, seats: &seats, options };
         let mut state = problem.start(begin);

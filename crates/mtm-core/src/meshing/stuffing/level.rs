@@ -43,17 +43,12 @@ impl Grid {
         }
         for axis in 0..3 {
             if !(spacing[axis] > 0.0 && spacing[axis].is_finite()) {
-                return Err(MtmError::OutOfRange {
-                    what: "spacing".into(),
-                    index: axis,
-                    value: spacing[axis],
-                    allowed: "above 0 mm and finite",
-                    kind,
-                });
+                let allowed = "above 0 mm and finite";
+                return Err(kind.out_of_range("spacing", axis, spacing[axis], allowed));
             }
             if !origin[axis].is_finite() {
                 let (what, value) = ("origin".into(), origin[axis]);
-                return Err(MtmError::NotFinite { what, index: axis, value, kind });
+                return Err(kind.not_finite(what, axis, value));
             }
         }
         Ok(Self { shape, spacing, origin })
@@ -89,18 +84,10 @@ impl LevelImage {
     /// A number of values that differs from the number of voxels, NaN or infinity.
     pub fn new(grid: Grid, values: Vec<f32>) -> Result<Self> {
         let kind = ErrorKind::Mesh;
-        if values.len() != grid.len() {
-            return Err(MtmError::Length {
-                what: "level image".into(),
-                found: values.len(),
-                expected: grid.len(),
-                why: "one per voxel",
-                kind,
-            });
-        }
+        kind.require_length("level image", values.len(), grid.len(), "one per voxel")?;
         if let Some(index) = values.par_iter().position_first(|v| !v.is_finite()) {
             let value = f64::from(values[index]);
-            return Err(MtmError::NotFinite { what: "level image".into(), index, value, kind });
+            return Err(kind.not_finite("level image", index, value));
         }
         Ok(Self { grid, values })
     }
@@ -113,15 +100,7 @@ impl LevelImage {
     /// # Errors
     /// A number of labels that differs from the number of voxels.
     pub fn from_labels(grid: Grid, inside: &[bool]) -> Result<Self> {
-        if inside.len() != grid.len() {
-            return Err(MtmError::Length {
-                what: "labels".into(),
-                found: inside.len(),
-                expected: grid.len(),
-                why: "one per voxel",
-                kind: ErrorKind::Mesh,
-            });
-        }
+        ErrorKind::Mesh.require_length("labels", inside.len(), grid.len(), "one per voxel")?;
         let [nx, ny, nz] = grid.shape;
         let plane = ny * nz;
         // Along j and k plane by plane, then along i from three neighbouring planes each.

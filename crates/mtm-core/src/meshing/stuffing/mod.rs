@@ -98,15 +98,13 @@ pub fn stuff(
     let lattice = Lattice::new(&cover.tree(level, options, halvings));
     let mut stuffed = cut(&lattice, level, cover.origin, cover.unit);
     drop(lattice);
-    if stuffed.tets.is_empty() {
-        return Err(MtmError::OutOfRange {
-            what: "edge_length".into(),
-            index: 0,
-            value: options.edge_length,
-            allowed: "below about the thickness of the tissue, or more refinements: no tet fits",
-            kind: ErrorKind::Mesh,
-        });
-    }
+    let allowed = "below about the thickness of the tissue, or more refinements: no tet fits";
+    ErrorKind::Mesh.require(
+        !stuffed.tets.is_empty(),
+        "edge_length",
+        options.edge_length,
+        allowed,
+    )?;
     let dropped_tets = improve(&mut stuffed, level);
     let dropped = keep_bodies(&mut stuffed, options.least_body);
     let mesh = TetMesh::new(stuffed.nodes, stuffed.tets)?;
@@ -152,58 +150,38 @@ fn boundary_error(mesh: &TetMesh, level: &LevelImage, reach: f64) -> (f64, f64) 
 
 fn check(options: &StuffingOptions) -> Result<()> {
     let kind = ErrorKind::Mesh;
-    if !(options.edge_length > 0.0 && options.edge_length.is_finite()) {
-        return Err(MtmError::OutOfRange {
-            what: "edge_length".into(),
-            index: 0,
-            value: options.edge_length,
-            allowed: "above 0 mm and finite",
-            kind,
-        });
-    }
-    if options.refinements > MAX_REFINEMENTS {
-        return Err(MtmError::OutOfRange {
-            what: "refinements".into(),
-            index: 0,
-            value: f64::from(options.refinements),
-            allowed: "0 to 3",
-            kind,
-        });
-    }
-    if options.least_body.is_nan() || options.least_body < 0.0 {
-        return Err(MtmError::OutOfRange {
-            what: "least_body".into(),
-            index: 0,
-            value: options.least_body,
-            allowed: "0 mm³ or more",
-            kind,
-        });
-    }
+    kind.require(
+        options.edge_length > 0.0 && options.edge_length.is_finite(),
+        "edge_length",
+        options.edge_length,
+        "above 0 mm and finite",
+    )?;
+    kind.require(
+        options.refinements <= MAX_REFINEMENTS,
+        "refinements",
+        f64::from(options.refinements),
+        "0 to 3",
+    )?;
+    kind.require(options.least_body >= 0.0, "least_body", options.least_body, "0 mm³ or more")?;
     Ok(())
 }
 
 fn check_halvings(halvings: &Halvings<'_>, n_voxels: usize, refinements: u32) -> Result<()> {
     let kind = ErrorKind::Mesh;
-    for (what, counts) in [("allowed", halvings.allowed), ("needed", halvings.needed)] {
-        if let Some(counts) = counts.filter(|counts| counts.len() != n_voxels) {
-            return Err(MtmError::Length {
-                what: format!("{what} refinements"),
-                found: counts.len(),
-                expected: n_voxels,
-                why: "one per voxel of the level image",
-                kind,
-            });
-        }
+    for (what, counts) in
+        [("allowed refinements", halvings.allowed), ("needed refinements", halvings.needed)]
+    {
+        let found = counts.map_or(n_voxels, <[u8]>::len);
+        kind.require_length(what, found, n_voxels, "one per voxel of the level image")?;
     }
     let needed = halvings.needed.unwrap_or_default();
     if let Some(index) = needed.iter().position(|&count| u32::from(count) > refinements) {
-        return Err(MtmError::OutOfRange {
-            what: "needed refinements".into(),
+        return Err(kind.out_of_range(
+            "needed refinements",
             index,
-            value: f64::from(needed[index]),
-            allowed: "0 to the refinements of the options: request fewer or allow more",
-            kind,
-        });
+            f64::from(needed[index]),
+            "0 to the refinements of the options: request fewer or allow more",
+        ));
     }
     Ok(())
 }
@@ -226,15 +204,9 @@ impl Cover {
         let margin = grid.spacing.map(|s| s + edge);
         let origin = [0, 1, 2].map(|a| low[a] - margin[a]);
         let counts = [0, 1, 2].map(|a| ((high[a] + margin[a] - origin[a]) / edge).ceil().max(1.0));
-        if counts.iter().product::<f64>() > MAX_CUBES {
-            return Err(MtmError::OutOfRange {
-                what: "edge_length".into(),
-                index: 0,
-                value: edge,
-                allowed: "large enough for at most 1e8 cubes over the tissue; check the units",
-                kind: ErrorKind::Mesh,
-            });
-        }
+        let are_few = counts.iter().product::<f64>() <= MAX_CUBES;
+        let allowed = "large enough for at most 1e8 cubes over the tissue; check the units";
+        ErrorKind::Mesh.require(are_few, "edge_length", edge, allowed)?;
         let unit = edge / f64::from(2_u32 << options.refinements);
         Ok(Self { origin, counts: counts.map(|c| c as usize), edge, unit })
     }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::geometry::surface::Surface;
 use crate::muscles::equivalent::shape::InsideTest;
 use crate::muscles::fibre::MuscleFibres;
@@ -41,16 +41,9 @@ impl Default for SamplingOptions {
 
 impl SamplingOptions {
     pub(super) fn check(&self) -> Result<()> {
-        if (1..=MOST_SAMPLES).contains(&self.samples) {
-            return Ok(());
-        }
-        Err(MtmError::OutOfRange {
-            what: "samples".to_owned(),
-            index: 0,
-            value: self.samples as f64,
-            allowed: "1 to 1048576",
-            kind: ErrorKind::Material,
-        })
+        let samples = self.samples;
+        let is_allowed = (1..=MOST_SAMPLES).contains(&samples);
+        ErrorKind::Material.require(is_allowed, "samples", samples as f64, "1 to 1048576")
     }
 }
 
@@ -60,12 +53,7 @@ impl InsideTest {
         match name {
             "winding" => Ok(Self::Winding),
             "normal" => Ok(Self::Normal),
-            _ => Err(MtmError::UnknownName {
-                what: "inside",
-                found: name.to_owned(),
-                known: INSIDE_TESTS,
-                kind: ErrorKind::Material,
-            }),
+            _ => Err(ErrorKind::Material.unknown("inside", name, INSIDE_TESTS)),
         }
     }
 }

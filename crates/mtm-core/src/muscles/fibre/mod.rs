@@ -81,11 +81,8 @@ impl MuscleKind {
     /// [`MtmError::UnknownName`].
     pub fn parse(name: &str) -> Result<Self> {
         let kinds = [Self::Strap, Self::Fan, Self::Ring, Self::Sheet];
-        kinds.into_iter().find(|kind| kind.name() == name).ok_or_else(|| MtmError::UnknownName {
-            what: "kind of muscle",
-            found: name.to_owned(),
-            known: "strap, fan, ring, sheet",
-            kind: ErrorKind::Mesh,
+        kinds.into_iter().find(|kind| kind.name() == name).ok_or_else(|| {
+            ErrorKind::Mesh.unknown("kind of muscle", name, "strap, fan, ring, sheet")
         })
     }
 }
@@ -136,13 +133,12 @@ impl MuscleFibres {
     pub fn from_surface(surface: &Surface, kind: MuscleKind, boxes: Option<usize>) -> Result<Self> {
         let least = if kind == MuscleKind::Ring { LEAST_ROUND } else { 1 };
         if let Some(count) = boxes.filter(|count| !(least..=MOST_BOXES).contains(count)) {
-            return Err(MtmError::OutOfRange {
-                what: "number of fibre boxes".to_owned(),
-                index: 0,
-                value: count as f64,
-                allowed: "1 to 64, round an opening 3 to 64",
-                kind: ErrorKind::Mesh,
-            });
+            return Err(ErrorKind::Mesh.out_of_range(
+                "number of fibre boxes",
+                0,
+                count as f64,
+                "1 to 64, round an opening 3 to 64",
+            ));
         }
         let region = Region::new(surface);
         let moments = region
@@ -183,9 +179,8 @@ impl MuscleFibres {
             let axes = b.axes.map(Vec3::from);
             let frame = Matrix3::from_columns(&axes);
             let off = (frame.transpose() * frame - Matrix3::identity()).amax();
-            let refuse = |what: &str, value, allowed| {
-                Err(MtmError::OutOfRange { what: what.to_owned(), index, value, allowed, kind })
-            };
+            let refuse =
+                |what: &str, value, allowed| Err(kind.out_of_range(what, index, value, allowed));
             if off > AXES_TOLERANCE {
                 let what = "deviation of the axes of fibre boxes from orthonormal";
                 return refuse(what, off, "at most 1e-6");
@@ -228,13 +223,12 @@ impl MuscleFibres {
             let mut points: Vec<Vec3> = line.iter().map(|&p| Vec3::from(p)).collect();
             points.dedup();
             if points.len() < 2 {
-                return Err(MtmError::Length {
-                    what: format!("fibre line {index}"),
-                    found: points.len(),
-                    expected: 2,
-                    why: "a direction needs two different points",
-                    kind,
-                });
+                return Err(kind.length(
+                    format!("fibre line {index}"),
+                    points.len(),
+                    2,
+                    "a direction needs two different points",
+                ));
             }
             distinct.push(points);
         }

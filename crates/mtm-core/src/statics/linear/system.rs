@@ -363,14 +363,8 @@ impl System {
 
 /// The error for liftable nodes where no factor can hold or free them.
 pub(crate) fn not_liftable(what: &'static str, found: String) -> MtmError {
-    MtmError::NotTogether {
-        what,
-        found,
-        with: "liftable nodes",
-        needed: "method \"cholesky\", linear kinematics, corner nodes alone, at most 6000 sliding and liftable \
-                 nodes, and a body that others hold",
-        kind: ErrorKind::Solver,
-    }
+    ErrorKind::Solver.not_together((what, &found), "liftable nodes", "method \"cholesky\", linear kinematics, corner nodes alone, at most 6000 sliding and liftable \
+                 nodes, and a body that others hold")
 }
 
 /// Displacements for all `columns`, first free and then under the contact `forces` that follow: two solves that

@@ -146,13 +146,11 @@ impl Equilibrium {
     ) -> Result<(Self, Method)> {
         let method = match options.method {
             Method::Relaxation => {
-                return Err(MtmError::NotTogether {
-                    what: "method",
-                    found: options.method.name().into(),
-                    with: "large deformation",
-                    needed: "auto, cholesky or pcg",
-                    kind: ErrorKind::Solver,
-                });
+                return Err(ErrorKind::Solver.not_together(
+                    ("method", options.method.name()),
+                    "large deformation",
+                    "auto, cholesky or pcg",
+                ));
             }
             method @ (Method::Auto | Method::Cholesky | Method::Pcg) => {
                 method.for_unknowns(3 * matrix.n_rows())

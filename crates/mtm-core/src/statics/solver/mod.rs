@@ -426,13 +426,8 @@ impl StaticSolver {
         let n = self.tensors.element_nodes().n_nodes();
         let corners = self.tensors.mesh().n_nodes();
         if loads.len() != n && loads.len() != corners {
-            return Err(MtmError::Length {
-                what: "loads".into(),
-                found: loads.len(),
-                expected: corners,
-                why: "one row per node",
-                kind: ErrorKind::Boundary,
-            });
+            let why = "one row per node";
+            return Err(ErrorKind::Boundary.length("loads", loads.len(), corners, why));
         }
         check_forces("loads", loads, ErrorKind::Boundary)?;
         let mut out = loads.to_vec();

@@ -13,26 +13,22 @@ impl StaticSolver {
             return Err(self.not_linear(result));
         }
         if !self.node_kinds.touching().is_empty() {
-            return Err(MtmError::NotTogether {
-                what: "boundary",
-                found: "touching pairs".into(),
-                with: result,
-                needed: "none, since contacts change with the plan (solve takes them)",
-                kind: ErrorKind::Solver,
-            });
+            return Err(ErrorKind::Solver.not_together(
+                ("boundary", "touching pairs"),
+                result,
+                "none, since contacts change with the plan (solve takes them)",
+            ));
         }
         Ok(())
     }
 
     /// The error for kinematics that are no linear map, which `result` needs.
     pub(crate) fn not_linear(&self, result: &'static str) -> MtmError {
-        MtmError::NotTogether {
-            what: "kinematics",
-            found: self.kinematics().name().into(),
-            with: result,
-            needed: "linear, since the others are no linear map (solve takes them)",
-            kind: ErrorKind::Solver,
-        }
+        ErrorKind::Solver.not_together(
+            ("kinematics", self.kinematics().name()),
+            result,
+            "linear, since the others are no linear map (solve takes them)",
+        )
     }
 
     /// Rejects a starting solution of another mesh or boundary.
@@ -44,15 +40,8 @@ impl StaticSolver {
             ("sliding nodes of the start", start.contact.nodes.len(), nodes),
         ];
         for (what, found, expected) in counts {
-            if found != expected {
-                return Err(MtmError::Length {
-                    what: what.into(),
-                    found,
-                    expected,
-                    why: "the start is a solution of the same solver",
-                    kind: ErrorKind::Boundary,
-                });
-            }
+            let why = "the start is a solution of the same solver";
+            ErrorKind::Boundary.require_length(what, found, expected, why)?;
         }
         Ok(())
     }
