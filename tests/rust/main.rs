@@ -8,10 +8,14 @@ mod properties;
 
 mod algebra {
     mod elastic_box;
+    mod error_bound;
     mod krylov;
+    mod ordering;
 }
 mod contact {
     mod creases;
+    mod field;
+    mod overlap;
     mod settling;
     mod sliding;
     mod touching;
@@ -20,23 +24,35 @@ mod contact {
 mod geometry {
     mod motion;
     mod surface;
+    mod tube;
     mod winding;
 }
 mod mechanics {
     mod bar;
+    mod barrier;
     mod convergence;
+    mod density;
     mod element_limits;
     mod elements;
+    mod part;
     mod patch;
+    mod polar;
     mod squeezed;
 }
 mod meshing {
+    mod distance;
+    mod lattice;
+    mod level;
     mod pieces;
     mod stuffing;
 }
 mod muscles {
+    mod direction;
     mod equivalent;
     mod fibre;
+    mod sequence;
+    mod sides;
+    mod tet_tree;
 }
 mod registration {
     mod fits;
@@ -45,4 +61,8 @@ mod statics {
     mod agreement;
     mod error_estimate;
     mod hinged_body;
+    mod options;
+    mod pressed;
+    mod projected_product;
+    mod unstable;
 }

@@ -81,6 +81,33 @@ mod registration;
 mod statics;
 mod vector;
 
+/// Parts that only the tests of this crate open; they may change in any version.
+#[doc(hidden)]
+pub mod internals {
+    pub use crate::algebra::constraints::{Constraint, projected};
+    pub use crate::algebra::error_bound::tridiagonal_extremes;
+    pub use crate::algebra::krylov::Operator;
+    pub use crate::algebra::ordering::postorder;
+    pub use crate::contact::Spring;
+    pub use crate::contact::field::{Field, FieldValue};
+    pub use crate::contact::links::Link;
+    pub use crate::contact::overlap::{Overlap, depth_in};
+    pub use crate::mechanics::density::{Density, volumetric, without_negative};
+    pub use crate::mechanics::hyperelastic::{PointResponse, PointTangent, Tangent, barrier};
+    pub use crate::mechanics::polar::Polar;
+    pub use crate::mechanics::strain_energy::Part;
+    pub use crate::meshing::stuffing::distance::thin_parts;
+    pub use crate::meshing::stuffing::lattice::{Octree, neighbours};
+    pub use crate::muscles::equivalent::aligned_box::AlignedBox;
+    pub use crate::muscles::equivalent::direction::DirectionSum;
+    pub use crate::muscles::equivalent::sequence::{Sequence, place};
+    pub use crate::muscles::equivalent::shape::MuscleShape;
+    pub use crate::muscles::equivalent::tet_tree::TetTree;
+    pub use crate::statics::linear::pressed::with_links;
+    pub use crate::statics::linear::projected_product::ProjectedProduct;
+    pub use crate::statics::linear::unstable::{at_fault, carry_on};
+}
+
 pub use algebra::blocks::BlockMatrix;
 pub use algebra::cholesky::Symbolic;
 pub use algebra::krylov::{BlockJacobi, PcgOptions, PcgOutcome, Preconditioner, pcg};

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 /// A point or direction, mm or dimensionless.
-pub(crate) type Vec3 = Vector3<f64>;
+pub type Vec3 = Vector3<f64>;
 
 pub(crate) fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]

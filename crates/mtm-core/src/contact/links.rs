@@ -4,7 +4,7 @@ use crate::vector::{add, dot, scaled};
 
 /// A spring between an unknown node and up to three others, or none: ½ k (c·u − goal)².
 #[derive(Debug, Clone)]
-pub(crate) struct Link {
+pub struct Link {
     /// Row and coefficient of each unknown node.
     pub ends: Vec<(u32, [f64; 3])>,
     /// k, N/mm.

@@ -4,7 +4,7 @@
 //! the gradient of φ (Kim et al. 2010, section 2.5 and eq. 2: no force acts in the tangent plane). The smooth
 //! distance φ is in `field`, the position of each node on it in `seat`, the solver in `newton`.
 
-mod field;
+pub(crate) mod field;
 pub(crate) mod links;
 mod newton;
 pub(crate) mod overlap;

@@ -12,7 +12,7 @@ use crate::vector::{add, cross, dot, norm, sub};
 
 /// Nodes that should not lie in any tet of another part.
 #[derive(Debug)]
-pub(crate) struct Overlap {
+pub struct Overlap {
     nodes: Vec<u32>,
     /// Cell size of the lattice used to look up the nodes, mm.
     cell: f64,
@@ -99,7 +99,7 @@ impl Overlap {
 }
 
 /// Smallest distance of a point from the faces of the tet that contains it, mm; zero or negative outside.
-fn depth_in(corners: &[[f64; 3]; 4], point: [f64; 3]) -> f64 {
+pub fn depth_in(corners: &[[f64; 3]; 4], point: [f64; 3]) -> f64 {
     let face = |k: usize| {
         let [a, b, c] = [1, 2, 3].map(|step| corners[(k + step) % 4]);
         let normal = cross(sub(b, a), sub(c, a));
@@ -108,40 +108,4 @@ fn depth_in(corners: &[[f64; 3]; 4], point: [f64; 3]) -> f64 {
     };
     let depth = (0..4).map(face).fold(f64::INFINITY, f64::min);
     if depth.is_finite() { depth } else { 0.0 }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    const CORNERS: [[f64; 3]; 4] =
-        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-
-    #[test]
-    fn depth_is_the_distance_from_the_nearest_face() {
-        assert!((depth_in(&CORNERS, [0.1, 0.3, 0.3]) - 0.1).abs() < 1e-15);
-        let near_the_slope = (1.0 - 0.9) / 3.0_f64.sqrt();
-        assert!((depth_in(&CORNERS, [0.3, 0.3, 0.3]) - near_the_slope).abs() < 1e-15);
-        assert!(depth_in(&CORNERS, [0.5, 0.5, 0.5]) < 0.0);
-        let flat = [[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0]];
-        assert_eq!(depth_in(&flat, [1.0, 0.0, 0.0]), 0.0);
-    }
-
-    #[test]
-    fn a_node_of_another_part_is_found_in_the_tet_that_holds_it() {
-        let mut nodes = CORNERS.to_vec();
-        nodes.extend(CORNERS.map(|c| add(c, [2.0, 0.0, 0.0])));
-        let mesh = TetMesh::new(nodes, vec![[0, 1, 2, 3], [4, 5, 6, 7]]);
-        let Ok(mesh) = mesh else { unreachable!("a valid mesh") };
-        let overlap = Overlap::new(&mesh, (0..8).collect());
-        let mut u = vec![[0.0; 3]; 8];
-        assert_eq!(overlap.inside(&mesh, &u), []);
-        for u in &mut u[4..] {
-            *u = [-1.9, 0.2, 0.3];
-        }
-        // Node 4 is at (0.1, 0.2, 0.3).
-        let inside = overlap.inside(&mesh, &u);
-        assert_eq!(inside.iter().map(|(node, _)| *node).collect::<Vec<_>>(), [4]);
-        assert!((inside[0].1 - 0.1).abs() < 1e-12);
-    }
 }

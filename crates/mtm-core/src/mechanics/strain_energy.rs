@@ -19,7 +19,7 @@ use crate::mechanics::nodal_pressure::split;
 use crate::mechanics::tensors::MassTensors;
 use crate::vector::add;
 
-pub(crate) use part::Part;
+pub use part::Part;
 
 /// Nodes per parallel task.
 const NODES_PER_TASK: usize = 256;

@@ -5,11 +5,11 @@ use nalgebra::{Matrix3, SMatrix};
 use crate::mechanics::material::Lame;
 
 /// Derivatives of the nine entries of F, row by row.
-pub(crate) type Tangent = SMatrix<f64, 9, 9>;
+pub type Tangent = SMatrix<f64, 9, 9>;
 
 /// Energy density and stress at a point.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct PointResponse {
+pub struct PointResponse {
     /// N mm/mm³.
     pub energy: f64,
     /// First Piola–Kirchhoff stress ∂W/∂F, MPa.
@@ -18,7 +18,7 @@ pub(crate) struct PointResponse {
 
 /// ∂²W/∂F² at a point in two parts: the cofactor part has the same form for every law.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct PointTangent {
+pub struct PointTangent {
     /// Everything but the cofactor part, MPa.
     pub own: Tangent,
     /// Factor of ∂²J/∂F², MPa.

@@ -16,7 +16,7 @@ use crate::vector::add;
 const STAYS: u32 = u32::MAX;
 
 /// Nodes that move, as rows, with the tets around them.
-pub(crate) struct Part<'a> {
+pub struct Part<'a> {
     body: &'a StrainEnergy,
     nodes: Vec<u32>,
     tets: Vec<PartTet>,
@@ -142,103 +142,4 @@ fn pattern(tets: &[PartTet], n_rows: usize) -> BlockMatrix {
         row_start.push(columns.len());
     }
     BlockMatrix::from_pattern(row_start, columns)
-}
-
-#[cfg(test)]
-mod tests {
-    use std::sync::Arc;
-
-    use super::*;
-    use crate::mechanics::element::Element;
-    use crate::mechanics::kinematics::Kinematics;
-    use crate::mechanics::material::Elastic;
-    use crate::mechanics::tensors::MassTensors;
-    use crate::mechanics::tissue::Tissue;
-    use crate::mesh::TetMesh;
-    use crate::vector::{dot, sub};
-
-    const ELEMENTS: [Element; 2] = [Element::Linear, Element::Quadratic];
-    const KINDS: [TangentKind; 2] = [TangentKind::Definite, TangentKind::Exact];
-
-    /// The eight tets of an octahedron around its centre, node 0.
-    fn octahedron(element: Element) -> StrainEnergy {
-        let mut nodes = vec![[0.1, 0.0, -0.1]];
-        for axis in 0..3 {
-            for side in [1.0, -1.0] {
-                let mut node = [0.0; 3];
-                node[axis] = side;
-                nodes.push(node);
-            }
-        }
-        let tets = (0..8_u32)
-            .map(|i| {
-                let [x, y, z] = [1 + (i & 1), 3 + (i >> 1 & 1), 5 + (i >> 2)];
-                let is_left = (i.count_ones() & 1) == 1;
-                if is_left { [0, y, x, z] } else { [0, x, y, z] }
-            })
-            .collect();
-        let mesh = Arc::new(TetMesh::new(nodes, tets).expect("eight tets"));
-        let rows = vec![Elastic { young: 0.01, poisson: 0.46 }; 8];
-        let tissue = Arc::new(Tissue::isotropic(&rows).expect("tissue"));
-        let tensors = MassTensors::with_element(mesh, tissue, element).expect("tensors");
-        StrainEnergy::new(Arc::new(tensors), Kinematics::NEO_HOOKEAN)
-    }
-
-    /// Displacements that deform every tet by another amount.
-    fn bent(body: &StrainEnergy) -> Vec<[f64; 3]> {
-        let places = body.nodes().positions();
-        places.iter().map(|&[x, y, z]| [0.2 * y * z, 0.3 * x - 0.1 * z * z, 0.2 * x * y]).collect()
-    }
-
-    #[test]
-    fn forces_and_stiffness_are_those_of_the_body() {
-        for element in ELEMENTS {
-            let body = octahedron(element);
-            let u = bent(&body);
-            let part = Part::new(&body, vec![0, 3, 5]).expect("no patches");
-            let whole = body.state(&u).expect("a state");
-            for (&node, force) in part.nodes().iter().zip(part.state(&u).forces) {
-                let off = sub(force, whole.forces[node as usize]);
-                assert!(dot(off, off).sqrt() < 1e-15, "{element:?}: {off:?} at {node}");
-            }
-            for kind in KINDS {
-                let (one, all) = (part.stiffness(&u, kind), body.stiffness(&u, kind).expect("one"));
-                for (row, &node) in part.nodes().iter().enumerate() {
-                    let (columns, blocks) = one.row(row);
-                    let (of_all, blocks_of_all) = all.row(node as usize);
-                    for (&column, block) in columns.iter().zip(blocks) {
-                        let other = part.nodes()[column as usize];
-                        let at = of_all.binary_search(&other).expect("a neighbour");
-                        for (a, b) in block.iter().zip(&blocks_of_all[at]) {
-                            assert!((a - b).abs() < 1e-15, "{element:?} {kind:?}: {a} {b}");
-                        }
-                    }
-                    let expected = of_all.iter().filter(|k| part.nodes().contains(k)).count();
-                    assert_eq!(columns.len(), expected, "{element:?}");
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn energy_changes_as_that_of_the_body() {
-        for element in ELEMENTS {
-            let body = octahedron(element);
-            let part = Part::new(&body, vec![0, 3]).expect("no patches");
-            let before = bent(&body);
-            let mut after = before.clone();
-            after[0] = [0.05, 0.1, -0.1];
-            after[3] = add(after[3], [0.1, 0.0, 0.05]);
-            let of_body = body.state(&after).expect("a state").energy
-                - body.state(&before).expect("a state").energy;
-            let of_part = part.state(&after).energy - part.state(&before).energy;
-            assert!((of_body - of_part).abs() < 1e-15, "{element:?}: {of_body} {of_part}");
-            assert!(of_part.abs() > 1e-6, "{element:?}: nothing changed");
-        }
-    }
-
-    #[test]
-    fn averaged_pressure_reaches_too_far() {
-        assert!(Part::new(&octahedron(Element::NodalPressure), vec![0]).is_none());
-    }
 }

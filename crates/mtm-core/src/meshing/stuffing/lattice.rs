@@ -178,7 +178,7 @@ impl Octree {
 }
 
 /// A position inside each of the 26 neighbouring cubes of the leaf's own size.
-fn neighbours(leaf: &Leaf) -> impl Iterator<Item = Place> + use<> {
+pub fn neighbours(leaf: &Leaf) -> impl Iterator<Item = Place> + use<> {
     let Leaf { origin, size, .. } = *leaf;
     (0..27).filter(|&d| d != 13).map(move |d| {
         let step = [d / 9 - 1, d / 3 % 3 - 1, d % 3 - 1];
@@ -297,28 +297,4 @@ fn key(place: Place) -> u64 {
 fn unpacked(key: u64) -> Place {
     let mask = (1_u64 << BITS) - 1;
     [key >> (2 * BITS), key >> BITS & mask, key & mask].map(|c| c as i32)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn balancing_splits_no_more_than_it_must() {
-        let mut tree = Octree::new([8, 8, 8], 2, &[true; 512]);
-        tree.refine([33, 33, 33], 2);
-        tree.balance();
-        let leaves = tree.leaves();
-        let count = |size| leaves.iter().filter(|leaf| leaf.size == size).count();
-        // One coarse cube becomes 7 cubes of half its size and 8 of a quarter; the cubes that touch the
-        // small ones across three of its faces, their edges and their corner are halved.
-        assert_eq!(count(2), 8);
-        assert_eq!(count(4), 7 + 7 * 8);
-        assert_eq!(count(8), 512 - 8);
-        for leaf in &leaves {
-            for place in neighbours(leaf) {
-                assert!(tree.leaf_at(place).is_none_or(|other| other.size <= 2 * leaf.size));
-            }
-        }
-    }
 }

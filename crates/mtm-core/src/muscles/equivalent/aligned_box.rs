@@ -3,12 +3,14 @@
 use crate::vector::Vec3;
 
 /// A box along the coordinate axes, mm; empty if `low` exceeds `high`.
+#[allow(missing_docs)]
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct AlignedBox {
+pub struct AlignedBox {
     pub low: Vec3,
     pub high: Vec3,
 }
 
+#[allow(missing_docs)]
 impl AlignedBox {
     pub const EMPTY: Self = Self {
         low: Vec3::new(f64::INFINITY, f64::INFINITY, f64::INFINITY),

@@ -30,7 +30,7 @@ pub enum InsideTest {
 
 /// Where a region lies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Side {
+pub enum Side {
     Inside,
     Outside,
     /// Possibly on both sides: next to a hole, a level of the winding number separates them, not a triangle.
@@ -39,7 +39,7 @@ pub(super) enum Side {
 
 /// A muscle's surface with the data for the inside tests.
 #[derive(Debug)]
-pub(super) struct MuscleShape<'a> {
+pub struct MuscleShape<'a> {
     surface: &'a Surface,
     corners: Vec<[Vec3; 3]>,
     boxes: Vec<AlignedBox>,
@@ -50,10 +50,11 @@ pub(super) struct MuscleShape<'a> {
     signed_volume: f64,
     /// −1 for a surface that is inside out, whose normals are reversed; otherwise 1.
     pub orientation: f64,
-    pub test: InsideTest,
+    pub(super) test: InsideTest,
 }
 
 impl<'a> MuscleShape<'a> {
+    /// Of `surface`, for `test`.
     pub fn new(surface: &'a Surface, test: InsideTest) -> Self {
         let n = surface.triangles().len();
         let corners: Vec<[Vec3; 3]> = (0..n).map(|t| surface.corners(t)).collect();
@@ -69,15 +70,15 @@ impl<'a> MuscleShape<'a> {
         Self { surface, corners, boxes, bounds, border, tree, signed_volume, orientation, test }
     }
 
-    pub fn n_triangles(&self) -> usize {
+    pub(super) fn n_triangles(&self) -> usize {
         self.corners.len()
     }
 
-    pub fn corners(&self, triangle: u32) -> &[Vec3; 3] {
+    pub(super) fn corners(&self, triangle: u32) -> &[Vec3; 3] {
         &self.corners[triangle as usize]
     }
 
-    pub fn triangle_box(&self, triangle: u32) -> &AlignedBox {
+    pub(super) fn triangle_box(&self, triangle: u32) -> &AlignedBox {
         &self.boxes[triangle as usize]
     }
 
