@@ -24,7 +24,7 @@ use std::time::Instant;
 
 use mtm_core::{
     BlockMatrix, CyclePrecision, MassTensors, Multigrid, MultigridOptions, Preconditioner,
-    SetUpPart, Symbolic, tet_tensor,
+    Symbolic, tet_tensor,
 };
 use rayon::prelude::*;
 use shell::Shell;
@@ -42,36 +42,29 @@ const LARGEST_FACTOR: usize = 6 << 30;
 struct Line {
     kernel: String,
     bytes: usize,
-    /// Additions and multiplications; 0 where they are not counted.
-    flops: usize,
     seconds: f64,
 }
 
 impl Line {
-    /// The line of a kernel whose operations are not counted.
     fn of(kernel: &str, bytes: usize, seconds: f64) -> Self {
-        Self { kernel: kernel.to_owned(), bytes, flops: 0, seconds }
+        Self { kernel: kernel.to_owned(), bytes, seconds }
     }
 }
 
 fn main() {
     let all = rayon::current_num_threads();
     println!(
-        "| tets | threads | bandwidth GB/s | kernel | MB moved | bound ms | time ms | ratio | Gflop/s |"
+        "| tets | threads | bandwidth GB/s | kernel | MB moved | bound ms | time ms | ratio |"
     );
-    println!("|---:|---:|---:|---|---:|---:|---:|---:|---:|");
+    println!("|---:|---:|---:|---|---:|---:|---:|---:|");
     for threads in if all == 1 { vec![1] } else { vec![1, all] } {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         let bandwidth = pool.install(stream_bandwidth);
         for n_tets in scene::sizes() {
             for line in pool.install(|| kernels(n_tets)) {
                 let bound = line.bytes as f64 / bandwidth;
-                let rate = match line.flops {
-                    0 => "–".to_owned(),
-                    flops => format!("{:.1}", 1e-9 * flops as f64 / line.seconds),
-                };
                 println!(
-                    "| {n_tets} | {threads} | {:.1} | {} | {:.1} | {:.3} | {:.3} | {:.1} | {rate} |",
+                    "| {n_tets} | {threads} | {:.1} | {} | {:.1} | {:.3} | {:.3} | {:.1} |",
                     1e-9 * bandwidth,
                     line.kernel,
                     1e-6 * line.bytes as f64,
@@ -118,32 +111,6 @@ fn median(mut call: impl FnMut()) -> f64 {
 fn middle(seconds: &mut [f64]) -> f64 {
     seconds.sort_by(f64::total_cmp);
     seconds[seconds.len() / 2]
-}
-
-/// A line for each part of the multigrid's set-up, and one for all of it.
-fn set_up_lines(set_up: impl Fn() -> Multigrid) -> Vec<Line> {
-    drop(set_up());
-    let mut whole = Vec::new();
-    let runs: Vec<Vec<SetUpPart>> = (0..REPEATS)
-        .map(|_| {
-            let begin = Instant::now();
-            let multigrid = set_up();
-            whole.push(begin.elapsed().as_secs_f64());
-            multigrid.set_up_parts().to_vec()
-        })
-        .collect();
-    let mut lines: Vec<Line> = (0..runs[0].len())
-        .map(|k| {
-            let mut seconds: Vec<f64> = runs.iter().map(|parts| parts[k].seconds).collect();
-            let SetUpPart { name, bytes, flops, .. } = runs[0][k];
-            Line { kernel: format!("set-up: {name}"), bytes, flops, seconds: middle(&mut seconds) }
-        })
-        .collect();
-    let sum = |of: fn(&Line) -> usize| lines.iter().map(of).sum();
-    let (bytes, flops) = (sum(|line| line.bytes), sum(|line| line.flops));
-    let kernel = "set-up of the multigrid".to_owned();
-    lines.push(Line { kernel, bytes, flops, seconds: middle(&mut whole) });
-    lines
 }
 
 fn matrix_bytes(a: &BlockMatrix) -> usize {
@@ -206,13 +173,6 @@ fn kernels(n_tets: usize) -> Vec<Line> {
         line(&format!("multigrid cycle, {name} precision"), bytes, seconds);
     }
 
-    let options =
-        MultigridOptions { precision: CyclePrecision::Single, ..MultigridOptions::default() };
-    lines.extend(set_up_lines(|| {
-        Multigrid::new(&matrix, &positions, &[], &options).expect("a held body")
-    }));
-
-    let mut line = |kernel: &str, bytes, seconds| lines.push(Line::of(kernel, bytes, seconds));
     let symbolic = Arc::new(Symbolic::new(&matrix, &[]).expect("an elimination order"));
     if symbolic.factor_bytes() <= LARGEST_FACTOR {
         let factored = || symbolic.factor(&matrix).expect("a held body");

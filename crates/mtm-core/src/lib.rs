@@ -112,7 +112,7 @@ pub use algebra::blocks::BlockMatrix;
 pub use algebra::cholesky::Symbolic;
 pub use algebra::krylov::{BlockJacobi, PcgOptions, PcgOutcome, Preconditioner, pcg};
 pub use algebra::memory::HugePages;
-pub use algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions, SetUpPart};
+pub use algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions};
 pub use algebra::pool;
 pub use boundary::{
     Against, Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment, TouchingPair,

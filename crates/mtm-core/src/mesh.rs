@@ -298,7 +298,8 @@ fn check_duplicates(tets: &[[u32; 4]], incident: &Incidence) -> Result<()> {
     }
 }
 
-fn signed_volume(nodes: &[[f64; 3]], tet: &[u32; 4]) -> f64 {
+/// Volume of a tet, mm³; negative if it is inverted.
+pub(crate) fn signed_volume(nodes: &[[f64; 3]], tet: &[u32; 4]) -> f64 {
     let x0 = nodes[tet[0] as usize];
     let [e1, e2, e3] = [1, 2, 3].map(|k| sub(nodes[tet[k] as usize], x0));
     dot(cross(e1, e2), e3) / 6.0

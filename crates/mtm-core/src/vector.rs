@@ -1,6 +1,15 @@
 //! Arithmetic of vectors in space: `[f64; 3]`, and nalgebra's type where a formula is more readable with it.
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
+
+/// Points per parallel task: enough to hide the cost of the hand-over.
+const POINTS_PER_TASK: usize = 64;
+
+/// `f` of each point, in their order; parallel.
+pub(crate) fn of_each<T: Send>(points: &[[f64; 3]], f: impl Fn([f64; 3]) -> T + Sync) -> Vec<T> {
+    points.par_iter().with_min_len(POINTS_PER_TASK).map(|&point| f(point)).collect()
+}
 
 /// A point or direction, mm or dimensionless.
 pub type Vec3 = Vector3<f64>;

@@ -1,11 +1,10 @@
 //! Motions that a plan prescribes: of a rigid segment, or of a surface whose vertices moved individually.
 
 use nalgebra::{Matrix3, Rotation2, Rotation3};
-use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::{Closest, Surface};
-use crate::vector::Vec3;
+use crate::vector::{Vec3, of_each};
 
 /// Largest entry by which RᵀR of a matrix that is to be read as a rigid motion may differ from I.
 ///
@@ -22,9 +21,6 @@ pub const BOTTOM_ROW_TOLERANCE: f64 = 1e-6;
 /// Far above what products and inverses of rotations accumulate, and so small that a point 1 m from the origin
 /// moves by only 1e-11 mm.
 const ROUNDING: f64 = 1e-14;
-
-/// Points per parallel task.
-const POINTS_PER_TASK: usize = 64;
 
 /// A rigid motion x' = R x + t.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -238,11 +234,7 @@ impl SurfaceMotion {
     /// that rotate differently, by the distance to the surface times the difference of R. Parallel; the result
     /// does not depend on the number of threads.
     pub fn displacement(&self, points: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        points
-            .par_iter()
-            .with_min_len(POINTS_PER_TASK)
-            .map(|&point| self.follow(point, &self.rest.closest_one(point)))
-            .collect()
+        of_each(points, |point| self.follow(point, &self.rest.closest_one(point)))
     }
 
     fn follow(&self, point: [f64; 3], closest: &Closest) -> [f64; 3] {

@@ -17,7 +17,7 @@ use crate::error::{ErrorKind, MtmError, Result, check_coordinates};
 use crate::geometry::topology::{NO_TRIANGLE, Topology};
 use crate::geometry::triangle::Feature;
 use crate::geometry::triangle::{self, Facet, TrianglePoint};
-use crate::vector::Vec3;
+use crate::vector::{Vec3, of_each};
 
 /// Angle between facet normals above which an edge is a crease, rad (60°): edges of boxes and teeth stay sharp,
 /// coarse round shapes stay smooth.
@@ -33,9 +33,6 @@ const BOUND_SLACK: f64 = 1.0 - 16.0 * f64::EPSILON;
 
 /// Length of a blended normal below which its direction is lost and the facet normal is used instead.
 const NORMAL_CANCELLED: f64 = 1e-6;
-
-/// Points per parallel task: enough to hide the cost of the hand-over.
-const POINTS_PER_TASK: usize = 64;
 
 /// Triangles per parallel task.
 const TRIANGLES_PER_TASK: usize = 1024;
@@ -189,11 +186,7 @@ impl Surface {
     ///
     /// Parallel; the result does not depend on the number of threads.
     pub fn closest(&self, points: &[[f64; 3]]) -> Vec<Closest> {
-        points
-            .par_iter()
-            .with_min_len(POINTS_PER_TASK)
-            .map(|&point| self.closest_one(point))
-            .collect()
+        of_each(points, |point| self.closest_one(point))
     }
 
     /// Closest point of the surface to `point` (mm, finite).

@@ -1,5 +1,6 @@
 //! How the triangles of a surface are connected: edges, neighbours, border, smoothing groups.
 
+use crate::geometry::forest::Forest;
 use crate::vector::Vec3;
 use rayon::prelude::*;
 
@@ -67,7 +68,7 @@ impl Topology {
         let mut neighbours = vec![[NO_TRIANGLE; 3]; triangles.len()];
         let mut on_border = vec![[false; 3]; triangles.len()];
         let mut border_vertex = vec![false; n_vertices];
-        let mut joints = CornerJoints::new(triangles.len());
+        let mut joints = Forest::new(3 * triangles.len());
         let (mut is_closed, mut is_consistently_oriented) = (true, true);
         let smooth_cosine = crease_angle.cos() - CREASE_ROUNDING;
         for run in sides.chunk_by(|a, b| a.edge == b.edge) {
@@ -99,7 +100,7 @@ impl Topology {
             }
         }
 
-        let (groups, group_vertex, group_triangle) = joints.groups(&triangles);
+        let (groups, group_vertex, group_triangle) = corner_groups(joints, &triangles);
         Self {
             triangles,
             edges,
@@ -133,54 +134,31 @@ impl TriangleSide {
     }
 
     /// Corner number `3 * triangle + k` at the start (0) or end (1) of the side.
-    fn corner(&self, end: u32) -> u32 {
-        3 * self.triangle + (u32::from(self.k) + end) % 3
+    fn corner(&self, end: usize) -> usize {
+        3 * self.triangle as usize + (usize::from(self.k) + end) % 3
     }
 }
 
-/// Disjoint sets of corners (union-find with path halving; the smallest corner is the root).
-struct CornerJoints {
-    parent: Vec<u32>,
-}
-
-impl CornerJoints {
-    fn new(n_triangles: usize) -> Self {
-        Self { parent: (0..3 * n_triangles as u32).collect() }
-    }
-
-    fn root(&mut self, mut corner: u32) -> u32 {
-        while self.parent[corner as usize] != corner {
-            let above = self.parent[self.parent[corner as usize] as usize];
-            self.parent[corner as usize] = above;
-            corner = above;
+/// Group of each corner, numbered by first corner; vertex and first triangle of each group.
+fn corner_groups(
+    mut joints: Forest,
+    triangles: &[[u32; 3]],
+) -> (Vec<[u32; 3]>, Vec<u32>, Vec<u32>) {
+    let mut groups = vec![[0; 3]; triangles.len()];
+    let (mut group_vertex, mut group_triangle) = (Vec::new(), Vec::new());
+    for (t, triangle) in triangles.iter().enumerate() {
+        for k in 0..3 {
+            let corner = 3 * t + k;
+            let root = joints.root(corner);
+            // The root is the smallest corner of its set, so it was numbered before.
+            groups[t][k] = if root == corner {
+                group_vertex.push(triangle[k]);
+                group_triangle.push(t as u32);
+                group_vertex.len() as u32 - 1
+            } else {
+                groups[root / 3][root % 3]
+            };
         }
-        corner
     }
-
-    fn join(&mut self, a: u32, b: u32) {
-        let (a, b) = (self.root(a), self.root(b));
-        let (low, high) = if a < b { (a, b) } else { (b, a) };
-        self.parent[high as usize] = low;
-    }
-
-    /// Group of each corner, numbered by first corner; vertex and first triangle of each group.
-    fn groups(mut self, triangles: &[[u32; 3]]) -> (Vec<[u32; 3]>, Vec<u32>, Vec<u32>) {
-        let mut groups = vec![[0; 3]; triangles.len()];
-        let (mut group_vertex, mut group_triangle) = (Vec::new(), Vec::new());
-        for (t, triangle) in triangles.iter().enumerate() {
-            for k in 0..3 {
-                let corner = (3 * t + k) as u32;
-                let root = self.root(corner);
-                // The root is the smallest corner of its set, so it was numbered before.
-                groups[t][k] = if root == corner {
-                    group_vertex.push(triangle[k]);
-                    group_triangle.push(t as u32);
-                    group_vertex.len() as u32 - 1
-                } else {
-                    groups[root as usize / 3][root as usize % 3]
-                };
-            }
-        }
-        (groups, group_vertex, group_triangle)
-    }
+    (groups, group_vertex, group_triangle)
 }

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, Result};
 use crate::geometry::surface::Surface;
-use crate::vector::Vec3;
+use crate::vector::{Vec3, of_each};
 
 /// Number of triangles below which a cluster is not split: one pass over them costs about as much as two far
 /// fields.
@@ -16,9 +16,6 @@ const LEAF_TRIANGLES: usize = 8;
 /// Range of the real part of a product of half-angles within which another factor may be multiplied: positive,
 /// and far from overflow and underflow.
 const PRODUCT_RANGE: std::ops::Range<f64> = 1e-100..1e100;
-
-/// Points per parallel task.
-const POINTS_PER_TASK: usize = 64;
 
 /// How far away a cluster of triangles must be to be replaced by its expansion.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -112,11 +109,7 @@ impl WindingTree {
     /// surface itself, the mean of both sides or the value of either. Parallel; the result does not depend on
     /// the number of threads.
     pub fn winding_number(&self, points: &[[f64; 3]]) -> Vec<f64> {
-        points
-            .par_iter()
-            .with_min_len(POINTS_PER_TASK)
-            .map(|&point| self.winding_number_one(point))
-            .collect()
+        of_each(points, |point| self.winding_number_one(point))
     }
 
     /// Winding number at `point` (mm, finite).
@@ -164,14 +157,11 @@ impl WindingTree {
 pub fn winding_number_exact(surface: &Surface, points: &[[f64; 3]]) -> Vec<f64> {
     let n = surface.triangles().len();
     let triangles: Vec<Sheet> = (0..n).map(|t| Sheet::new(surface.corners(t))).collect();
-    points
-        .par_iter()
-        .map(|&point| {
-            let mut sum = SolidAngle::new();
-            sum.add(&Vec3::from(point), &triangles);
-            sum.total() / (4.0 * PI)
-        })
-        .collect()
+    of_each(points, |point| {
+        let mut sum = SolidAngle::new();
+        sum.add(&Vec3::from(point), &triangles);
+        sum.total() / (4.0 * PI)
+    })
 }
 
 /// Triangles of one cluster, and where the depth-first walk continues after it.

@@ -85,17 +85,7 @@ fn ascending(a: u32, b: u32) -> [u32; 2] {
 fn sides(mesh: &TetMesh, surface: &Surface, heights: &[Option<f64>]) -> Vec<i8> {
     let side = |tet: &[u32; 4]| {
         let known = tet.iter().filter_map(|&j| heights.get(j as usize).copied().flatten());
-        let sum: i8 = known
-            .map(|h| {
-                if h > 0.0 {
-                    1
-                } else if h < 0.0 {
-                    -1
-                } else {
-                    0
-                }
-            })
-            .sum();
+        let sum: i8 = known.map(|h| i8::from(h > 0.0) - i8::from(h < 0.0)).sum();
         if sum != 0 {
             return sum.signum();
         }
@@ -105,13 +95,7 @@ fn sides(mesh: &TetMesh, surface: &Surface, heights: &[Option<f64>]) -> Vec<i8> 
         let apart = x.iter().flat_map(|&p| x.iter().map(move |&q| norm(sub(p, q))));
         let longest = apart.fold(0.0, f64::max);
         match height(surface, centroid) {
-            Some(h) if h.abs() < longest => {
-                if h > 0.0 {
-                    1
-                } else {
-                    -1
-                }
-            }
+            Some(h) if h.abs() < longest => i8::from(h > 0.0) - i8::from(h <= 0.0),
             _ => 0,
         }
     };
@@ -165,8 +149,7 @@ fn double(
         for p in 1..parts {
             let copy = (mesh.n_nodes() + copied.len()) as u32;
             copied.push(node as u32);
-            for (i, &t) in star.iter().enumerate().filter(|(i, _)| part[*i] == p) {
-                debug_assert_eq!(star[i], t);
+            for (_, &t) in star.iter().enumerate().filter(|(i, _)| part[*i] == p) {
                 for v in tets[t as usize].iter_mut().filter(|v| **v as usize == node) {
                     *v = copy;
                 }

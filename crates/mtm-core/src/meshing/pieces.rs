@@ -4,6 +4,7 @@
 //! than once are runs, not voxels.
 
 use super::stuffing::level::Grid;
+use crate::geometry::forest::Forest;
 
 /// The voxels that make two of them one piece.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,10 +38,10 @@ pub fn pieces(grid: &Grid, inside: &[bool], joined: Joined) -> Pieces {
     let mut runs: Vec<Run> = Vec::new();
     // The runs of line (i, j) are starts[i ny + j]..starts[i ny + j + 1].
     let mut starts = vec![0; nx * ny + 1];
-    let mut parents: Vec<usize> = Vec::new();
+    let mut forest = Forest::default();
     for (line, voxels) in inside.chunks(nz).enumerate() {
         add_runs(voxels, &mut runs);
-        parents.extend(parents.len()..runs.len());
+        forest.grow(runs.len());
         starts[line + 1] = runs.len();
         let (i, j) = (line / ny, line % ny);
         let before = |di: usize, j: usize| (i >= di && j < ny).then(|| (i - di) * ny + j);
@@ -57,10 +58,10 @@ pub fn pieces(grid: &Grid, inside: &[bool], joined: Joined) -> Pieces {
         let reach = usize::from(joined == Joined::Corners);
         for other in near.into_iter().flatten() {
             let ends = (starts[line]..runs.len(), starts[other]..starts[other + 1]);
-            join_lines(&runs, ends, reach, &mut parents);
+            join_lines(&runs, ends, reach, &mut forest);
         }
     }
-    numbered(&runs, &starts, &mut parents, nz)
+    numbered(&runs, &starts, &mut forest, nz)
 }
 
 /// Adds the runs of one line.
@@ -78,7 +79,7 @@ fn join_lines(
     runs: &[Run],
     (mine, theirs): (std::ops::Range<usize>, std::ops::Range<usize>),
     reach: usize,
-    parents: &mut [usize],
+    forest: &mut Forest,
 ) {
     let (mut a, mut b) = (mine.start, theirs.start);
     while a < mine.end && b < theirs.end {
@@ -87,7 +88,7 @@ fn join_lines(
         } else if runs[b].past + reach <= runs[a].first {
             b += 1;
         } else {
-            join(parents, a, b);
+            forest.join(a, b);
             if runs[a].past < runs[b].past {
                 a += 1;
             } else {
@@ -97,27 +98,12 @@ fn join_lines(
     }
 }
 
-/// The first run of a piece; the ways there are halved.
-fn root(parents: &mut [usize], mut run: usize) -> usize {
-    while parents[run] != run {
-        parents[run] = parents[parents[run]];
-        run = parents[run];
-    }
-    run
-}
-
-/// Makes the piece whose first run comes later a part of the other.
-fn join(parents: &mut [usize], a: usize, b: usize) {
-    let (a, b) = (root(parents, a), root(parents, b));
-    parents[a.max(b)] = a.min(b);
-}
-
 /// The pieces numbered in the order of their first runs.
-fn numbered(runs: &[Run], starts: &[usize], parents: &mut [usize], nz: usize) -> Pieces {
+fn numbered(runs: &[Run], starts: &[usize], forest: &mut Forest, nz: usize) -> Pieces {
     let mut numbers = vec![0_i32; runs.len()];
     let mut sizes = vec![0];
     for (run, Run { first, past }) in runs.iter().enumerate() {
-        let first_run = root(parents, run);
+        let first_run = forest.root(run);
         if first_run == run {
             numbers[run] = sizes.len() as i32;
             sizes.push(0);

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::registration::spread::{check_coordinates, check_count, check_not_in_plane, extents};
-use crate::vector::Vec3;
+use crate::vector::{Vec3, of_each};
 
 /// Number of landmarks that a spline needs: four that are not coplanar determine its affine part.
 pub const LEAST_LANDMARKS: usize = 4;
@@ -150,11 +150,7 @@ impl ThinPlateSpline {
     pub fn jacobian(&self, points: &[[f64; 3]]) -> Result<Vec<[[f64; 3]; 3]>> {
         check_coordinates("points", points)?;
         let rows = |j: Matrix3<f64>| std::array::from_fn(|i| std::array::from_fn(|k| j[(i, k)]));
-        Ok(points
-            .par_iter()
-            .with_min_len(POINTS_PER_TASK)
-            .map(|&point| rows(self.derivative(point)))
-            .collect())
+        Ok(of_each(points, |point| rows(self.derivative(point))))
     }
 
     /// Determinants of the Jacobian at `points` (mm), and where they are zero or less.
@@ -163,13 +159,7 @@ impl ThinPlateSpline {
     /// Those of [`ThinPlateSpline::warp`].
     pub fn folds(&self, points: &[[f64; 3]]) -> Result<Folds> {
         check_coordinates("points", points)?;
-        Ok(Folds::new(
-            points
-                .par_iter()
-                .with_min_len(POINTS_PER_TASK)
-                .map(|&point| self.derivative(point).determinant())
-                .collect(),
-        ))
+        Ok(Folds::new(of_each(points, |point| self.derivative(point).determinant())))
     }
 
     /// Smallest determinant of the Jacobian in the limit at each landmark, over all directions of approach.

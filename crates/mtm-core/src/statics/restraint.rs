@@ -6,6 +6,7 @@
 use nalgebra::{DMatrix, Matrix6, SMatrix, SymmetricEigen, Vector3, Vector6};
 
 use crate::error::{MtmError, Result};
+use crate::geometry::forest::Forest;
 use crate::mesh::TetMesh;
 use crate::vector::{cross, dot, norm, scaled, sub};
 
@@ -212,34 +213,22 @@ fn touching(
     open: &[usize],
     grounded: &[bool],
 ) -> Vec<Vec<usize>> {
-    let mut chain_of: Vec<usize> = (0..open.len()).collect();
+    let mut forest = Forest::new(open.len());
     let mut owner: Vec<Option<usize>> = vec![None; mesh.n_nodes()];
     for (at, &p) in open.iter().enumerate() {
         for &j in parts[p].nodes.iter().filter(|&&j| !grounded[j as usize]) {
             match owner[j as usize] {
                 None => owner[j as usize] = Some(at),
-                Some(other) => {
-                    let (a, b) = (root(&mut chain_of, at), root(&mut chain_of, other));
-                    chain_of[a.max(b)] = a.min(b);
-                }
+                Some(other) => forest.join(at, other),
             }
         }
     }
     let mut chains: Vec<Vec<usize>> = vec![Vec::new(); open.len()];
     for (at, &p) in open.iter().enumerate() {
-        chains[root(&mut chain_of, at)].push(p);
+        chains[forest.root(at)].push(p);
     }
     chains.retain(|chain| !chain.is_empty());
     chains
-}
-
-/// The smallest member of the chain of `i`, halving paths on the way.
-fn root(chain_of: &mut [usize], mut i: usize) -> usize {
-    while chain_of[i] != i {
-        chain_of[i] = chain_of[chain_of[i]];
-        i = chain_of[i];
-    }
-    i
 }
 
 /// Whether parts that share nodes constrain each other: six unknowns per part, equal motion at shared nodes.

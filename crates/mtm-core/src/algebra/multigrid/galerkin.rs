@@ -35,13 +35,6 @@ struct BlockPlace {
     is_below: bool,
 }
 
-impl CoarseMatrix {
-    /// Operations of the product.
-    pub(super) fn flops(&self) -> usize {
-        self.upper.iter().map(|rows| rows.flops).sum()
-    }
-}
-
 impl SystemRows<MODES> for CoarseMatrix {
     fn row_start(&self) -> &[usize] {
         &self.row_start
@@ -94,7 +87,6 @@ struct UpperRows {
     lengths: Vec<usize>,
     columns: Vec<u32>,
     blocks: Vec<ModeBlock>,
-    flops: usize,
 }
 
 /// A sparse column of R×6 blocks that is being summed.
@@ -162,14 +154,11 @@ impl<const N: usize, A: SystemRows<N>> Kernel for Product<'_, N, A> {
             lengths: Vec::with_capacity(rows.len()),
             columns: Vec::new(),
             blocks: Vec::new(),
-            flops: 0,
         };
-        let (mut fine_products, mut coarse_products) = (0, 0);
         for coarse in rows {
             for t in transposed.start[coarse]..transposed.start[coarse + 1] {
                 let i = transposed.rows[t] as usize;
                 let block = &p.blocks[transposed.positions[t] as usize];
-                fine_products += row_start[i + 1] - row_start[i];
                 for k in row_start[i]..row_start[i + 1] {
                     add_transposed_product(images.at(columns[k]), &a.block(k), block);
                 }
@@ -178,7 +167,6 @@ impl<const N: usize, A: SystemRows<N>> Kernel for Product<'_, N, A> {
                 for l in p.row_start[j as usize]..p.row_start[j as usize + 1] {
                     let column = p.columns[l];
                     if column as usize >= coarse {
-                        coarse_products += 1;
                         add_transposed_product(products.at(column), image, &p.blocks[l]);
                     }
                 }
@@ -193,7 +181,6 @@ impl<const N: usize, A: SystemRows<N>> Kernel for Product<'_, N, A> {
             images.clear();
             products.clear();
         }
-        upper.flops = 2 * MODES * N * (N * fine_products + MODES * coarse_products);
         upper.blocks = blocks.clone();
         upper
     }

@@ -11,7 +11,6 @@ use super::block_rows::SystemRows;
 use super::coarsest::DenseCholesky;
 use super::galerkin::{CoarseMatrix, galerkin};
 use super::options::MultigridOptions;
-use super::parts::Parts;
 use super::precision::{Precision, Real};
 use super::prolongator::Prolongator;
 use super::rigid_modes::{MODES, ModeBlock, orthonormalise};
@@ -45,28 +44,25 @@ impl<P: Precision> Hierarchy<P> {
         scaling: &Scaling<3>,
         modes: Vec<[[f64; MODES]; 3]>,
         options: &MultigridOptions,
-        parts: &mut Parts,
     ) -> Self {
-        let direct = |rows: usize| rows <= options.coarsest_rows;
         let mut coarse = Vec::new();
         let mut coarsest = None;
-        let (finest, mut next) = Level::new(a, scaling, modes, (options, 0), parts);
+        let (finest, mut next) = Level::new(a, scaling, modes, (options, 0));
         while let Some(mut system) = next {
             let depth = coarse.len() + 1;
             let rows = system.a.n_rows();
-            if direct(rows) || depth + 1 >= options.max_levels {
+            if rows <= options.coarsest_rows || depth + 1 >= options.max_levels {
                 if rows <= DENSE_LIMIT {
-                    coarsest = Some(system.factor(parts));
+                    coarsest = Some(DenseCholesky::new(&system.a, &system.scaling));
                 } else {
-                    coarse.push(Level::lone(&system.a, &system.scaling, parts));
+                    coarse.push(Level::lone(&system.a, &system.scaling));
                 }
                 break;
             }
             let modes = std::mem::take(&mut system.modes);
-            let (level, after) =
-                Level::new(&system.a, &system.scaling, modes, (options, depth), parts);
+            let (level, after) = Level::new(&system.a, &system.scaling, modes, (options, depth));
             if after.is_none() && rows <= DENSE_LIMIT {
-                coarsest = Some(system.factor(parts));
+                coarsest = Some(DenseCholesky::new(&system.a, &system.scaling));
                 break;
             }
             coarse.push(level);
@@ -200,16 +196,6 @@ struct CoarseSystem {
     modes: Vec<ModeBlock>,
 }
 
-impl CoarseSystem {
-    /// The dense factor of this system, as the coarsest one.
-    fn factor(&self, parts: &mut Parts) -> DenseCholesky {
-        let factor = || DenseCholesky::new(&self.a, &self.scaling);
-        parts.timed("coarsest factor", factor, |made| {
-            (8 * made.size * made.size, made.size * made.size * made.size / 3)
-        })
-    }
-}
-
 /// A level of the cycle and the transfer to the next coarser one, if there is one.
 #[derive(Debug)]
 struct Level<const N: usize, P: Precision> {
@@ -228,16 +214,8 @@ fn scale_modes<const N: usize>(modes: &mut [[[f64; MODES]; N]], scaling: &Scalin
 
 impl<const N: usize, P: Precision> Level<N, P> {
     /// The level without a coarser one.
-    fn lone(a: &impl SystemRows<N>, scaling: &Scaling<N>, parts: &mut Parts) -> Self {
-        let read = a.columns().len() * (4 + 8 * N * N) + a.n_rows() * 8 * N * N;
-        let mut matrix = parts.timed(
-            "scaled matrix",
-            || ScaledMatrix::new(a, scaling),
-            |made| (read + made.memory_bytes(), 4 * N * N * N * made.columns.len()),
-        );
-        let cost = matrix.eigenvalue_cost();
-        parts.timed("largest eigenvalue", || matrix.find_largest_eigenvalue(), |()| cost);
-        Self { matrix, transfer: None }
+    fn lone(a: &impl SystemRows<N>, scaling: &Scaling<N>) -> Self {
+        Self { matrix: ScaledMatrix::new(a, scaling), transfer: None }
     }
 
     /// The level and the system below it, if there is one.
@@ -246,58 +224,24 @@ impl<const N: usize, P: Precision> Level<N, P> {
         scaling: &Scaling<N>,
         mut modes: Vec<[[f64; MODES]; N]>,
         (options, depth): (&MultigridOptions, usize),
-        parts: &mut Parts,
     ) -> (Self, Option<CoarseSystem>) {
-        let mut level = Self::lone(a, scaling, parts);
+        let mut level = Self::lone(a, scaling);
         let matrix = &level.matrix;
         let strength = options.strength * 0.5_f64.powi(depth.try_into().unwrap_or(i32::MAX));
-        let aggregates = parts.timed(
-            "strength and aggregates",
-            || Aggregates::new(matrix, strength),
-            |_| {
-                (matrix.memory_bytes() + 8 * matrix.columns.len(), 2 * N * N * matrix.columns.len())
-            },
-        );
+        let aggregates = Aggregates::new(matrix, strength);
         if aggregates.count == 0 || aggregates.count as f64 > STALL * matrix.n_rows() as f64 {
             return (level, None);
         }
-        let mode_bytes = 8 * N * MODES * modes.len();
-        let coarse_modes = parts.timed(
-            "tentative prolongator",
-            || {
-                scale_modes(&mut modes, scaling);
-                orthonormalise(&aggregates, &mut modes)
-            },
-            |_| (4 * mode_bytes, 0),
-        );
+        scale_modes(&mut modes, scaling);
+        let coarse_modes = orthonormalise(&aggregates, &mut modes);
         let damping = options.prolongator_damping / matrix.largest_eigenvalue;
-        let p = parts.timed(
-            "smoothed prolongator",
-            || Prolongator::smoothed(matrix, &aggregates, &modes, damping, scaling),
-            |p| {
-                let flops = 2 * MODES * N * N * (matrix.columns.len() + p.columns.len());
-                (matrix.memory_bytes() + mode_bytes + p.memory_bytes(), flops)
-            },
-        );
+        let p = Prolongator::smoothed(matrix, &aggregates, &modes, damping, scaling);
         drop(modes);
-        let p_bytes = p.memory_bytes();
-        let transposed = parts.timed(
-            "transposed pattern",
-            || p.transposed(),
-            |t| (4 * p.columns.len() + 8 * t.positions.len(), 0),
-        );
-        let a_bytes = a.columns().len() * (4 + 8 * N * N);
-        let coarse = parts.timed(
-            "Galerkin product",
-            || galerkin(a, &p, &transposed),
-            |coarse| (a_bytes + p_bytes + coarse.columns.len() * 8 * MODES * MODES, coarse.flops()),
-        );
+        let transposed = p.transposed();
+        let coarse = galerkin(a, &p, &transposed);
         let coarse_scaling = Scaling::new(&coarse);
-        level.transfer = Some(parts.timed(
-            "transfer",
-            || Transfer::new(p, transposed, scaling, &coarse_scaling, level.matrix.rows_per_task),
-            |made| (p_bytes + made.memory_bytes(), 0),
-        ));
+        let rows = level.matrix.rows_per_task;
+        level.transfer = Some(Transfer::new(p, transposed, scaling, &coarse_scaling, rows));
         let system = CoarseSystem { a: coarse, scaling: coarse_scaling, modes: coarse_modes };
         (level, Some(system))
     }

@@ -16,7 +16,6 @@ mod coarsest;
 mod galerkin;
 mod hierarchy;
 mod options;
-mod parts;
 mod precision;
 mod prolongator;
 mod rigid_modes;
@@ -33,11 +32,9 @@ use crate::error::{ErrorKind, MtmError, Result};
 
 use hierarchy::Hierarchy;
 pub use options::MultigridOptions;
-use parts::Parts;
-pub use parts::SetUpPart;
 pub use precision::CyclePrecision;
 use precision::{Double, Single};
-use rigid_modes::{MODES, rigid_modes};
+use rigid_modes::rigid_modes;
 use scaling::Scaling;
 
 /// A symmetric positive definite multigrid cycle for one [`BlockMatrix`].
@@ -49,7 +46,6 @@ pub struct Multigrid {
     /// S of the finest level: r̃ = S r, z = Sᵀ z̃.
     scaling: Vec<[[f64; 3]; 3]>,
     levels: Levels,
-    parts: Vec<SetUpPart>,
 }
 
 /// The levels in either precision.
@@ -94,14 +90,8 @@ impl Multigrid {
         normals: &[(usize, [f64; 3])],
         options: &MultigridOptions,
     ) -> Result<Self> {
-        let mut parts = Parts::default();
-        let modes = parts.timed(
-            "rigid modes",
-            || rigid_modes(nodes, normals),
-            |modes| (24 * nodes.len() + 24 * MODES * modes.len(), 0),
-        );
-        let scaling =
-            parts.timed("scaling", || Scaling::new(a), |made| (3 * 72 * made.factors.len(), 0));
+        let modes = rigid_modes(nodes, normals);
+        let scaling = Scaling::new(a);
         if let Some(node) = scaling.not_positive {
             return Err(MtmError::NotPositiveDefinite {
                 node,
@@ -109,19 +99,10 @@ impl Multigrid {
             });
         }
         let levels = match options.precision {
-            CyclePrecision::Double => {
-                Levels::Double(Hierarchy::new(a, &scaling, modes, options, &mut parts))
-            }
-            CyclePrecision::Single => {
-                Levels::Single(Hierarchy::new(a, &scaling, modes, options, &mut parts))
-            }
+            CyclePrecision::Double => Levels::Double(Hierarchy::new(a, &scaling, modes, options)),
+            CyclePrecision::Single => Levels::Single(Hierarchy::new(a, &scaling, modes, options)),
         };
-        Ok(Self { scaling: scaling.inverse_factors, levels, parts: parts.into_vec() })
-    }
-
-    /// What the parts of the set-up cost, over all levels.
-    pub fn set_up_parts(&self) -> &[SetUpPart] {
-        &self.parts
+        Ok(Self { scaling: scaling.inverse_factors, levels })
     }
 
     /// Number of rows of each level, the finest first.

@@ -70,10 +70,6 @@ impl<const N: usize> Prolongator<N> {
         Self { row_start, columns, blocks, n_coarse: aggregates.count }
     }
 
-    pub(super) fn memory_bytes(&self) -> usize {
-        self.row_start.len() * 8 + self.columns.len() * (4 + 8 * MODES * N)
-    }
-
     /// Positions of the blocks of Pᵀ in P.
     pub(super) fn transposed(&self) -> TransposedIndex {
         let mut sizes = vec![0; self.n_coarse];

@@ -38,7 +38,7 @@ impl<const N: usize, T: Stored> ScaledMatrix<N, T> {
         self.row_start.len() * 8 + self.columns.len() * (4 + size_of::<T>() * N * N)
     }
 
-    /// The system `a`, scaled; its largest eigenvalue is not known yet.
+    /// The system `a`, scaled.
     pub(super) fn new(a: &impl SystemRows<N>, scaling: &Scaling<N>) -> Self {
         let row_start = a.row_start().to_vec();
         let entries = a.columns().len() * N * N;
@@ -49,7 +49,9 @@ impl<const N: usize, T: Stored> ScaledMatrix<N, T> {
         split_rows(&mut blocks, &row_start, rows_per_task)
             .into_par_iter()
             .for_each(|part| widest(ScaledRows { a, s, part }));
-        Self { row_start, columns, blocks, largest_eigenvalue: 1.0, rows_per_task }
+        let mut out = Self { row_start, columns, blocks, largest_eigenvalue: 1.0, rows_per_task };
+        out.largest_eigenvalue = EIGENVALUE_SAFETY * out.estimate_eigenvalue();
+        out
     }
 
     /// Row `i` of A x.
@@ -65,33 +67,13 @@ impl<const N: usize, T: Stored> ScaledMatrix<N, T> {
         self.blocks[k].map(|column| column.map(|v| v.raw::<f64>() * (1.0 / T::ONE)))
     }
 
-    /// Estimates the largest eigenvalue, with a margin.
-    pub(super) fn find_largest_eigenvalue(&mut self) {
-        self.largest_eigenvalue = EIGENVALUE_SAFETY * self.estimate_eigenvalue();
-    }
-
-    /// Traffic and operations of [`find_largest_eigenvalue`](Self::find_largest_eigenvalue).
-    pub(super) fn eigenvalue_cost(&self) -> (usize, usize) {
-        // Four vectors are read or written by the product and three by the sums.
-        let vectors = 7 * 8 * N * self.n_rows();
-        let step = (self.memory_bytes() + vectors, 2 * N * N * self.columns.len());
-        (LANCZOS_STEPS * step.0, LANCZOS_STEPS * step.1)
-    }
-
     /// Largest eigenvalue of the scaled matrix by a few Lanczos steps from a fixed start.
     fn estimate_eigenvalue(&self) -> f64 {
         let n = self.n_rows();
-        let mut v: Vec<[f64; N]> = (0..n)
-            .map(|j| {
-                let mut row = [0.0; N];
-                for (c, value) in row.iter_mut().enumerate() {
-                    // Golden-ratio sequence: equidistributed, and the same on every machine.
-                    let t = ((j * N + c + 1) as f64 * 0.618_033_988_749_895).fract();
-                    *value = t - 0.5;
-                }
-                row
-            })
-            .collect();
+        // Golden-ratio sequence: equidistributed, and the same on every machine.
+        let at = |k: usize| (k as f64 * 0.618_033_988_749_895).fract() - 0.5;
+        let mut v: Vec<[f64; N]> =
+            (0..n).map(|j| std::array::from_fn(|c| at(j * N + c + 1))).collect();
         let mut previous = vec![[0.0; N]; n];
         let mut w = vec![[0.0; N]; n];
         let mut norm = dot(&v, &v).sqrt();

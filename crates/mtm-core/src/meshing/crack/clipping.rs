@@ -3,8 +3,8 @@
 use std::collections::HashMap;
 
 use crate::mesh::FACES;
-use crate::meshing::stuffing::cut::pairs;
-use crate::vector::{cross, dot, sub, towards};
+use crate::meshing::stuffing::cut::{pairs, positive};
+use crate::vector::towards;
 
 use super::ascending;
 
@@ -30,9 +30,8 @@ struct Corners<'a> {
 /// without knowing of each other (Dompierre et al. 1999).
 pub fn clip(tets: &[[u32; 4]], heights: &[Option<f64>], nodes: &mut Vec<[f64; 3]>) -> Clipped {
     let sign = |j: u32| match heights[j as usize] {
-        Some(h) if h > 0.0 => 1,
-        Some(h) if h < 0.0 => -1,
-        _ => 0,
+        Some(h) => i8::from(h > 0.0) - i8::from(h < 0.0),
+        None => 0,
     };
     let (mut out, mut parents) = (Vec::with_capacity(tets.len()), Vec::new());
     let mut on_edges: HashMap<[u32; 2], u32> = HashMap::new();
@@ -71,7 +70,7 @@ impl Corners<'_> {
             let first = (0..face.len()).min_by_key(|&i| face[i]).unwrap_or(0);
             let at = |i: usize| face[(first + i) % face.len()];
             for i in 1..face.len() - 1 {
-                out.push(positive([apex, at(0), at(i), at(i + 1)], nodes));
+                out.push(positive([apex, at(0), at(i), at(i + 1)], |v| nodes[v as usize]));
             }
         }
     }
@@ -111,11 +110,4 @@ impl Corners<'_> {
         }
         self.on_edges.get(&ascending(self.tet[a], self.tet[b])).copied()
     }
-}
-
-/// The tet with two corners exchanged if its volume is negative.
-fn positive(tet: [u32; 4], nodes: &[[f64; 3]]) -> [u32; 4] {
-    let [o, a, b, c] = tet.map(|j| nodes[j as usize]);
-    let volume = dot(cross(sub(a, o), sub(b, o)), sub(c, o));
-    if volume < 0.0 { [tet[0], tet[1], tet[3], tet[2]] } else { tet }
 }

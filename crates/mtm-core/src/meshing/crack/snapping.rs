@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::geometry::surface::Surface;
 use crate::mesh::TetMesh;
 use crate::meshing::stuffing::cut::{pairs, shape};
-use crate::vector::{norm, sub, towards};
+use crate::vector::{norm, of_each, sub, towards};
 
 use super::ascending;
 use super::height;
@@ -22,8 +22,7 @@ const ROUNDING: f64 = 1e-9;
 /// Moves `nodes` of `mesh` onto the surface where this keeps the shape of their tets; returns the height of each
 /// above the surface, mm: 0 on it, none outside its rim.
 pub fn snap(mesh: &TetMesh, surface: &Surface, nodes: &mut [[f64; 3]]) -> Vec<Option<f64>> {
-    let mut heights: Vec<Option<f64>> =
-        nodes.par_iter().with_min_len(256).map(|&x| height(surface, x)).collect();
+    let mut heights = of_each(nodes, |x| height(surface, x));
     forget_around_rim(mesh, &mut heights);
     let boundary = BoundaryEdges::new(mesh);
     for (near, least) in PASSES {

@@ -6,6 +6,7 @@
 
 use rayon::prelude::*;
 
+use crate::mesh::{FACES, Incidence};
 use crate::vector::{add, cross, dot, norm, scaled, sub};
 
 use super::lattice::{Lattice, Place};
@@ -83,11 +84,8 @@ impl<'a> Crossings<'a> {
             .collect();
         let signs: Vec<i8> = positions
             .par_iter()
-            .map(|&x| match level.value(x) {
-                v if v > 0.0 => 1,
-                v if v < 0.0 => -1,
-                _ => 0,
-            })
+            .map(|&x| level.value(x))
+            .map(|v| i8::from(v > 0.0) - i8::from(v < 0.0))
             .collect();
         let mut keys: Vec<u64> = lattice
             .tets
@@ -125,23 +123,10 @@ impl<'a> Crossings<'a> {
     /// Moves vertices to the nearest crossing that is too close, one after another in their order.
     fn snap(&mut self) {
         let n = self.signs.len();
-        let mut start = vec![0_u32; n + 1];
-        for &v in self.edges.iter().flatten() {
-            start[v as usize + 1] += 1;
-        }
+        let at_vertex = Incidence::new(n, &self.edges);
         for v in 0..n {
-            start[v + 1] += start[v];
-        }
-        let mut next = start.clone();
-        let mut at_vertex = vec![0_u32; 2 * self.edges.len()];
-        for (edge, ends) in self.edges.iter().enumerate() {
-            for &v in ends {
-                at_vertex[next[v as usize] as usize] = edge as u32;
-                next[v as usize] += 1;
-            }
-        }
-        for v in 0..n {
-            let nearest = at_vertex[start[v] as usize..start[v + 1] as usize]
+            let nearest = at_vertex
+                .of(v)
                 .iter()
                 .filter_map(|&edge| {
                     let [p, q] = self.edges[edge as usize].map(|w| w as usize);
@@ -288,11 +273,18 @@ impl<'a> Crossings<'a> {
     }
 
     fn oriented(&self, piece: [u32; 4], n: u32) -> [u32; 4] {
-        let x = piece.map(|v| self.position(v, n));
-        let [e1, e2, e3] = [1, 2, 3].map(|k| sub(x[k], x[0]));
-        let [a, b, c, d] = piece;
-        if dot(cross(e1, e2), e3) < 0.0 { [a, b, d, c] } else { piece }
+        positive(piece, |v| self.position(v, n))
     }
+}
+
+/// The tet with two corners exchanged if its volume is negative.
+pub fn positive(tet: [u32; 4], place: impl Fn(u32) -> [f64; 3]) -> [u32; 4] {
+    if sixfold_volume(tet.map(place)) < 0.0 { [tet[0], tet[1], tet[3], tet[2]] } else { tet }
+}
+
+fn sixfold_volume(x: [[f64; 3]; 4]) -> f64 {
+    let [e1, e2, e3] = [1, 2, 3].map(|k| sub(x[k], x[0]));
+    dot(cross(e1, e2), e3)
 }
 
 /// The three tets of a prism given by its columns; a column's diagonals run from its top to the
@@ -313,15 +305,14 @@ fn is_along_axis(p: Place, q: Place) -> bool {
 /// Quality of a tet: its smallest dihedral angle, radians; for an inverted tet, its volume over its longest
 /// edge cubed, which is negative, so that a less inverted tet has a higher quality.
 pub fn shape(x: [[f64; 3]; 4]) -> f64 {
-    let [e1, e2, e3] = [1, 2, 3].map(|k| sub(x[k], x[0]));
-    let sixfold = dot(cross(e1, e2), e3);
+    let sixfold = sixfold_volume(x);
     if sixfold <= 0.0 {
         let longest = pairs().map(|[a, b]| norm(sub(x[b], x[a]))).fold(0.0, f64::max);
         return if longest > 0.0 { sixfold / longest.powi(3) } else { 0.0 };
     }
     // Between outward normals n and m of two faces the dihedral angle is the supplement of theirs.
-    let normals = [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]
-        .map(|[a, b, c]: [usize; 3]| cross(sub(x[b], x[a]), sub(x[c], x[a])))
+    let normals = FACES
+        .map(|[a, b, c]| cross(sub(x[b], x[a]), sub(x[c], x[a])))
         .map(|n| scaled(n, 1.0 / norm(n)));
     let largest_cosine =
         pairs().map(|[f, g]| -dot(normals[f], normals[g])).fold(f64::NEG_INFINITY, f64::max);

@@ -1,6 +1,7 @@
 //! The bodies of a cut lattice: specks are removed, and bodies that only touch are separated.
 
-use crate::vector::{cross, dot, sub};
+use crate::geometry::forest::Forest;
+use crate::mesh::{FACES, signed_volume};
 
 use super::cut::Cut;
 
@@ -25,9 +26,7 @@ pub fn keep_bodies(cut: &mut Cut, least: f64) -> Dropped {
     }
     let mut volumes = vec![0.0; n_bodies];
     for (tet, &b) in cut.tets.iter().zip(&body) {
-        let x = tet.map(|v| cut.nodes[v as usize]);
-        let [e1, e2, e3] = [1, 2, 3].map(|k| sub(x[k], x[0]));
-        volumes[b as usize] += dot(cross(e1, e2), e3) / 6.0;
+        volumes[b as usize] += signed_volume(&cut.nodes, tet);
     }
     let largest = volumes.iter().copied().fold(0.0, f64::max);
     let keep: Vec<bool> = volumes.iter().map(|&v| v >= least.min(largest)).collect();
@@ -75,7 +74,7 @@ fn bodies(tets: &[[u32; 4]]) -> Vec<u32> {
         .iter()
         .enumerate()
         .flat_map(|(t, tet)| {
-            [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]].map(|face: [usize; 3]| {
+            FACES.map(|face| {
                 let mut face = face.map(|v| tet[v]);
                 face.sort_unstable();
                 (face, t as u32)
@@ -83,16 +82,15 @@ fn bodies(tets: &[[u32; 4]]) -> Vec<u32> {
         })
         .collect();
     rayon::slice::ParallelSliceMut::par_sort_unstable(&mut faces[..]);
-    let mut parent: Vec<u32> = (0..tets.len() as u32).collect();
+    let mut forest = Forest::new(tets.len());
     for pair in faces.windows(2).filter(|pair| pair[0].0 == pair[1].0) {
-        let [a, b] = [pair[0].1, pair[1].1].map(|t| root(&mut parent, t));
-        parent[a.max(b) as usize] = a.min(b);
+        forest.join(pair[0].1 as usize, pair[1].1 as usize);
     }
     let mut number = vec![u32::MAX; tets.len()];
     let mut next = 0;
-    (0..tets.len() as u32)
+    (0..tets.len())
         .map(|t| {
-            let root = root(&mut parent, t) as usize;
+            let root = forest.root(t);
             if number[root] == u32::MAX {
                 number[root] = next;
                 next += 1;
@@ -100,12 +98,4 @@ fn bodies(tets: &[[u32; 4]]) -> Vec<u32> {
             number[root]
         })
         .collect()
-}
-
-fn root(parent: &mut [u32], mut t: u32) -> u32 {
-    while parent[t as usize] != t {
-        parent[t as usize] = parent[parent[t as usize] as usize];
-        t = parent[t as usize];
-    }
-    t
 }

@@ -12,11 +12,10 @@ mod parts;
 mod region;
 
 use nalgebra::Matrix3;
-use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 use crate::geometry::surface::Surface;
-use crate::vector::Vec3;
+use crate::vector::{Vec3, of_each};
 use course::{Courses, Segments};
 use parts::FibrePart;
 use region::Region;
@@ -47,9 +46,6 @@ const LEAST_ROUND: usize = 3;
 /// Beyond it, the boxes of a real muscle would be less than 1 mm long; cutting a surface into 100 000 of them
 /// takes minutes and gigabytes.
 pub const MOST_BOXES: usize = 64;
-
-/// Points per parallel task.
-const POINTS_PER_TASK: usize = 256;
 
 /// How the fibres of a muscle run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -314,11 +310,7 @@ impl MuscleFibres {
     ///
     /// Parallel; the result does not depend on the number of threads.
     pub fn directions(&self, points: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        points
-            .par_iter()
-            .with_min_len(POINTS_PER_TASK)
-            .map(|&point| self.direction(point))
-            .collect()
+        of_each(points, |point| self.direction(point))
     }
 }
 

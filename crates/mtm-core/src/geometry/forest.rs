@@ -1,0 +1,31 @@
+//! Disjoint sets (union-find with path halving): the smallest member of a set is its root.
+
+/// The sets that members 0, 1, … form; each is one of its own at first.
+#[derive(Default)]
+pub(crate) struct Forest(Vec<u32>);
+
+impl Forest {
+    pub fn new(n: usize) -> Self {
+        Self((0..n as u32).collect())
+    }
+
+    /// Adds members until there are `n`.
+    pub fn grow(&mut self, n: usize) {
+        self.0.extend(self.0.len() as u32..n as u32);
+    }
+
+    /// The smallest member of the set of `i`.
+    pub fn root(&mut self, mut i: usize) -> usize {
+        while self.0[i] as usize != i {
+            self.0[i] = self.0[self.0[i] as usize];
+            i = self.0[i] as usize;
+        }
+        i
+    }
+
+    /// Makes one set of those of `a` and `b`.
+    pub fn join(&mut self, a: usize, b: usize) {
+        let (a, b) = (self.root(a), self.root(b));
+        self.0[a.max(b)] = a.min(b) as u32;
+    }
+}
