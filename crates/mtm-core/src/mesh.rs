@@ -168,6 +168,15 @@ impl TetMesh {
         })
     }
 
+    /// Edges of the boundary triangles, each with its lower node first, ascending.
+    pub(crate) fn boundary_edges(&self) -> Vec<[u32; 2]> {
+        let sides = |&[a, b, c]: &[u32; 3]| [ascending(a, b), ascending(b, c), ascending(c, a)];
+        let mut edges: Vec<[u32; 2]> = self.boundary_triangles().iter().flat_map(sides).collect();
+        edges.par_sort_unstable();
+        edges.dedup();
+        edges
+    }
+
     /// The other tet on the face `tri` of tet `t`.
     pub(crate) fn neighbour_across(&self, t: u32, tri: [u32; 3]) -> Option<u32> {
         let smallest = tri.iter().min_by_key(|&&v| self.incident.of(v as usize).len())?;
@@ -303,6 +312,11 @@ pub(crate) fn signed_volume(nodes: &[[f64; 3]], tet: &[u32; 4]) -> f64 {
     let x0 = nodes[tet[0] as usize];
     let [e1, e2, e3] = [1, 2, 3].map(|k| sub(nodes[tet[k] as usize], x0));
     dot(cross(e1, e2), e3) / 6.0
+}
+
+/// The edge between two nodes, whichever way it is named.
+pub(crate) fn ascending(a: u32, b: u32) -> [u32; 2] {
+    [a.min(b), a.max(b)]
 }
 
 /// Smallest and largest coordinate along each axis.

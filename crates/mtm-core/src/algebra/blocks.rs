@@ -61,6 +61,16 @@ impl BlockMatrix {
         tasks
     }
 
+    /// Calls `fill` with the number, columns and blocks of each row, in parallel.
+    pub(crate) fn fill_rows(&mut self, fill: impl Fn(usize, &[u32], &mut [Block]) + Sync) {
+        self.row_tasks().into_par_iter().for_each(|task| {
+            for (offset, window) in task.start.windows(2).enumerate() {
+                let row = window[0] - task.start[0]..window[1] - task.start[0];
+                fill(task.first + offset, &task.columns[row.clone()], &mut task.blocks[row]);
+            }
+        });
+    }
+
     /// Number of block rows.
     pub fn n_rows(&self) -> usize {
         self.row_start.len() - 1

@@ -89,12 +89,7 @@ pub fn relax(
     Err(MtmError::NotConverged {
         method: "relaxation",
         iterations: options.max_sweeps,
-        shortfall: Shortfall {
-            quantity: "the estimated error of a node",
-            value: bound,
-            limit: options.tolerance,
-            unit: " mm",
-        },
+        shortfall: Shortfall::new("the estimated error of a node", bound, options.tolerance, " mm"),
         advice: "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison",
     })
 }

@@ -13,6 +13,12 @@ pub struct Shortfall {
     pub unit: &'static str,
 }
 
+impl Shortfall {
+    pub(crate) fn new(quantity: &'static str, value: f64, limit: f64, unit: &'static str) -> Self {
+        Self { quantity, value, limit, unit }
+    }
+}
+
 impl std::fmt::Display for Shortfall {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { quantity, value, limit, unit } = self;

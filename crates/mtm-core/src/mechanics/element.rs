@@ -5,7 +5,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, Result};
-use crate::mesh::{Incidence, TetGeometry, TetMesh};
+use crate::mesh::{Incidence, TetGeometry, TetMesh, ascending};
 use crate::vector::{add, scaled};
 
 /// How displacement and pressure vary in a tet.
@@ -147,11 +147,10 @@ impl ElementNodes {
 
 impl Middles {
     fn new(mesh: &TetMesh) -> Self {
-        let sorted = |a: u32, b: u32| if a < b { [a, b] } else { [b, a] };
         let mut edges: Vec<[u32; 2]> = mesh
             .tets()
             .par_iter()
-            .flat_map_iter(|tet| TET_EDGES.map(|[i, j]| sorted(tet[i], tet[j])))
+            .flat_map_iter(|tet| TET_EDGES.map(|[i, j]| ascending(tet[i], tet[j])))
             .collect();
         edges.par_sort_unstable();
         edges.dedup();
@@ -163,7 +162,7 @@ impl Middles {
                 let mut out = [0; MOST_NODES];
                 out[..4].copy_from_slice(tet);
                 for (e, [i, j]) in TET_EDGES.into_iter().enumerate() {
-                    let edge = sorted(tet[i], tet[j]);
+                    let edge = ascending(tet[i], tet[j]);
                     // Every edge of a tet is in the list.
                     let at = edges.partition_point(|other| *other < edge);
                     out[4 + e] = (n_corners + at) as u32;

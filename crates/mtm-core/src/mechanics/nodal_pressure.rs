@@ -10,7 +10,6 @@
 //! tet belongs to each corner, so that uniform strain stores the energy of C.
 
 use nalgebra::{Matrix3, Vector6};
-use rayon::prelude::*;
 
 use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::mechanics::material::{Lame, Spencer, Voigt, voigt_eigenvalues, voigt_matrix};
@@ -18,48 +17,21 @@ use crate::mechanics::tissue::{TetMaterial, Tissue};
 use crate::mesh::TetMesh;
 use crate::vector::add;
 
-/// κ of a material, MPa, and the remaining stiffness.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct StiffnessSplit {
-    /// Stiffness against averaged volumetric strain.
-    pub bulk: f64,
-    /// C − κ I⊗I, positive definite.
-    pub rest: Rest,
-}
-
-/// The remaining material of a tet; a temporary value.
-#[derive(Debug, Clone, Copy)]
-#[allow(clippy::large_enum_variant)]
-pub(crate) enum Rest {
-    Isotropic(Lame),
-    Spencer(Spencer, [f64; 3]),
-    General(Voigt),
-}
-
-impl Rest {
-    /// In the form used by the tensor formulas.
-    pub fn material(&self) -> TetMaterial<'_> {
-        match self {
-            Self::Isotropic(lame) => TetMaterial::Isotropic(*lame),
-            Self::Spencer(c, a) => TetMaterial::Spencer(*c, *a),
-            Self::General(c) => TetMaterial::General(c),
-        }
-    }
-}
-
-/// The volumetric split of a material: κ = K_R − e/3 with K_R = 1/(I : C⁻¹ : I) its bulk modulus under pressure
+/// The volumetric split of a material, κ and C − κ I⊗I, which is positive definite: κ = K_R − e/3 with K_R = 1/(I : C⁻¹ : I) its bulk modulus under pressure
 /// and e the smallest eigenvalue of C; λ if the tissue is isotropic and λ ≥ 0.
 ///
 /// K_R is the largest κ for which C − κ I⊗I has no negative eigenvalue. The direction that then has a zero
 /// eigenvalue, C⁻¹ I, is not a shear: reducing κ by e/3 makes it positive. e ≤ 3 K_R, so κ ≥ 0.
-pub(crate) fn split(material: &TetMaterial<'_>) -> StiffnessSplit {
+///
+/// `memory`: where the rest of a stiffness without structure is written.
+pub(crate) fn split<'a>(
+    material: &TetMaterial<'_>,
+    memory: &'a mut Voigt,
+) -> (f64, TetMaterial<'a>) {
     match material {
         TetMaterial::Isotropic(l) => {
             let bulk = l.lambda_.max(0.0);
-            StiffnessSplit {
-                bulk,
-                rest: Rest::Isotropic(Lame { lambda_: l.lambda_ - bulk, mu: l.mu }),
-            }
+            (bulk, TetMaterial::Isotropic(Lame { lambda_: l.lambda_ - bulk, mu: l.mu }))
         }
         TetMaterial::Spencer(c, a) => {
             // In the fibre frame pressure only involves C11, C12 and C22 + C23.
@@ -69,7 +41,7 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> StiffnessSplit {
             let pressed = (c11 * pair - 2.0 * c12 * c12) / (pair - 4.0 * c12 + 2.0 * c11);
             let bulk = (pressed - c.eigenvalue_range().0 / 3.0).max(0.0);
             let rest = Spencer { lambda_: c.lambda_ - bulk, ..*c };
-            StiffnessSplit { bulk, rest: Rest::Spencer(rest, *a) }
+            (bulk, TetMaterial::Spencer(rest, *a))
         }
         TetMaterial::General(c) => {
             let pressure = Vector6::new(1.0, 1.0, 1.0, 0.0, 0.0, 0.0);
@@ -77,13 +49,13 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> StiffnessSplit {
             let pressed = nalgebra::Cholesky::new(voigt_matrix(c))
                 .map_or(0.0, |l| 1.0 / pressure.dot(&l.solve(&pressure)));
             let bulk = (pressed - voigt_eigenvalues(c).0 / 3.0).max(0.0);
-            let mut rest = **c;
-            for row in rest.iter_mut().take(3) {
+            *memory = **c;
+            for row in memory.iter_mut().take(3) {
                 for value in row.iter_mut().take(3) {
                     *value -= bulk;
                 }
             }
-            StiffnessSplit { bulk, rest: Rest::General(rest) }
+            (bulk, TetMaterial::General(memory))
         }
     }
 }
@@ -93,13 +65,13 @@ pub(crate) fn split(material: &TetMaterial<'_>) -> StiffnessSplit {
 /// compensate for volume changes of the stiff one.
 type Octaves = [i32; 2];
 
-fn octaves(split: &StiffnessSplit) -> Octaves {
-    let shear = match split.rest {
-        Rest::Isotropic(l) => l.mu,
-        Rest::Spencer(c, _) => c.mu_across,
-        Rest::General(c) => (c[3][3] + c[4][4] + c[5][5]) / 3.0,
+fn octaves(bulk: f64, rest: &TetMaterial<'_>) -> Octaves {
+    let shear = match rest {
+        TetMaterial::Isotropic(l) => l.mu,
+        TetMaterial::Spencer(c, _) => c.mu_across,
+        TetMaterial::General(c) => (c[3][3] + c[4][4] + c[5][5]) / 3.0,
     };
-    [split.bulk, shear].map(|stiffness| stiffness.log2().floor() as i32)
+    [bulk, shear].map(|stiffness| stiffness.log2().floor() as i32)
 }
 
 /// Tets of one material around a corner, for every corner and material.
@@ -133,8 +105,9 @@ impl Patches {
         let n_rows = tissue.n_rows();
         let rows: Vec<(f64, Octaves)> = (0..n_rows)
             .map(|t| {
-                let split = split(&tissue.of_tet(t));
-                (split.bulk, octaves(&split))
+                let mut memory = Voigt::default();
+                let (bulk, rest) = split(&tissue.of_tet(t), &mut memory);
+                (bulk, octaves(bulk, &rest))
             })
             .collect();
         let row = |t: u32| &rows[if n_rows == 1 { 0 } else { t as usize }];
@@ -290,13 +263,6 @@ impl Patches {
 
     /// Adds Σ_a w_a d⊗d to a matrix whose pattern contains all neighbours.
     pub fn add_to(&self, mesh: &TetMesh, gradients: &PatchGradients, matrix: &mut BlockMatrix) {
-        matrix.row_tasks().into_par_iter().for_each(|task| {
-            let origin = task.start[0];
-            for (offset, window) in task.start.windows(2).enumerate() {
-                let row = window[0] - origin..window[1] - origin;
-                let (columns, blocks) = (&task.columns[row.clone()], &mut task.blocks[row]);
-                self.add_row(mesh, gradients, task.first + offset, columns, blocks);
-            }
-        });
+        matrix.fill_rows(|j, columns, blocks| self.add_row(mesh, gradients, j, columns, blocks));
     }
 }

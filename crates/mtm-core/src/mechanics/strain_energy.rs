@@ -15,6 +15,7 @@ use crate::mechanics::density::{Density, volumetric};
 use crate::mechanics::element::{ElementNodes, MOST_NODES};
 use crate::mechanics::hyperelastic::Tangent;
 use crate::mechanics::kinematics::Kinematics;
+use crate::mechanics::material::Voigt;
 use crate::mechanics::nodal_pressure::split;
 use crate::mechanics::tensors::MassTensors;
 use crate::vector::add;
@@ -107,7 +108,7 @@ impl StrainEnergy {
             .map(|t| {
                 let material = tissue.of_tet(t);
                 if tensors.patches().is_some() {
-                    Density::new(&split(&material).rest.material(), kinematics)
+                    Density::new(&split(&material, &mut Voigt::default()).1, kinematics)
                 } else {
                     Density::new(&material, kinematics)
                 }

@@ -63,14 +63,7 @@ impl MassTensors {
         let patches = (element == Element::NodalPressure).then(|| Patches::new(&mesh, &tissue));
         let nodes = ElementNodes::new(element, mesh);
         let mut matrix = pattern(&nodes, patches.as_ref());
-        matrix.row_tasks().into_par_iter().for_each(|task| {
-            let origin = task.start[0];
-            for (offset, window) in task.start.windows(2).enumerate() {
-                let row = window[0] - origin..window[1] - origin;
-                let (columns, blocks) = (&task.columns[row.clone()], &mut task.blocks[row]);
-                assemble_row(&nodes, &tissue, task.first + offset, columns, blocks);
-            }
-        });
+        matrix.fill_rows(|j, columns, blocks| assemble_row(&nodes, &tissue, j, columns, blocks));
         if let Some(patches) = &patches {
             let gradients = patches.gradients(nodes.mesh(), |_| nalgebra::Matrix3::identity());
             patches.add_to(nodes.mesh(), &gradients, &mut matrix);
@@ -173,7 +166,7 @@ impl MassTensors {
         rows.par_iter_mut().enumerate().for_each(|(t, row)| {
             let material = self.tissue.of_tet(t);
             let c = match &averages {
-                Some(_) => split(&material).rest.material().voigt(),
+                Some(_) => split(&material, &mut Voigt::default()).1.voigt(),
                 None => material.voigt(),
             };
             let strain = *row;
@@ -276,8 +269,11 @@ fn assemble_row(
         let tet = nodes.of_tet(t as usize);
         let geometry = nodes.mesh().geometry(t as usize);
         let material = tissue.of_tet(t as usize);
-        let rest = (nodes.element() == Element::NodalPressure).then(|| split(&material).rest);
-        let material = rest.as_ref().map_or(material, |r| r.material());
+        let mut memory = Voigt::default();
+        let material = match nodes.element() {
+            Element::NodalPressure => split(&material, &mut memory).1,
+            Element::Linear | Element::Quadratic => material,
+        };
         let corners = (nodes.element() == Element::Quadratic).then(|| {
             [0, 1, 2, 3].map(|p| [0, 1, 2, 3].map(|q| tet_tensor(&geometry, &material, p, q)))
         });

@@ -74,11 +74,6 @@ fn height(surface: &Surface, x: [f64; 3]) -> Option<f64> {
     (!closest.on_border || aside <= BESIDE * length).then_some(closest.signed_distance)
 }
 
-/// The edge between two nodes, whichever way it is named.
-fn ascending(a: u32, b: u32) -> [u32; 2] {
-    [a.min(b), a.max(b)]
-}
-
 /// +1 or −1 for tets next to the surface, 0 for all others. No tet has nodes on either side.
 ///
 /// `heights`: of the nodes of the unsplit mesh; all others lie on the surface.

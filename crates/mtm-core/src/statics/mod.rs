@@ -8,4 +8,3 @@ pub(crate) mod reduction;
 pub mod restraint;
 pub mod solution;
 pub mod solver;
-pub(crate) mod touching;

@@ -190,19 +190,14 @@ impl<'a> State<'a> {
         let (error, energy) = (due.doubt * self.error_mm(), due.doubt * self.energy_error());
         let by_energy = energy / options.energy_tolerance > error / options.tolerance;
         let shortfall = if by_energy {
-            Shortfall {
-                quantity: "the estimated error of the energy",
-                value: energy,
-                limit: options.energy_tolerance,
-                unit: " of the whole",
-            }
+            Shortfall::new(
+                "the estimated error of the energy",
+                energy,
+                options.energy_tolerance,
+                " of the whole",
+            )
         } else {
-            Shortfall {
-                quantity: "the estimated error of a node",
-                value: error,
-                limit: options.tolerance,
-                unit: " mm",
-            }
+            Shortfall::new("the estimated error of a node", error, options.tolerance, " mm")
         };
         let advice = if due.exhausted {
             "allow more iterations (max_iterations) or a larger tolerance, or use method=\"cholesky\""

@@ -2,11 +2,9 @@
 
 use std::collections::HashMap;
 
-use crate::mesh::FACES;
+use crate::mesh::{FACES, ascending};
 use crate::meshing::stuffing::cut::{pairs, positive};
 use crate::vector::towards;
-
-use super::ascending;
 
 /// Tets divided where they cross a surface.
 pub struct Clipped {

@@ -3,11 +3,10 @@
 use rayon::prelude::*;
 
 use crate::geometry::surface::Surface;
-use crate::mesh::TetMesh;
+use crate::mesh::{TetMesh, ascending};
 use crate::meshing::stuffing::cut::{pairs, shape};
 use crate::vector::{norm, of_each, sub, towards};
 
-use super::ascending;
 use super::height;
 
 /// Two passes: a node moves onto the surface if an edge at it crosses the surface within a share of its length,
@@ -24,7 +23,7 @@ const ROUNDING: f64 = 1e-9;
 pub fn snap(mesh: &TetMesh, surface: &Surface, nodes: &mut [[f64; 3]]) -> Vec<Option<f64>> {
     let mut heights = of_each(nodes, |x| height(surface, x));
     forget_around_rim(mesh, &mut heights);
-    let boundary = BoundaryEdges::new(mesh);
+    let boundary = mesh.boundary_edges();
     for (near, least) in PASSES {
         for node in 0..nodes.len() {
             let crossings = NodeCrossings::at(mesh, node, (nodes, &heights), &boundary);
@@ -63,7 +62,7 @@ impl NodeCrossings {
         mesh: &TetMesh,
         node: usize,
         (nodes, heights): (&[[f64; 3]], &[Option<f64>]),
-        boundary: &BoundaryEdges,
+        boundary: &[[u32; 2]],
     ) -> Self {
         let mut found = Self { nearest: None, on_boundary: None };
         let Some(h) = heights[node].filter(|h| *h != 0.0) else { return found };
@@ -76,7 +75,9 @@ impl NodeCrossings {
             if nearer(share, found.nearest) {
                 found.nearest = crossing;
             }
-            if nearer(share, found.on_boundary) && boundary.contains(node as u32, k) {
+            if nearer(share, found.on_boundary)
+                && boundary.binary_search(&ascending(node as u32, k)).is_ok()
+            {
                 found.on_boundary = crossing;
             }
         }
@@ -120,24 +121,4 @@ fn neighbours(mesh: &TetMesh, node: usize) -> Vec<u32> {
     found.dedup();
     found.retain(|&k| k as usize != node);
     found
-}
-
-/// The edges of the boundary of a mesh.
-struct BoundaryEdges(Vec<[u32; 2]>);
-
-impl BoundaryEdges {
-    fn new(mesh: &TetMesh) -> Self {
-        let triangles = mesh.boundary_triangles();
-        let mut edges: Vec<[u32; 2]> = triangles
-            .iter()
-            .flat_map(|&[a, b, c]| [ascending(a, b), ascending(b, c), ascending(c, a)])
-            .collect();
-        edges.par_sort_unstable();
-        edges.dedup();
-        Self(edges)
-    }
-
-    fn contains(&self, a: u32, b: u32) -> bool {
-        self.0.binary_search(&ascending(a, b)).is_ok()
-    }
 }

@@ -113,12 +113,12 @@ fn not_confirmed(trial: &Trial, options: &PcgOptions, relative: f64) -> MtmError
     MtmError::NotConverged {
         method: "pcg",
         iterations: trial.iterations,
-        shortfall: Shortfall {
-            quantity: "the error in recovering a known solution",
-            value: trial.error,
-            limit: options.slack / TRIAL_SAFETY * relative,
-            unit: " of the displacements",
-        },
+        shortfall: Shortfall::new(
+            "the error in recovering a known solution",
+            trial.error,
+            options.slack / TRIAL_SAFETY * relative,
+            " of the displacements",
+        ),
         advice: "stiff and soft tissue, or slender parts, are beyond conjugate gradients: use \
                  method=\"cholesky\", or allow a larger tolerance",
     }

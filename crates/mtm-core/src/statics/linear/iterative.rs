@@ -195,12 +195,7 @@ impl Iterative {
         Err(MtmError::NotConverged {
             method: if self.sweeps { "relaxation" } else { "pcg" },
             iterations: solve.effort.iterations,
-            shortfall: Shortfall {
-                quantity: "the estimated error of a node",
-                value,
-                limit,
-                unit: " mm",
-            },
+            shortfall: Shortfall::new("the estimated error of a node", value, limit, " mm"),
             advice: "the material contrast is too large for f64: check the moduli, or use \
                      method=\"cholesky\"",
         })
@@ -511,12 +506,7 @@ fn no_rest(sweeps: usize, error: f64, tolerance: f64) -> MtmError {
     MtmError::NotConverged {
         method: "relaxation",
         iterations: sweeps,
-        shortfall: Shortfall {
-            quantity: "the measured error of a node",
-            value: error,
-            limit: tolerance,
-            unit: " mm",
-        },
+        shortfall: Shortfall::new("the measured error of a node", error, tolerance, " mm"),
         advice: NO_SWEEPS,
     }
 }

@@ -3,6 +3,7 @@
 
 pub(crate) mod outcome;
 pub(crate) mod refusals;
+mod touching;
 
 use std::sync::Arc;
 
@@ -23,8 +24,8 @@ use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart, method_
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Support};
 use crate::statics::solution::{Clock, Solution, Timings};
-use crate::statics::touching::{BoundaryRule, TouchingParts, TouchingPlan};
 use crate::vector::{add, norm, scaled};
+use touching::{TouchingParts, TouchingPlan};
 
 /// Multiple of the correction of a solution by factorisation that is taken as the error of the corrected one.
 const CORRECTION_SAFETY: f64 = 2.0;
@@ -445,8 +446,6 @@ impl StaticSolver {
         if let (Mechanics::Linear(system), Some(pairs)) = (&self.mechanics, &self.pairs) {
             let path = TouchingPlan {
                 body: self,
-                mesh: self.tensors.mesh(),
-                reduction: &self.reduction,
                 rows: BodyRows {
                     positions: &self.reduction.rows(self.tensors.element_nodes().positions()),
                     sliding: self.sliding.as_deref(),
@@ -455,7 +454,6 @@ impl StaticSolver {
                     tissue: Extremes::of(self.tensors.tissue()),
                     multigrid: None,
                 },
-                options: &self.options,
                 system,
                 pairs,
                 motions,
@@ -523,16 +521,6 @@ impl StaticSolver {
     }
 }
 
-impl BoundaryRule for StaticSolver {
-    fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>> {
-        self.prescribed(motions)
-    }
-
-    fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        self.coupled(u)
-    }
-}
-
 /// `boundary` with the mid-edge nodes of `tensors`; unchanged if there are none.
 fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc<Boundary>> {
     let edges = tensors.element_nodes().mid_edges();
@@ -540,13 +528,7 @@ fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc
         return Ok(boundary.clone());
     }
     let mesh = tensors.mesh();
-    let mut surface: Vec<[u32; 2]> = mesh
-        .boundary_triangles()
-        .iter()
-        .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
-        .map(|[a, b]| if a < b { [a, b] } else { [b, a] })
-        .collect();
-    surface.sort_unstable();
+    let surface = mesh.boundary_edges();
     let on_surface = |edge: [u32; 2]| surface.binary_search(&edge).is_ok();
     Ok(Arc::new(boundary.with_mid_edges(mesh.n_nodes(), edges, on_surface)?))
 }

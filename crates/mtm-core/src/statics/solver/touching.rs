@@ -18,10 +18,9 @@ use crate::geometry::motion::SurfaceMotion;
 use crate::mesh::TetMesh;
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::system::{BodyRows, SolvedRows, System};
-use crate::statics::options::StaticOptions;
 use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart};
-use crate::statics::reduction::Reduction;
 use crate::statics::solution::{Clock, TouchResult};
+use crate::statics::solver::StaticSolver;
 use crate::vector::{add, norm, scaled, sub};
 
 /// Motion of the bones in one step, over the mean edge of the tissue that may be touched.
@@ -88,25 +87,10 @@ pub(super) struct TouchingParts {
     pub forces: Vec<[f64; 3]>,
 }
 
-/// How the nodes of a body follow from the motions of its segments.
-pub(super) trait BoundaryRule {
-    /// Displacements of all nodes with the prescribed ones filled in, mm.
-    ///
-    /// # Errors
-    /// Those of the motions.
-    fn prescribed(&self, motions: &[&Motion]) -> Result<Vec<[f64; 3]>>;
-
-    /// Forces exerted by the prescribed nodes on the unknown rows, N.
-    fn coupled(&self, u: &[[f64; 3]]) -> Vec<[f64; 3]>;
-}
-
 /// A plan on a body whose parts may touch.
 pub(super) struct TouchingPlan<'a> {
-    pub body: &'a dyn BoundaryRule,
-    pub mesh: &'a TetMesh,
-    pub reduction: &'a Reduction,
+    pub body: &'a StaticSolver,
     pub rows: BodyRows<'a>,
-    pub options: &'a StaticOptions,
     pub system: &'a System,
     pub pairs: &'a Pairs,
     /// One motion per segment.
@@ -173,10 +157,14 @@ impl TouchingPlan<'_> {
         }
     }
 
+    fn mesh(&self) -> &TetMesh {
+        self.body.tensors.mesh()
+    }
+
     fn rest(&self) -> PartialState {
         PartialState {
-            u: vec![[0.0; 3]; self.reduction.row_of.len()],
-            rows: vec![[0.0; 3]; self.reduction.unknowns.len()],
+            u: vec![[0.0; 3]; self.body.reduction.row_of.len()],
+            rows: vec![[0.0; 3]; self.body.reduction.unknowns.len()],
             contact: None,
             touching: self.pairs.at_rest(),
         }
@@ -184,12 +172,12 @@ impl TouchingPlan<'_> {
 
     /// Distance that counts as touching, mm.
     fn close(&self) -> f64 {
-        CLOSE.min(CLOSE_SHARE * self.mesh.diagonal())
+        CLOSE.min(CLOSE_SHARE * self.mesh().diagonal())
     }
 
     /// The same at the end of the plan, mm: less if the tolerance of contact asks for it.
     fn sought(&self) -> f64 {
-        self.close().min(CLOSE_TOLERANCES * self.options.contact.tolerance)
+        self.close().min(CLOSE_TOLERANCES * self.body.options.contact.tolerance)
     }
 
     /// `pose`, reached at the share `from` of the plan, advanced to the share `to`; nothing if the step is too
@@ -207,14 +195,14 @@ impl TouchingPlan<'_> {
         let b = self.forces(&prescribed, to);
         let goal = StepTarget { motions: &motions, prescribed: &prescribed, b: &b };
         let ahead =
-            self.pairs.planes_ahead(self.mesh, &pose.u, (&before, &motions), &pose.touching)?;
+            self.pairs.planes_ahead(self.mesh(), &pose.u, (&before, &motions), &pose.touching)?;
         let contact = self.carried(pose, &before, &motions);
         // Displacements are nearly proportional to the plan.
         let more = if from > 0.0 { to / from } else { 1.0 };
         let mut pose = pose.clone();
         pose.rows.iter_mut().for_each(|v| *v = scaled(*v, more));
         let (pose, rounds) = self.go_ahead(pose, &ahead, contact, &goal, solve)?;
-        let planes = self.pairs.planes(self.mesh, &pose.u, &motions, &pose.touching)?;
+        let planes = self.pairs.planes(self.mesh(), &pose.u, &motions, &pose.touching)?;
         if planes.deepest() > DEEP_EDGES * self.pairs.mean_edge() {
             return Ok(None);
         }
@@ -232,7 +220,7 @@ impl TouchingPlan<'_> {
         solve: &mut PlanSolve<'_>,
     ) -> Result<(PartialState, usize)> {
         // The targets of prescribed nodes are known before anything is solved.
-        pose.u = self.reduction.filled(goal.prescribed, &pose.rows);
+        pose.u = self.body.reduction.filled(goal.prescribed, &pose.rows);
         let deep = AHEAD_EDGES * self.pairs.mean_edge();
         for round in 1..=MOST_ROUNDS_AHEAD {
             let links = self.pairs.round(ahead, &pose.u, &pose.touching, true);
@@ -272,7 +260,7 @@ impl TouchingPlan<'_> {
             let next = self.moved(&pose, rows, contact, goal);
             let change = largest_change(&pose.u, &next.u);
             pose = next;
-            let mut met = self.pairs.planes(self.mesh, &pose.u, goal.motions, &pose.touching)?;
+            let mut met = self.pairs.planes(self.mesh(), &pose.u, goal.motions, &pose.touching)?;
             if count > SHARP_ROUNDS {
                 met.steady(&planes, &pose.u);
             }
@@ -306,7 +294,7 @@ impl TouchingPlan<'_> {
         contact: Option<ContactState>,
         goal: &StepTarget<'_>,
     ) -> PartialState {
-        let u = self.reduction.filled(goal.prescribed, &rows);
+        let u = self.body.reduction.filled(goal.prescribed, &rows);
         PartialState { u, rows, contact, touching: pose.touching.clone() }
     }
 
@@ -335,7 +323,7 @@ impl TouchingPlan<'_> {
         let linked = RowLinks { links: &round.links, share: rough.then_some(ROUGH_SHARE) };
         let before = solve.effort.iterations;
         let (rows, contact) = if let Some(sliding) = self.rows.sliding {
-            let mut options = *self.options;
+            let mut options = self.body.options;
             if rough {
                 options.contact.allowed = f64::INFINITY;
             }
@@ -360,7 +348,7 @@ impl TouchingPlan<'_> {
         if share == 1.0 {
             return Ok(self.motions.iter().map(|&m| m.clone()).collect());
         }
-        let centre = self.mesh.centre();
+        let centre = self.mesh().centre();
         let part = |motion: &&Motion| {
             Ok(match motion {
                 Motion::Rigid(rigid) => Motion::Rigid(rigid.partial(share, centre)),
@@ -382,7 +370,7 @@ impl TouchingPlan<'_> {
     fn forces(&self, prescribed: &[[f64; 3]], share: f64) -> Vec<[f64; 3]> {
         let mut b = self.body.coupled(prescribed);
         if let Some(loads) = self.loads {
-            for (b, &j) in b.iter_mut().zip(&self.reduction.unknowns) {
+            for (b, &j) in b.iter_mut().zip(&self.body.reduction.unknowns) {
                 *b = add(*b, scaled(loads[j as usize], share));
             }
         }
@@ -409,7 +397,7 @@ impl TouchingPlan<'_> {
         rounds: usize,
         solve: &mut PlanSolve<'_>,
     ) -> Result<(SolvedRows, TouchingParts)> {
-        let inside = self.pairs.overlap.inside(self.mesh, &pose.u);
+        let inside = self.pairs.overlap.inside(self.mesh(), &pose.u);
         let overlap = inside.iter().fold(0.0, |m: f64, (_, depth)| m.max(*depth));
         let open = done.left.beside_tissue().max(overlap);
         if !done.converged && open > SEEN * self.close() {
