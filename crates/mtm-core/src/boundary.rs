@@ -95,6 +95,17 @@ pub enum Motion {
     Surface(Arc<SurfaceMotion>),
 }
 
+impl Motion {
+    /// Displacements of `points` that follow the segment, mm; none if only its joined nodes are known to move.
+    pub(crate) fn displacements(&self, points: &[[f64; 3]]) -> Option<Vec<[f64; 3]>> {
+        match self {
+            Self::Rigid(rigid) => Some(points.iter().map(|&x| rigid.displacement(x)).collect()),
+            Self::Surface(surface) => Some(surface.displacement(points)),
+            Self::Nodes(_) => None,
+        }
+    }
+}
+
 /// A motion for each segment, by name.
 pub type Plan = Vec<(String, Motion)>;
 
@@ -469,42 +480,26 @@ impl Boundary {
         nodes: &[[f64; 3]],
     ) -> Result<Vec<(u32, [f64; 3])>> {
         let segment = &self.segments[s];
-        let at =
-            |list: &[u32]| -> Vec<[f64; 3]> { list.iter().map(|&j| nodes[j as usize]).collect() };
-        Ok(match motion {
-            Motion::Rigid(rigid) => {
-                segment.joined.iter().map(|&j| (j, rigid.displacement(nodes[j as usize]))).collect()
+        let Motion::Nodes(rows) = motion else {
+            let places: Vec<[f64; 3]> = segment.joined.iter().map(|&j| nodes[j as usize]).collect();
+            let moved = motion.displacements(&places).unwrap_or_default();
+            return Ok(segment.joined.iter().copied().zip(moved).collect());
+        };
+        let mut seen: HashMap<u32, [f64; 3]> = HashMap::new();
+        for (row, (&node, &u)) in self.given[s].iter().zip(rows).enumerate() {
+            if let Some(before) = seen.insert(node, u)
+                && before != u
+            {
+                let problem =
+                    format!("row {row} moves node {node} by {u:?}, an earlier row by {before:?}");
+                return Err(MtmError::Plan { segment: segment.name.clone(), problem });
             }
-            Motion::Surface(surface) => segment
-                .joined
-                .iter()
-                .copied()
-                .zip(surface.displacement(&at(&segment.joined)))
-                .collect(),
-            Motion::Nodes(rows) => {
-                let mut seen: HashMap<u32, [f64; 3]> = HashMap::new();
-                for (row, (&node, &u)) in self.given[s].iter().zip(rows).enumerate() {
-                    if let Some(before) = seen.insert(node, u)
-                        && before != u
-                    {
-                        return Err(MtmError::Plan {
-                            segment: segment.name.clone(),
-                            problem: format!(
-                                "row {row} moves node {node} by {u:?}, an earlier row by {before:?}"
-                            ),
-                        });
-                    }
-                }
-                segment
-                    .joined
-                    .iter()
-                    .map(|j| match self.inherited.get(j) {
-                        Some([a, b]) => (*j, scaled(add(seen[a], seen[b]), 0.5)),
-                        None => (*j, seen[j]),
-                    })
-                    .collect()
-            }
-        })
+        }
+        let own = |j: &u32| match self.inherited.get(j) {
+            Some([a, b]) => (*j, scaled(add(seen[a], seen[b]), 0.5)),
+            None => (*j, seen[j]),
+        };
+        Ok(segment.joined.iter().map(own).collect())
     }
 }
 

@@ -110,7 +110,7 @@ pub mod internals {
 
 pub use algebra::blocks::BlockMatrix;
 pub use algebra::cholesky::Symbolic;
-pub use algebra::krylov::{BlockJacobi, PcgOptions, PcgOutcome, Preconditioner, pcg};
+pub use algebra::krylov::{PcgOptions, PcgOutcome, Preconditioner, pcg};
 pub use algebra::memory::HugePages;
 pub use algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions};
 pub use algebra::pool;

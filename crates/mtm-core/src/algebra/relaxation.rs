@@ -15,16 +15,8 @@ const WINDOW: usize = 20;
 /// The contraction is taken as at most 1 − this, so that the bound stays finite.
 const LEAST_PROGRESS: f64 = 1e-9;
 
-/// Parameters of the iteration.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RelaxationOptions {
-    /// Estimate of the largest nodal error at which the sweeps end, mm.
-    pub tolerance: f64,
-    /// Over-relaxation ω, 0 < ω < 2; 1 is the plain iteration.
-    pub factor: f64,
-    /// Maximum number of sweeps.
-    pub max_sweeps: usize,
-}
+/// Over-relaxation ω, 0 < ω < 2; 1 is the plain iteration.
+const FACTOR: f64 = 1.6;
 
 /// Outcome of the iteration.
 #[derive(Debug, Clone)]
@@ -37,7 +29,7 @@ pub struct RelaxationOutcome {
     pub steps: Vec<f64>,
 }
 
-/// Solves A x = b from `start`.
+/// Solves A x = b from `start`, until the estimate of the largest nodal error is within `tolerance`, mm.
 ///
 /// # Errors
 /// A diagonal block that is not positive definite, no convergence within the sweeps, interruption.
@@ -45,13 +37,13 @@ pub fn relax(
     a: &BlockMatrix,
     b: &[[f64; 3]],
     start: &[[f64; 3]],
-    options: &RelaxationOptions,
+    (tolerance, max_sweeps): (f64, usize),
     interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<RelaxationOutcome> {
     let inverse = (0..a.n_rows()).map(|j| inverse_block(a, j)).collect::<Result<Vec<Block>>>()?;
     let mut x = start.to_vec();
     let (mut steps, mut bound) = (Vec::new(), f64::INFINITY);
-    for sweep in 1..=options.max_sweeps {
+    for sweep in 1..=max_sweeps {
         if interrupted() {
             return Err(MtmError::Interrupted);
         }
@@ -62,7 +54,7 @@ pub fn relax(
             let m = &inverse[j];
             for i in 0..3 {
                 let d = m[3 * i] * r[0] + m[3 * i + 1] * r[1] + m[3 * i + 2] * r[2];
-                x[j][i] += options.factor * d;
+                x[j][i] += FACTOR * d;
                 step = step.max(d.abs());
             }
         }
@@ -80,16 +72,16 @@ pub fn relax(
             // hardly moved yet has no effect on the steps.
             let ratio = step / steps[sweep - 1 - WINDOW];
             let contraction = ratio.powf(1.0 / WINDOW as f64).min(1.0 - LEAST_PROGRESS);
-            bound = options.factor * step * contraction / (1.0 - contraction);
+            bound = FACTOR * step * contraction / (1.0 - contraction);
         }
-        if bound <= options.tolerance {
+        if bound <= tolerance {
             return Ok(RelaxationOutcome { solution: x, sweeps: sweep, steps });
         }
     }
     Err(MtmError::NotConverged {
         method: "relaxation",
-        iterations: options.max_sweeps,
-        shortfall: Shortfall::new("the estimated error of a node", bound, options.tolerance, " mm"),
+        iterations: max_sweeps,
+        shortfall: Shortfall::new("the estimated error of a node", bound, tolerance, " mm"),
         advice: "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison",
     })
 }

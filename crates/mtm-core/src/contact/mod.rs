@@ -286,21 +286,11 @@ impl Sliding {
         for (s, motion) in motions.iter().enumerate() {
             let members: Vec<usize> =
                 (0..self.nodes.len()).filter(|&i| self.nodes[i].segment == s).collect();
-            match motion {
-                Motion::Rigid(rigid) => {
-                    for i in members {
-                        out[i] = rigid.apply(self.positions[i]);
-                    }
-                }
-                Motion::Surface(surface) => {
-                    let points: Vec<[f64; 3]> =
-                        members.iter().map(|&i| self.positions[i]).collect();
-                    for (i, u) in members.into_iter().zip(surface.displacement(&points)) {
-                        out[i] = add(self.positions[i], u);
-                    }
-                }
-                // `Boundary::motions` rejects this for segments with sliding nodes.
-                Motion::Nodes(_) => {}
+            let points: Vec<[f64; 3]> = members.iter().map(|&i| self.positions[i]).collect();
+            // `Boundary::motions` rejects displacements of joined nodes for segments with sliding nodes.
+            let moved = motion.displacements(&points).unwrap_or_default();
+            for (i, u) in members.into_iter().zip(moved) {
+                out[i] = add(self.positions[i], u);
             }
         }
         out

@@ -238,13 +238,7 @@ impl Pairs {
                 Wall::Bone { surface, segment } => match segment.map(|s| motions[s]) {
                     None => MovedWall::Rigid(surface, RigidMotion::identity()),
                     Some(Motion::Rigid(rigid)) => MovedWall::Rigid(surface, *rigid),
-                    Some(Motion::Surface(motion)) => {
-                        let way = motion.displacement(surface.vertices());
-                        let vertices = surface.vertices().iter().zip(way);
-                        MovedWall::Deformed(
-                            surface.moved(vertices.map(|(x, w)| add(*x, w)).collect())?,
-                        )
-                    }
+                    Some(Motion::Surface(motion)) => MovedWall::Deformed(motion.carry(surface)?),
                     // `Boundary::motions` rejects this for segments that nodes may touch.
                     Some(Motion::Nodes(_)) => MovedWall::Rigid(surface, RigidMotion::identity()),
                 },
@@ -288,10 +282,7 @@ impl Pairs {
     fn meet(&self, c: &Candidate, wall: &MovedWall<'_>, place: [f64; 3]) -> Option<Meeting> {
         let (closest, mean_edge) = match wall {
             MovedWall::Rigid(surface, rigid) => {
-                let mut found = surface.closest_one(rigid.apply_inverse(place));
-                found.point = rigid.apply(found.point);
-                found.normal = rigid.rotate(found.normal);
-                (found, surface.mean_edge_length())
+                (rigid.closest(surface, place), surface.mean_edge_length())
             }
             MovedWall::Deformed(surface) => {
                 (surface.closest_one(place), surface.mean_edge_length())

@@ -8,7 +8,7 @@ use crate::boundary::Motion;
 use crate::error::Result;
 use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::Closest;
-use crate::vector::{add, dot, norm, scaled, sub};
+use crate::vector::{dot, norm, scaled, sub};
 
 /// Length of the gradient of the distance by which a gap is divided at least, while a node passes such a place.
 const LEAST_SLOPE: f64 = 0.1;
@@ -105,12 +105,8 @@ impl<'a> Seats<'a> {
                 Ok(match (field, motion) {
                     (None, _) | (_, Motion::Nodes(_)) => MovedSurface::Unused,
                     (Some(field), Motion::Rigid(rigid)) => MovedSurface::Rigid(field, *rigid),
-                    (Some(field), Motion::Surface(surface)) => {
-                        let rest = field.surface();
-                        let u = surface.displacement(rest.vertices());
-                        let vertices = rest.vertices().iter().zip(u);
-                        let moved = vertices.map(|(&x, u)| add(x, u)).collect();
-                        MovedSurface::Deformed(field.of(rest.moved(moved)?))
+                    (Some(field), Motion::Surface(motion)) => {
+                        MovedSurface::Deformed(field.of(motion.carry(field.surface())?))
                     }
                 })
             })
@@ -207,14 +203,7 @@ impl<'a> Seats<'a> {
     pub fn closest(&self, i: usize, at: [f64; 3]) -> (Closest, Option<f64>) {
         let own = sub(at, self.seats[i].offset);
         let found = match &self.surfaces[self.sliding.nodes[i].segment] {
-            MovedSurface::Rigid(field, rigid) => {
-                let found = field.surface().closest_one(rigid.apply_inverse(own));
-                Closest {
-                    point: rigid.apply(found.point),
-                    normal: rigid.rotate(found.normal),
-                    ..found
-                }
-            }
+            MovedSurface::Rigid(field, rigid) => rigid.closest(field.surface(), own),
             MovedSurface::Deformed(field) => field.surface().closest_one(own),
             MovedSurface::Unused => {
                 Closest { point: own, on_border: false, ..self.sliding.rest[i] }
@@ -234,19 +223,19 @@ impl<'a> Seats<'a> {
 
     /// Lattice spacing of the field of segment `s`, mm.
     fn spacing(&self, s: usize) -> f64 {
-        match &self.surfaces[s] {
-            MovedSurface::Rigid(field, _) => field.spacing(),
-            MovedSurface::Deformed(field) => field.spacing(),
-            MovedSurface::Unused => f64::INFINITY,
-        }
+        self.field(s).map_or(f64::INFINITY, Field::spacing)
     }
 
     /// Mean edge of the surface of segment `s`, mm.
     pub fn mean_edge(&self, s: usize) -> f64 {
+        self.field(s).map_or(0.0, |field| field.surface().mean_edge_length())
+    }
+
+    fn field(&self, s: usize) -> Option<&Field> {
         match &self.surfaces[s] {
-            MovedSurface::Rigid(field, _) => field.surface().mean_edge_length(),
-            MovedSurface::Deformed(field) => field.surface().mean_edge_length(),
-            MovedSurface::Unused => 0.0,
+            MovedSurface::Rigid(field, _) => Some(field),
+            MovedSurface::Deformed(field) => Some(field),
+            MovedSurface::Unused => None,
         }
     }
 }

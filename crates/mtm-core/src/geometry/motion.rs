@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Rotation2, Rotation3};
 
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::geometry::surface::{Closest, Surface};
-use crate::vector::{Vec3, of_each};
+use crate::vector::{Vec3, add, of_each};
 
 /// Largest entry by which RᵀR of a matrix that is to be read as a rigid motion may differ from I.
 ///
@@ -100,6 +100,12 @@ impl RigidMotion {
             let row = &self.matrix[i];
             row[0] * x + row[1] * y + row[2] * z
         })
+    }
+
+    /// Closest point of the moved `surface` to `point`, mm.
+    pub(crate) fn closest(&self, surface: &Surface, point: [f64; 3]) -> Closest {
+        let found = surface.closest_one(self.apply_inverse(point));
+        Closest { point: self.apply(found.point), normal: self.rotate(found.normal), ..found }
     }
 
     /// R⁻¹ v: the direction before the motion.
@@ -235,6 +241,15 @@ impl SurfaceMotion {
     /// does not depend on the number of threads.
     pub fn displacement(&self, points: &[[f64; 3]]) -> Vec<[f64; 3]> {
         of_each(points, |point| self.follow(point, &self.rest.closest_one(point)))
+    }
+
+    /// `surface`, whose vertices follow the motion.
+    ///
+    /// # Errors
+    /// A triangle that collapses.
+    pub(crate) fn carry(&self, surface: &Surface) -> Result<Surface> {
+        let moved = surface.vertices().iter().zip(self.displacement(surface.vertices()));
+        surface.moved(moved.map(|(&x, u)| add(x, u)).collect())
     }
 
     fn follow(&self, point: [f64; 3], closest: &Closest) -> [f64; 3] {

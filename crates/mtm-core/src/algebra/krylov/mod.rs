@@ -16,7 +16,7 @@ use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
 
 pub use crate::algebra::error_bound::PcgOptions;
 pub(crate) use crate::algebra::error_bound::Spectrum;
-pub use operator::{BlockJacobi, Operator, Preconditioner};
+pub use operator::{Operator, Preconditioner};
 pub use state::PcgOutcome;
 use state::State;
 pub(crate) use trial::{Trial, trial};

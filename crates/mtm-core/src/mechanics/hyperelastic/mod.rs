@@ -41,11 +41,6 @@ impl HyperelasticLaw {
         self.has_barrier && barrier::acts_at(f)
     }
 
-    /// The law called `name`.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::all().find(|law| law.name() == name)
-    }
-
     /// Every law.
     pub fn all() -> impl Iterator<Item = Self> {
         LAWS.iter().copied().map(Self::new)

@@ -64,11 +64,6 @@ impl Grid {
         self.len() == 0
     }
 
-    /// Centre of the last voxel, mm.
-    pub fn highest(&self) -> [f64; 3] {
-        [0, 1, 2].map(|a| self.origin[a] + (self.shape[a] - 1) as f64 * self.spacing[a])
-    }
-
     /// Centre of voxel `index` of the flat array, mm.
     pub fn centre(&self, index: usize) -> [f64; 3] {
         let [_, ny, nz] = self.shape;

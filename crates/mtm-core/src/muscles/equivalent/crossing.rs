@@ -17,8 +17,8 @@ pub(super) struct Touch {
     first: u32,
     /// How many there are.
     count: u32,
-    /// Whether the tet lies wholly inside.
-    is_whole: bool,
+    /// Whether the tet lies wholly inside the muscle.
+    pub is_whole: bool,
 }
 
 /// The tets that contain part of a muscle.
@@ -33,11 +33,6 @@ pub(super) struct Touches {
 }
 
 impl Touch {
-    /// Whether the tet lies wholly inside the muscle.
-    pub fn is_whole(&self) -> bool {
-        self.is_whole
-    }
-
     fn whole(tet: u32) -> Self {
         Self { tet, first: 0, count: 0, is_whole: true }
     }
@@ -74,14 +69,14 @@ impl Passage<'_> {
     /// A branch of tets whose box no triangle meets is decided by one evaluation if the winding number allows;
     /// its tets are then not examined.
     pub fn touches(&self) -> Touches {
-        let all: Vec<u32> = (0..self.muscle.n_triangles() as u32).collect();
+        let all: Vec<u32> = (0..self.muscle.corners.len() as u32).collect();
         self.visit(0, &all)
     }
 
     fn visit(&self, at: usize, triangles: &[u32]) -> Touches {
         let mut found = Touches::default();
         let Some(branch) = self.tree.branch(at) else { return found };
-        if !branch.bounds.meets(self.muscle.bounds()) {
+        if !branch.bounds.meets(&self.muscle.bounds) {
             return found;
         }
         let near: Vec<u32> = self.near(triangles, &branch.bounds);
@@ -117,7 +112,7 @@ impl Passage<'_> {
     }
 
     fn near(&self, triangles: &[u32], bounds: &AlignedBox) -> Vec<u32> {
-        let meets = |&&t: &&u32| self.muscle.triangle_box(t).meets(bounds);
+        let meets = |&&t: &&u32| self.muscle.boxes[t as usize].meets(bounds);
         triangles.iter().filter(meets).copied().collect()
     }
 
@@ -125,17 +120,17 @@ impl Passage<'_> {
     fn look_at(&self, leaf: &Branch, triangles: &[u32], found: &mut Touches) {
         for &tet in self.tree.tets(leaf) {
             let bounds = &self.boxes[tet as usize];
-            if !bounds.meets(self.muscle.bounds()) {
+            if !bounds.meets(&self.muscle.bounds) {
                 continue;
             }
             found.looked_at += 1;
             let corners =
                 self.mesh.tets()[tet as usize].map(|v| Vec3::from(self.mesh.nodes()[v as usize]));
-            let faces = Faces::new(&corners);
+            let faces = faces(&corners);
             let first = found.triangles.len();
             for &t in triangles {
-                if self.muscle.triangle_box(t).meets(bounds)
-                    && may_cross(&corners, &faces, self.muscle.corners(t))
+                if self.muscle.boxes[t as usize].meets(bounds)
+                    && may_cross(&corners, &faces, &self.muscle.corners[t as usize])
                 {
                     found.triangles.push(t);
                 }
@@ -148,7 +143,7 @@ impl Passage<'_> {
                 match self.muscle.side_of(&centroid, radius) {
                     Side::Inside => found.tets.push(Touch::whole(tet)),
                     Side::Outside => {}
-                    Side::Mixed => found.tets.push(Touch { tet, first: 0, count, is_whole: false }),
+                    Side::Mixed => found.tets.push(Touch { is_whole: false, ..Touch::whole(tet) }),
                 }
             } else {
                 found.tets.push(Touch { tet, first: first as u32, count, is_whole: false });
@@ -158,20 +153,16 @@ impl Passage<'_> {
 }
 
 /// Outward normals of a tet's faces, and their offsets.
-struct Faces([(Vec3, f64); 4]);
-
-impl Faces {
-    fn new([a, b, c, d]: &[Vec3; 4]) -> Self {
-        let face = |p: &Vec3, q: &Vec3, r: &Vec3| {
-            let normal = (q - p).cross(&(r - p));
-            (normal, normal.dot(p))
-        };
-        Self([face(b, c, d), face(a, d, c), face(a, b, d), face(a, c, b)])
-    }
+fn faces([a, b, c, d]: &[Vec3; 4]) -> [(Vec3, f64); 4] {
+    let face = |p: &Vec3, q: &Vec3, r: &Vec3| {
+        let normal = (q - p).cross(&(r - p));
+        (normal, normal.dot(p))
+    };
+    [face(b, c, d), face(a, d, c), face(a, b, d), face(a, c, b)]
 }
 
 /// False only if a face of the tet, or the plane of the triangle, separates the two.
-fn may_cross(tet: &[Vec3; 4], Faces(faces): &Faces, triangle: &[Vec3; 3]) -> bool {
+fn may_cross(tet: &[Vec3; 4], faces: &[(Vec3, f64); 4], triangle: &[Vec3; 3]) -> bool {
     if faces.iter().any(|(n, offset)| triangle.iter().all(|p| n.dot(p) > *offset)) {
         return false;
     }

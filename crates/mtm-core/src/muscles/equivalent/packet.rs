@@ -101,7 +101,7 @@ impl Packet {
         let [x, y, z] = if offset == Vec3::zeros() { &self.coordinates } else { &self.shifted };
         self.turns.fill(0.0);
         for &t in near {
-            let corners = muscle.corners(t).map(|c| c - anchor);
+            let corners = muscle.corners[t as usize].map(|c| c - anchor);
             if let Some(gate) = Gate::new(&corners, muscle.orientation) {
                 gate.count(x, y, z, &mut self.turns);
             }
@@ -116,7 +116,7 @@ impl Packet {
         let clearance = CLEARANCE * radius;
         let is_clear = |p: &Vec3| {
             near.iter().all(|&t| {
-                let corners = muscle.corners(t);
+                let corners = &muscle.corners[t as usize];
                 let normal = (corners[1] - corners[0]).cross(&(corners[2] - corners[0]));
                 let height = normal.dot(&(p - corners[0])).abs();
                 height > clearance * normal.norm()

@@ -41,9 +41,11 @@ pub enum Side {
 #[derive(Debug)]
 pub struct MuscleShape<'a> {
     surface: &'a Surface,
-    corners: Vec<[Vec3; 3]>,
-    boxes: Vec<AlignedBox>,
-    bounds: AlignedBox,
+    pub(super) corners: Vec<[Vec3; 3]>,
+    /// Of each triangle.
+    pub(super) boxes: Vec<AlignedBox>,
+    /// Around the whole surface: no point outside it counts as inside.
+    pub(super) bounds: AlignedBox,
     border: Border,
     tree: WindingTree,
     /// Volume between the triangles and the centre of their box, mm³.
@@ -68,23 +70,6 @@ impl<'a> MuscleShape<'a> {
         };
         let tree = WindingTree::with_options(surface, &options).expect("both betas are allowed");
         Self { surface, corners, boxes, bounds, border, tree, signed_volume, orientation, test }
-    }
-
-    pub(super) fn n_triangles(&self) -> usize {
-        self.corners.len()
-    }
-
-    pub(super) fn corners(&self, triangle: u32) -> &[Vec3; 3] {
-        &self.corners[triangle as usize]
-    }
-
-    pub(super) fn triangle_box(&self, triangle: u32) -> &AlignedBox {
-        &self.boxes[triangle as usize]
-    }
-
-    /// Box around the whole surface: no point outside it counts as inside.
-    pub fn bounds(&self) -> &AlignedBox {
-        &self.bounds
     }
 
     /// Volume that the surface encloses, mm³; none if it has a border. Vertices at the same position are

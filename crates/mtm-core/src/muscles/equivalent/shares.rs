@@ -170,7 +170,7 @@ impl Sampler<'_> {
                     (self.stop)();
                 }
                 let muscles = touched.of(i);
-                if muscles.iter().all(|(_, touch)| touch.is_whole()) {
+                if muscles.iter().all(|(_, touch)| touch.is_whole) {
                     self.whole(muscles)
                 } else {
                     self.sampled(muscles, scratch)
@@ -210,7 +210,7 @@ impl Sampler<'_> {
         inside.clear();
         inside.resize(n * muscles.len(), true);
         for ((muscle, touch), side) in muscles.iter().zip(inside.chunks_exact_mut(n)) {
-            if !touch.is_whole() {
+            if !touch.is_whole {
                 let triangles = self.touches[*muscle as usize].triangles(touch);
                 packet.inside(&self.shapes[*muscle as usize], triangles, side);
             }
@@ -251,7 +251,7 @@ impl Sampler<'_> {
             fraction: in_muscle as f64 / n as f64,
             fibre: all.mean(),
             samples: n,
-            crossing: muscles.iter().filter(|(_, touch)| !touch.is_whole()).count(),
+            crossing: muscles.iter().filter(|(_, touch)| !touch.is_whole).count(),
         }
     }
 }

@@ -272,11 +272,7 @@ impl MuscleFibres {
 
     /// Unit direction of the fibres at `point` (mm, finite); its sign has no meaning.
     pub fn direction(&self, point: [f64; 3]) -> [f64; 3] {
-        let x = Vec3::from(point);
-        match &self.courses {
-            Some(courses) => blended(courses.tangents(courses.segments(), &x)).into(),
-            None => self.direction_of_boxes(&x).into(),
-        }
+        self.direction_by(Courses::segments, &Vec3::from(point)).into()
     }
 
     /// Writes into `near` the data that determine the directions in a ball (mm).
@@ -289,14 +285,18 @@ impl MuscleFibres {
     /// Unit direction of the fibres at `point` of the ball that `near` was filled for: the same as
     /// [`MuscleFibres::direction`], at lower cost.
     pub fn direction_near(&self, near: &NearFibres, point: [f64; 3]) -> [f64; 3] {
-        let x = Vec3::from(point);
-        match &self.courses {
-            Some(courses) => blended(courses.tangents(&near.0, &x)).into(),
-            None => self.direction_of_boxes(&x).into(),
-        }
+        self.direction_by(|_| &near.0, &Vec3::from(point)).into()
     }
 
-    fn direction_of_boxes(&self, x: &Vec3) -> Vec3 {
+    /// The direction at `x` from `segments` of the courses, or from the boxes if there are none.
+    fn direction_by<'a>(
+        &'a self,
+        segments: impl Fn(&'a Courses) -> &'a Segments,
+        x: &'a Vec3,
+    ) -> Vec3 {
+        if let Some(courses) = &self.courses {
+            return blended(courses.tangents(segments(courses), x));
+        }
         let distance = |reach: &Reach| (reach.scaled * (x - reach.centre)).norm_squared();
         let least = self.reaches.iter().map(distance).fold(f64::INFINITY, f64::min);
         let near = self.reaches.iter().filter_map(|reach| {

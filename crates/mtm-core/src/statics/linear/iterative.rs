@@ -13,7 +13,7 @@ use crate::algebra::krylov::{
     Trial, pcg_near,
 };
 use crate::algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions};
-use crate::algebra::relaxation::{RelaxationOptions, relax};
+use crate::algebra::relaxation::relax;
 use crate::contact::links::Link;
 use crate::error::{MtmError, Result, Shortfall};
 use crate::mechanics::tissue::Tissue;
@@ -26,8 +26,6 @@ use crate::statics::linear::unstable::{at_fault, carry_on};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::vector::{add, dot, norm, scaled, sub};
 
-/// Over-relaxation of the node-wise iteration.
-const RELAXATION_FACTOR: f64 = 1.6;
 /// Sweeps after which the node-wise iteration stops with an error.
 const MAX_SWEEPS: usize = 200_000;
 /// Estimated error of a solution that is worth nothing, over the largest displacement.
@@ -385,13 +383,8 @@ impl Iterative {
         let most = self.max_iterations.unwrap_or(MAX_SWEEPS);
         let (mut x, mut goal, mut sweeps) = (vec![[0.0; 3]; b.len()], tolerance, 0);
         loop {
-            let options = RelaxationOptions {
-                tolerance: goal,
-                factor: RELAXATION_FACTOR,
-                max_sweeps: most - sweeps,
-            };
-            let found =
-                relax(matrix, b, &x, &options, solve.interrupted).map_err(|e| gave_up(e, most))?;
+            let found = relax(matrix, b, &x, (goal, most - sweeps), solve.interrupted)
+                .map_err(|e| gave_up(e, most))?;
             (x, sweeps) = (found.solution, sweeps + found.sweeps);
             solve.effort.add(found.sweeps, found.steps);
             let rest: Vec<[f64; 3]> =
@@ -463,7 +456,18 @@ pub(crate) fn hierarchy(
     normals: &[(usize, [f64; 3])],
     tissue: Extremes,
 ) -> Result<Multigrid> {
-    Multigrid::new(matrix, positions, normals, &multigrid_options(tissue))
+    let defaults = MultigridOptions::default();
+    let compressible = tissue.lame_ratio < NEARLY_INCOMPRESSIBLE;
+    let options = MultigridOptions {
+        smoother_degree: if compressible { 1 } else { 2 } * defaults.smoother_degree,
+        precision: if compressible && tissue.contrast <= SINGLE_CONTRAST {
+            CyclePrecision::Single
+        } else {
+            CyclePrecision::Double
+        },
+        ..defaults
+    };
+    Multigrid::new(matrix, positions, normals, &options)
 }
 
 /// Extreme material ratios of a tissue.
@@ -479,21 +483,6 @@ impl Extremes {
     /// Those of `tissue`.
     pub fn of(tissue: &Tissue) -> Self {
         Self { lame_ratio: tissue.largest_lame_ratio(), contrast: tissue.contrast() }
-    }
-}
-
-/// Options of the cycle for such a tissue.
-fn multigrid_options(tissue: Extremes) -> MultigridOptions {
-    let defaults = MultigridOptions::default();
-    let compressible = tissue.lame_ratio < NEARLY_INCOMPRESSIBLE;
-    MultigridOptions {
-        smoother_degree: if compressible { 1 } else { 2 } * defaults.smoother_degree,
-        precision: if compressible && tissue.contrast <= SINGLE_CONTRAST {
-            CyclePrecision::Single
-        } else {
-            CyclePrecision::Double
-        },
-        ..defaults
     }
 }
 
