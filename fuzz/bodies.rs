@@ -329,7 +329,7 @@ fn construct(bytes: &mut Bytes<'_>) -> Result<(), MtmError> {
         let surface = bytes.surface()?;
         let points: Vec<[f64; 3]> =
             bytes.rows(3).into_iter().filter(|p| p.iter().all(|v| v.abs() < 1e9)).collect();
-        finite("area", &[surface.area(), surface.mean_edge_length(), surface.diagonal()]);
+        finite("area", &[surface.area(), surface.mean_edge_length()]);
         for c in surface.closest(&points) {
             finite("closest", &[c.distance, c.signed_distance]);
             finite("closest point", &c.point);

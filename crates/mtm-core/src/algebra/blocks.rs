@@ -164,3 +164,12 @@ impl Kernel for RowProducts<'_> {
         }
     }
 }
+
+/// 0, c₀, c₀ + c₁, …
+pub(crate) fn running_sum(counts: impl IntoIterator<Item = usize>) -> Vec<usize> {
+    let ends = counts.into_iter().scan(0, |sum, count| {
+        *sum += count;
+        Some(*sum)
+    });
+    std::iter::once(0).chain(ends).collect()
+}

@@ -72,7 +72,7 @@ pub struct SlidingNode {
 }
 
 /// The sliding nodes of a scene with their contact surfaces at rest.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Sliding {
     pub(crate) nodes: Vec<SlidingNode>,
     pub(crate) positions: Vec<[f64; 3]>,
@@ -229,17 +229,7 @@ impl Sliding {
         if !boundary.has_sliding() {
             return Ok(None);
         }
-        let mut sliding = Self {
-            nodes: Vec::new(),
-            positions: Vec::new(),
-            rest: Vec::new(),
-            rest_normals: Vec::new(),
-            gaps: Vec::new(),
-            stiffness: Vec::new(),
-            fields: Vec::new(),
-            names: Vec::new(),
-            diagonal: mesh.diagonal(),
-        };
+        let mut sliding = Self { diagonal: mesh.diagonal(), ..Self::default() };
         for (s, segment) in boundary.segments().iter().enumerate() {
             sliding.names.push(segment.name.clone());
             let (false, Some(surface)) = (segment.sliding.is_empty(), &segment.contact) else {

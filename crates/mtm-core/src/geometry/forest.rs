@@ -15,7 +15,7 @@ impl Forest {
     }
 
     /// The smallest member of the set of `i`.
-    pub fn root(&mut self, mut i: usize) -> usize {
+    fn root(&mut self, mut i: usize) -> usize {
         while self.0[i] as usize != i {
             self.0[i] = self.0[self.0[i] as usize];
             i = self.0[i] as usize;
@@ -27,5 +27,20 @@ impl Forest {
     pub fn join(&mut self, a: usize, b: usize) {
         let (a, b) = (self.root(a), self.root(b));
         self.0[a.max(b)] = a.min(b) as u32;
+    }
+
+    /// Number of the set of each member, in the order of the smallest members.
+    pub fn numbered(mut self) -> Vec<u32> {
+        let (mut numbers, mut count) = (vec![0; self.0.len()], 0);
+        for i in 0..numbers.len() {
+            let root = self.root(i);
+            if root == i {
+                numbers[i] = count;
+                count += 1;
+            } else {
+                numbers[i] = numbers[root];
+            }
+        }
+        numbers
     }
 }

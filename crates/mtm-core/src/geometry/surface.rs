@@ -59,7 +59,6 @@ struct Shape {
     bvh: Bvh,
     area: f64,
     volume: f64,
-    diagonal: f64,
     mean_edge: f64,
 }
 
@@ -258,24 +257,14 @@ impl Surface {
         &self.topology.edges
     }
 
-    /// Edges that one triangle uses, in that triangle's direction.
-    pub fn border_edges(&self) -> &[[u32; 2]] {
-        &self.topology.border_edges
-    }
-
     /// Number of edges that one triangle uses.
     pub fn n_border_edges(&self) -> usize {
-        self.topology.border_edges.len()
+        self.topology.n_border_edges
     }
 
     /// Whether every directed edge is used exactly once, and its reverse exactly once.
     pub fn is_closed(&self) -> bool {
         self.topology.is_closed
-    }
-
-    /// Whether no directed edge is used twice.
-    pub fn is_consistently_oriented(&self) -> bool {
-        self.topology.is_consistently_oriented
     }
 
     /// Enclosed volume, mm³, negative if the normals point inward; none for a surface that is not
@@ -287,11 +276,6 @@ impl Surface {
     /// Total area, mm².
     pub fn area(&self) -> f64 {
         self.shape.area
-    }
-
-    /// Diagonal of the bounding box of the triangles, mm.
-    pub fn diagonal(&self) -> f64 {
-        self.shape.diagonal
     }
 
     /// Mean edge length, mm; an edge of two triangles counts once.
@@ -376,7 +360,6 @@ impl Shape {
     fn new(vertices: Vec<[f64; 3]>, topology: &Topology, facets: Vec<Facet>, bvh: Bvh) -> Self {
         let mut group_sums = vec![Vec3::zeros(); topology.group_vertex.len()];
         let mut vertex_sums = vec![Vec3::zeros(); vertices.len()];
-        let (mut low, mut high) = (Vec3::repeat(f64::INFINITY), Vec3::repeat(f64::NEG_INFINITY));
         let (mut area, mut volume) = (0.0, 0.0);
         // Volumes of tets to a point near the surface: the digits of a distant origin would be
         // lost.
@@ -385,8 +368,6 @@ impl Shape {
             let corners = triangle::corners(&vertices, topology.triangles[t]);
             for k in 0..3 {
                 group_sums[topology.groups[t][k] as usize] += facet.normal * facet.angles[k];
-                low = low.inf(&corners[k]);
-                high = high.sup(&corners[k]);
             }
             area += facet.area;
             volume += facet.area * facet.normal.dot(&(corners[0] - origin)) / 3.0;
@@ -416,7 +397,6 @@ impl Shape {
             bvh,
             area,
             volume,
-            diagonal: (high - low).norm(),
             mean_edge,
             vertices,
         }

@@ -20,9 +20,8 @@ pub(crate) struct Topology {
     pub triangles: Vec<[u32; 3]>,
     /// Each undirected edge once, smaller vertex first, in ascending order.
     pub edges: Vec<[u32; 2]>,
-    /// Edges used by one triangle, in that triangle's direction, ascending by their sorted
-    /// vertices.
-    pub border_edges: Vec<[u32; 2]>,
+    /// Number of edges used by one triangle.
+    pub n_border_edges: usize,
     /// Triangle across each edge where exactly two oppositely directed triangles meet.
     pub neighbours: Vec<[u32; 3]>,
     /// Whether each edge of a triangle is used by it alone.
@@ -37,8 +36,6 @@ pub(crate) struct Topology {
     pub group_triangle: Vec<u32>,
     /// Every directed edge is used once and so is its reverse.
     pub is_closed: bool,
-    /// No directed edge is used twice.
-    pub is_consistently_oriented: bool,
 }
 
 /// One side of a triangle, filed under its undirected edge.
@@ -64,23 +61,21 @@ impl Topology {
     ) -> Self {
         let sides = TriangleSide::sorted(&triangles);
         let mut edges = Vec::with_capacity(sides.len() / 2 + 1);
-        let mut border_edges = Vec::new();
+        let mut n_border_edges = 0;
         let mut neighbours = vec![[NO_TRIANGLE; 3]; triangles.len()];
         let mut on_border = vec![[false; 3]; triangles.len()];
         let mut border_vertex = vec![false; n_vertices];
         let mut joints = Forest::new(3 * triangles.len());
-        let (mut is_closed, mut is_consistently_oriented) = (true, true);
+        let mut is_closed = true;
         let smooth_cosine = crease_angle.cos() - CREASE_ROUNDING;
         for run in sides.chunk_by(|a, b| a.edge == b.edge) {
             edges.push(run[0].edge);
             let ascending = run.iter().filter(|side| side.ascending).count();
-            let descending = run.len() - ascending;
-            is_closed &= ascending == 1 && descending == 1;
-            is_consistently_oriented &= ascending <= 1 && descending <= 1;
+            is_closed &= ascending == 1 && run.len() == 2;
             match run {
                 [side] => {
                     let [low, high] = side.edge;
-                    border_edges.push(if side.ascending { [low, high] } else { [high, low] });
+                    n_border_edges += 1;
                     on_border[side.triangle as usize][side.k as usize] = true;
                     border_vertex[low as usize] = true;
                     border_vertex[high as usize] = true;
@@ -104,7 +99,7 @@ impl Topology {
         Self {
             triangles,
             edges,
-            border_edges,
+            n_border_edges,
             neighbours,
             on_border,
             border_vertex,
@@ -112,7 +107,6 @@ impl Topology {
             group_vertex,
             group_triangle,
             is_closed,
-            is_consistently_oriented,
         }
     }
 }
@@ -140,25 +134,14 @@ impl TriangleSide {
 }
 
 /// Group of each corner, numbered by first corner; vertex and first triangle of each group.
-fn corner_groups(
-    mut joints: Forest,
-    triangles: &[[u32; 3]],
-) -> (Vec<[u32; 3]>, Vec<u32>, Vec<u32>) {
-    let mut groups = vec![[0; 3]; triangles.len()];
-    let (mut group_vertex, mut group_triangle) = (Vec::new(), Vec::new());
-    for (t, triangle) in triangles.iter().enumerate() {
-        for k in 0..3 {
-            let corner = 3 * t + k;
-            let root = joints.root(corner);
-            // The root is the smallest corner of its set, so it was numbered before.
-            groups[t][k] = if root == corner {
-                group_vertex.push(triangle[k]);
-                group_triangle.push(t as u32);
-                group_vertex.len() as u32 - 1
-            } else {
-                groups[root / 3][root % 3]
-            };
+fn corner_groups(joints: Forest, triangles: &[[u32; 3]]) -> (Vec<[u32; 3]>, Vec<u32>, Vec<u32>) {
+    let numbers = joints.numbered();
+    let (mut vertex, mut triangle) = (Vec::new(), Vec::new());
+    for (corner, (&group, &v)) in numbers.iter().zip(triangles.as_flattened()).enumerate() {
+        if group as usize == vertex.len() {
+            vertex.push(v);
+            triangle.push((corner / 3) as u32);
         }
     }
-    (groups, group_vertex, group_triangle)
+    (numbers.as_chunks::<3>().0.to_vec(), vertex, triangle)
 }

@@ -12,7 +12,7 @@ use nalgebra::{Cholesky, Matrix3, Matrix6, SVector, SymmetricEigen, Vector3};
 
 use crate::mechanics::hyperelastic::{PointResponse, Tangent, cofactor};
 use crate::mechanics::kinematics::Kinematics;
-use crate::mechanics::material::{Lame, Voigt};
+use crate::mechanics::material::{Lame, PAIRS, Voigt, voigt_matrix};
 use crate::mechanics::polar::{Polar, small_tangent};
 use crate::mechanics::tissue::TetMaterial;
 
@@ -22,8 +22,6 @@ const LEAST_STRETCH_SUM: f64 = 1e-2;
 /// Stiffness added to a tangent, relative to its largest entry, so that its zero eigenvalues, such as those of
 /// rotations at rest, do not become negative by rounding. Newton's method converges as fast with it.
 const DEFINITE_LIFT: f64 = 1e-10;
-/// Rows and columns of strain components in Voigt order.
-const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
 /// A deformation, row by row.
 type Mode = SVector<f64, 9>;
 /// Index in Voigt order of each entry of a tensor, row by row.
@@ -61,15 +59,14 @@ impl Density {
             TetMaterial::Isotropic(lame) => Stiffness::Isotropic(*lame),
             other => Stiffness::General(other.voigt()),
         };
-        match kinematics {
-            Kinematics::Linear | Kinematics::Corotational => {
-                return Self { isotropic: None, stretch: Some(stiffness) };
+        match (kinematics, stiffness) {
+            (Kinematics::Linear | Kinematics::Corotational, _) => {
+                Self { isotropic: None, stretch: Some(stiffness) }
             }
-            Kinematics::Hyperelastic(_) => {}
-        }
-        match stiffness {
-            Stiffness::Isotropic(lame) => Self { isotropic: Some(lame), stretch: None },
-            Stiffness::General(c) => {
+            (Kinematics::Hyperelastic(_), Stiffness::Isotropic(lame)) => {
+                Self { isotropic: Some(lame), stretch: None }
+            }
+            (Kinematics::Hyperelastic(_), Stiffness::General(c)) => {
                 let lame = nearest_isotropic(&c);
                 let mut rest = c;
                 for (i, row) in rest.iter_mut().enumerate() {
@@ -283,9 +280,7 @@ impl Stiffness {
             }
         }
     }
-}
 
-impl Stiffness {
     /// C in the axes given by the columns of `v`, by the stress transformation of Bond (1943).
     fn in_frame(&self, v: &Matrix3<f64>) -> Voigt {
         match self {
@@ -304,8 +299,7 @@ impl Stiffness {
                     let one = v[(k, i)] * v[(l, j)];
                     if k == l { one } else { one + v[(l, i)] * v[(k, j)] }
                 });
-                let c = Matrix6::from_fn(|i, j| 0.5 * (c[i][j] + c[j][i]));
-                let turned = bond * c * bond.transpose();
+                let turned = bond * voigt_matrix(c) * bond.transpose();
                 std::array::from_fn(|i| std::array::from_fn(|j| turned[(i, j)]))
             }
         }

@@ -11,6 +11,9 @@ pub const DEFINITE_RATIO: f64 = 1e-12;
 /// Stiffness in Voigt order xx, yy, zz, yz, xz, xy with engineering shears, MPa, row by row.
 pub type Voigt = [[f64; 6]; 6];
 
+/// Rows and columns of strain components in Voigt order.
+pub(crate) const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
+
 /// Lamé constants, MPa.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lame {
@@ -199,11 +202,8 @@ impl Spencer {
     pub fn eigenvalue_range(&self) -> (f64, f64) {
         let mu_l = self.mu_across + self.mu_difference;
         let c12 = self.lambda_ + self.alpha;
-        let c11 = self.lambda_
-            + 2.0 * self.mu_across
-            + 2.0 * self.alpha
-            + 4.0 * self.mu_difference
-            + self.beta;
+        let c11 = self.lambda_ + 2.0 * self.mu_across + 2.0 * self.alpha;
+        let c11 = c11 + 4.0 * self.mu_difference + self.beta;
         let c22_23 = 2.0 * (self.lambda_ + self.mu_across);
         let (mean, half) = (0.5 * (c11 + c22_23), 0.5 * (c11 - c22_23));
         let large = mean + half.hypot(std::f64::consts::SQRT_2 * c12);
@@ -229,7 +229,6 @@ impl Spencer {
 
     /// Stiffness in global axes for the unit fibre `a`.
     pub fn voigt(&self, a: [f64; 3]) -> Voigt {
-        const PAIRS: [(usize, usize); 6] = [(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)];
         let delta = |i: usize, j: usize| f64::from(u8::from(i == j));
         let mut c = [[0.0; 6]; 6];
         for (row, &(i, j)) in PAIRS.iter().enumerate() {

@@ -3,7 +3,7 @@
 
 mod part;
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
@@ -168,12 +168,12 @@ impl StrainEnergy {
 
     /// Takes the memory of the last state and tangent; another thread's call meanwhile starts with none.
     fn take_scratch(&self) -> TetValues {
-        std::mem::take(&mut *self.memory.values.lock().unwrap_or_else(PoisonError::into_inner))
+        std::mem::take(&mut *locked(&self.memory.values))
     }
 
     /// Keeps `scratch` for the next state and tangent.
     fn keep_scratch(&self, scratch: TetValues) {
-        *self.memory.values.lock().unwrap_or_else(PoisonError::into_inner) = scratch;
+        *locked(&self.memory.values) = scratch;
     }
 
     /// Energy and forces under displacements of all nodes, mm.
@@ -247,8 +247,7 @@ impl StrainEnergy {
     ///
     /// `lag`: the change of any entry of F up to which a definite tangent is kept.
     pub(crate) fn begin(&self, lag: f64) -> PointTangents {
-        let freed = &mut *self.memory.tangents.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut tangents = std::mem::take(freed);
+        let mut tangents = std::mem::take(&mut *locked(&self.memory.tangents));
         tangents.at.clear();
         tangents.lag = lag;
         tangents
@@ -256,7 +255,7 @@ impl StrainEnergy {
 
     /// Ends a series, whose memory the next one uses.
     pub(crate) fn end(&self, tangents: PointTangents) {
-        *self.memory.tangents.lock().unwrap_or_else(PoisonError::into_inner) = tangents;
+        *locked(&self.memory.tangents) = tangents;
     }
 
     /// Tangent stiffness under displacements of all nodes, N/mm, on the pattern of the tensors.
@@ -373,6 +372,10 @@ impl StrainEnergy {
             energy: patches.energy(&averages),
         })
     }
+}
+
+fn locked<T>(memory: &Mutex<T>) -> MutexGuard<'_, T> {
+    memory.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The rows of `task`: g_aᵀ H g_b of every tet around them.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use crate::algebra::blocks::{Block, BlockMatrix};
+use crate::algebra::blocks::{Block, BlockMatrix, running_sum};
 use crate::error::{ErrorKind, Result, check_displacements};
 use crate::mechanics::element::{Element, ElementNodes};
 use crate::mechanics::material::{Lame, Spencer, Voigt};
@@ -226,7 +226,7 @@ fn displacement_gradient(nodes: &ElementNodes, t: usize, u: &[[f64; 3]]) -> [[f6
 /// Block rows of the graph of nodes that share a tet or a patch, with blocks still zero.
 fn pattern(nodes: &ElementNodes, patches: Option<&Patches>) -> BlockMatrix {
     let n = nodes.n_nodes();
-    let rows: Vec<(Vec<u32>, Vec<u32>)> = (0..n.div_ceil(NODES_PER_TASK))
+    let (lengths, columns): (Vec<Vec<usize>>, Vec<Vec<u32>>) = (0..n.div_ceil(NODES_PER_TASK))
         .into_par_iter()
         .map(|task| {
             let (mut lengths, mut columns, mut row) = (Vec::new(), Vec::new(), Vec::new());
@@ -240,22 +240,13 @@ fn pattern(nodes: &ElementNodes, patches: Option<&Patches>) -> BlockMatrix {
                 }
                 row.sort_unstable();
                 row.dedup();
-                lengths.push(row.len() as u32);
+                lengths.push(row.len());
                 columns.extend_from_slice(&row);
             }
             (lengths, columns)
         })
-        .collect();
-    let mut row_start = Vec::with_capacity(n + 1);
-    row_start.push(0);
-    let mut columns = Vec::new();
-    for (lengths, part) in rows {
-        for length in lengths {
-            row_start.push(row_start[row_start.len() - 1] + length as usize);
-        }
-        columns.extend(part);
-    }
-    BlockMatrix::from_pattern(row_start, columns)
+        .unzip();
+    BlockMatrix::from_pattern(running_sum(lengths.concat()), columns.concat())
 }
 
 fn assemble_row(

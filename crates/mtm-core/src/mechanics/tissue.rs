@@ -97,12 +97,9 @@ impl Tissue {
     /// Tissue of any symmetric positive definite stiffness, one row or one per tet.
     pub fn from_stiffness(rows: Vec<Voigt>) -> Result<Self> {
         check_rows(rows.len())?;
-        let failure =
-            rows.par_iter().enumerate().find_map_first(|(tet, c)| check_voigt(tet, c).err());
-        match failure {
-            Some(error) => Err(error),
-            None => Ok(Self { law: Law::General(rows) }),
-        }
+        let checks = rows.par_iter().enumerate();
+        let failure = checks.find_map_first(|(tet, c)| check_voigt(tet, c).err());
+        failure.map_or(Ok(Self { law: Law::General(rows) }), Err)
     }
 
     /// Isotropic tissue of `n_tets` tets except for some: `rows[i]` is the stiffness of tet `tets[i]`.
@@ -124,10 +121,8 @@ impl Tissue {
             .par_iter()
             .zip(&rows)
             .find_map_first(|(&tet, c)| check_voigt(tet as usize, c).err());
-        match failure {
-            Some(error) => Err(error),
-            None => Ok(Self { law: Law::Composite { base: base.into(), rows, row_of } }),
-        }
+        let law = Law::Composite { base: base.into(), rows, row_of };
+        failure.map_or(Ok(Self { law }), Err)
     }
 
     /// Equivalent tissue of tets with muscle fraction `fraction` and unit `fibre` (ignored if the fraction is
@@ -206,9 +201,8 @@ impl Tissue {
             TetMaterial::Spencer(c, _) => c.mu_across + c.mu_difference * 2.0 / 3.0,
             TetMaterial::General(c) => (c[3][3] + c[4][4] + c[5][5]) / 3.0,
         };
-        let (least, most) = (0..self.n_rows())
-            .map(shear)
-            .fold((f64::INFINITY, 0.0_f64), |(least, most), v| (least.min(v), most.max(v)));
+        let range = |(least, most): (f64, f64), v: f64| (least.min(v), most.max(v));
+        let (least, most) = (0..self.n_rows()).map(shear).fold((f64::INFINITY, 0.0), range);
         most / least
     }
 

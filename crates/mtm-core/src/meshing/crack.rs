@@ -144,7 +144,7 @@ fn double(
         for p in 1..parts {
             let copy = (mesh.n_nodes() + copied.len()) as u32;
             copied.push(node as u32);
-            for (_, &t) in star.iter().enumerate().filter(|(i, _)| part[*i] == p) {
+            for (&t, _) in star.iter().zip(&part).filter(|(_, own)| **own == p) {
                 for v in tets[t as usize].iter_mut().filter(|v| **v as usize == node) {
                     *v = copy;
                 }

@@ -61,7 +61,7 @@ pub fn pieces(grid: &Grid, inside: &[bool], joined: Joined) -> Pieces {
             join_lines(&runs, ends, reach, &mut forest);
         }
     }
-    numbered(&runs, &starts, &mut forest, nz)
+    numbered(&runs, &starts, forest, nz)
 }
 
 /// Adds the runs of one line.
@@ -99,18 +99,11 @@ fn join_lines(
 }
 
 /// The pieces numbered in the order of their first runs.
-fn numbered(runs: &[Run], starts: &[usize], forest: &mut Forest, nz: usize) -> Pieces {
-    let mut numbers = vec![0_i32; runs.len()];
-    let mut sizes = vec![0];
-    for (run, Run { first, past }) in runs.iter().enumerate() {
-        let first_run = forest.root(run);
-        if first_run == run {
-            numbers[run] = sizes.len() as i32;
-            sizes.push(0);
-        } else {
-            numbers[run] = numbers[first_run];
-        }
-        sizes[numbers[run] as usize] += past - first;
+fn numbered(runs: &[Run], starts: &[usize], forest: Forest, nz: usize) -> Pieces {
+    let numbers: Vec<i32> = forest.numbered().into_iter().map(|number| number as i32 + 1).collect();
+    let mut sizes = vec![0; numbers.iter().max().map_or(1, |&last| last as usize + 1)];
+    for (&number, Run { first, past }) in numbers.iter().zip(runs) {
+        sizes[number as usize] += past - first;
     }
     let mut labels = vec![0_i32; (starts.len() - 1) * nz];
     for (line, voxels) in labels.chunks_mut(nz).enumerate() {

@@ -51,14 +51,8 @@ pub fn rigid_fit(
 ) -> Result<RigidFit> {
     check_coordinates("moving", moving)?;
     check_coordinates("fixed", fixed)?;
-    let ones;
-    let weights = match options.weights {
-        Some(weights) => weights,
-        None => {
-            ones = vec![1.0; moving.len()];
-            &ones
-        }
-    };
+    let ones = vec![1.0; moving.len()];
+    let weights = options.weights.unwrap_or(&ones);
     check_pairs(moving, fixed, weights)?;
     let pose = fit_pairs(moving, fixed, weights, options.scale)?;
     let residuals: Vec<f64> = moving

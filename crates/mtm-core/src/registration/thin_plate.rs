@@ -99,8 +99,8 @@ impl ThinPlateSpline {
 
         let scaled: Vec<Vec3> = about.iter().map(|s| s / radius).collect();
         let right = DMatrix::from_fn(n, 3, |i, axis| target[i][axis] - middle[axis]);
-        let system = PlateSystem::new(&scaled, smoothing / radius)
-            .ok_or_else(|| closest_pair(&about).into_error())?;
+        let system =
+            PlateSystem::new(&scaled, smoothing / radius).ok_or_else(|| closest_pair(&about).0)?;
         let (a, c) = system.solve(&right);
 
         // a = −w L belongs to −U/L, and c to 1 and the scaled coordinates.
@@ -300,12 +300,8 @@ impl PlateSystem {
         for i in 0..n {
             kernel[(i, i)] += smoothing;
         }
-        let affine =
-            DMatrix::from_fn(
-                n,
-                LEAST_LANDMARKS,
-                |i, k| if k == 0 { 1.0 } else { points[i][k - 1] },
-            );
+        let entry = |i: usize, k: usize| if k == 0 { 1.0 } else { points[i][k - 1] };
+        let affine = DMatrix::from_fn(n, LEAST_LANDMARKS, entry);
         let qr = affine.clone().qr();
         let mut transposed = DMatrix::identity(n, n);
         qr.q_tr_mul(&mut transposed);
@@ -344,32 +340,20 @@ impl PlateSystem {
     }
 }
 
-/// Two points and their distance.
-struct Pair {
-    first: usize,
-    second: usize,
-    distance: f64,
-}
-
-impl Pair {
-    fn into_error(self) -> MtmError {
-        let Self { first, second, distance } = self;
-        MtmError::CoincidentPoints { what: "source landmarks", first, second, distance }
-    }
-}
-
-/// The closest two of the points, of which there are at least two.
-fn closest_pair(points: &[Vec3]) -> Pair {
-    let mut closest = Pair { first: 0, second: 1, distance: f64::INFINITY };
+/// The closest two of the points, of which there are at least two, as an error; and their distance, mm.
+fn closest_pair(points: &[Vec3]) -> (MtmError, f64) {
+    let (mut pair, mut distance) = ((0, 1), f64::INFINITY);
     for second in 1..points.len() {
         for first in 0..second {
-            let distance = (points[first] - points[second]).norm();
-            if distance < closest.distance {
-                closest = Pair { first, second, distance };
+            let apart = (points[first] - points[second]).norm();
+            if apart < distance {
+                (pair, distance) = ((first, second), apart);
             }
         }
     }
-    closest
+    let (first, second) = pair;
+    let what = "source landmarks";
+    (MtmError::CoincidentPoints { what, first, second, distance }, distance)
 }
 
 fn check_landmarks(source: &[[f64; 3]], target: &[[f64; 3]], smoothing: f64) -> Result<()> {
@@ -397,9 +381,9 @@ fn check_landmarks(source: &[[f64; 3]], target: &[[f64; 3]], smoothing: f64) -> 
 /// Rejects points of which two coincide, or that are all coplanar.
 fn check_spread(about: &[Vec3]) -> Result<()> {
     let [.., size] = extents(about);
-    let closest = closest_pair(about);
-    if closest.distance <= COINCIDENT_DISTANCE * size {
-        return Err(closest.into_error());
+    let (error, distance) = closest_pair(about);
+    if distance <= COINCIDENT_DISTANCE * size {
+        return Err(error);
     }
     check_not_in_plane("source landmarks", about)
 }

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::blocks::{BlockMatrix, running_sum};
 use crate::boundary::NodeKind;
 pub(crate) use crate::contact::pairs::NO_ROW;
 
@@ -60,11 +60,7 @@ impl Reduction {
                 .filter(|(row, _)| *row != NO_ROW)
         };
         let lengths: Vec<usize> = unknowns.par_iter().map(|&j| kept(j).count()).collect();
-        let mut row_start = Vec::with_capacity(unknowns.len() + 1);
-        row_start.push(0);
-        for length in lengths {
-            row_start.push(row_start[row_start.len() - 1] + length);
-        }
+        let row_start = running_sum(lengths);
         let (columns, sources) = unknowns.par_iter().flat_map_iter(|&j| kept(j)).unzip();
         ReducedPattern { row_start, columns, sources }
     }

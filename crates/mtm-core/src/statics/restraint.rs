@@ -77,24 +77,18 @@ fn grow(mesh: &TetMesh, grounded: &mut [bool]) {
 /// Face-connected groups of the tets that still have a node not grounded.
 fn parts(mesh: &TetMesh, grounded: &[bool]) -> Vec<RigidPart> {
     let open = |t: usize| mesh.tets()[t].iter().any(|&v| !grounded[v as usize]);
-    let mut seen = vec![false; mesh.n_tets()];
+    let mut forest = Forest::new(mesh.n_tets());
+    for t in (0..mesh.n_tets()).filter(|&t| open(t)) {
+        for other in mesh.face_neighbours(t).filter(|&other| open(other as usize)) {
+            forest.join(t, other as usize);
+        }
+    }
+    let numbers = forest.numbered();
+    let mut order: Vec<usize> = (0..mesh.n_tets()).filter(|&t| open(t)).collect();
+    order.sort_by_key(|&t| numbers[t]);
     let mut parts = Vec::new();
-    for first in 0..mesh.n_tets() {
-        if seen[first] || !open(first) {
-            continue;
-        }
-        seen[first] = true;
-        let (mut stack, mut nodes) = (vec![first], Vec::new());
-        while let Some(t) = stack.pop() {
-            nodes.extend_from_slice(&mesh.tets()[t]);
-            for other in mesh.face_neighbours(t) {
-                let other = other as usize;
-                if !seen[other] && open(other) {
-                    seen[other] = true;
-                    stack.push(other);
-                }
-            }
-        }
+    for tets in order.chunk_by(|&s, &t| numbers[s] == numbers[t]) {
+        let mut nodes: Vec<u32> = tets.iter().flat_map(|&t| mesh.tets()[t]).collect();
         nodes.sort_unstable();
         nodes.dedup();
         let count = nodes.len() as f64;
@@ -224,8 +218,8 @@ fn touching(
         }
     }
     let mut chains: Vec<Vec<usize>> = vec![Vec::new(); open.len()];
-    for (at, &p) in open.iter().enumerate() {
-        chains[forest.root(at)].push(p);
+    for (chain, &p) in forest.numbered().into_iter().zip(open) {
+        chains[chain as usize].push(p);
     }
     chains.retain(|chain| !chain.is_empty());
     chains

@@ -8,7 +8,7 @@ use crate::contact::{ContactRow, ContactStart, Spring};
 pub type Timings = Vec<(&'static str, f64)>;
 
 /// Contact at the sliding nodes after a solve.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct ContactResult {
     /// The sliding nodes, segment by segment.
     pub nodes: Vec<u32>,
@@ -60,25 +60,6 @@ impl TouchResult {
     /// Largest depth of a node behind its surface or inside other tissue, mm.
     pub fn penetration(&self) -> f64 {
         self.gaps.iter().fold(self.overlap, |m, gap| m.max(-gap))
-    }
-}
-
-impl Default for ContactResult {
-    /// The result without sliding nodes.
-    fn default() -> Self {
-        Self {
-            nodes: Vec::new(),
-            points: Vec::new(),
-            normals: Vec::new(),
-            forces: Vec::new(),
-            gaps: Vec::new(),
-            active: Vec::new(),
-            rows: Vec::new(),
-            springs: Vec::new(),
-            unbalanced: 0.0,
-            at_rest: None,
-            converged: true,
-        }
     }
 }
 

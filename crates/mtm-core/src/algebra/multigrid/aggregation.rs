@@ -2,9 +2,10 @@
 
 use rayon::prelude::*;
 
-use super::block_rows::{row_index, running_sum, split_rows};
+use super::block_rows::split_rows;
 use super::precision::Stored;
 use super::scaled_matrix::ScaledMatrix;
+use crate::algebra::blocks::running_sum;
 
 /// No aggregate.
 pub(super) const UNASSIGNED: u32 = u32::MAX;
@@ -58,12 +59,12 @@ impl Aggregates {
                 sizes[aggregate as usize] += 1;
             }
         }
-        let member_start = running_sum(&sizes);
+        let member_start = running_sum(sizes);
         let mut next = member_start.clone();
         let mut members = vec![0; member_start[count]];
         for (i, &aggregate) in of_row.iter().enumerate() {
             if aggregate != UNASSIGNED {
-                members[next[aggregate as usize]] = row_index(i);
+                members[next[aggregate as usize]] = i as u32;
                 next[aggregate as usize] += 1;
             }
         }

@@ -60,20 +60,3 @@ pub(super) fn split_rows<'a, T>(
     }
     parts
 }
-
-/// 0, c₀, c₀ + c₁, …
-pub(super) fn running_sum(counts: &[usize]) -> Vec<usize> {
-    let mut sums = Vec::with_capacity(counts.len() + 1);
-    let mut sum = 0;
-    sums.push(0);
-    for &count in counts {
-        sum += count;
-        sums.push(sum);
-    }
-    sums
-}
-
-/// Row numbers are 32 bit, as in [`BlockMatrix`].
-pub(super) fn row_index(i: usize) -> u32 {
-    i as u32
-}

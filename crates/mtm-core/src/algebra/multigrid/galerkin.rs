@@ -2,9 +2,10 @@
 
 use rayon::prelude::*;
 
+use crate::algebra::blocks::running_sum;
 use crate::algebra::simd::{Kernel, widest};
 
-use super::block_rows::{SystemRows, row_index, running_sum, split_rows};
+use super::block_rows::{SystemRows, split_rows};
 use super::prolongator::{Prolongator, TransposedIndex};
 use super::rigid_modes::{MODES, ModeBlock};
 use super::small_blocks::add_transposed_product;
@@ -107,7 +108,7 @@ impl<const R: usize> Sums<R> {
     fn at(&mut self, row: u32) -> &mut [[f64; MODES]; R] {
         let place = &mut self.place[row as usize];
         if *place == UNSEEN {
-            *place = row_index(self.rows.len());
+            *place = self.rows.len() as u32;
             self.rows.push(row);
             self.blocks.push([[0.0; MODES]; R]);
         }
@@ -194,15 +195,15 @@ fn in_order(n: usize, upper: Vec<UpperRows>) -> CoarseMatrix {
             sizes[j] += 1;
         }
     });
-    let row_start = running_sum(&sizes);
+    let row_start = running_sum(sizes);
     let mut entries =
         vec![(0_u32, BlockPlace { task: 0, offset: 0, is_below: false }); row_start[n]];
     let mut next = row_start.clone();
     for_each_block(&upper, |i, j, place| {
-        entries[next[i]] = (row_index(j), place);
+        entries[next[i]] = (j as u32, place);
         next[i] += 1;
         if j != i {
-            entries[next[j]] = (row_index(i), BlockPlace { is_below: true, ..place });
+            entries[next[j]] = (i as u32, BlockPlace { is_below: true, ..place });
             next[j] += 1;
         }
     });
@@ -230,11 +231,8 @@ fn for_each_block(upper: &[UpperRows], mut visit: impl FnMut(usize, usize, Block
         let mut offset = 0;
         for &length in &rows.lengths {
             for &column in &rows.columns[offset..offset + length] {
-                let place = BlockPlace {
-                    task: row_index(task),
-                    offset: row_index(offset),
-                    is_below: false,
-                };
+                let place =
+                    BlockPlace { task: task as u32, offset: offset as u32, is_below: false };
                 visit(row, column as usize, place);
                 offset += 1;
             }

@@ -24,6 +24,13 @@ use super::transfer::Transfer;
 const STALL: f64 = 0.8;
 /// Number of rows above which the coarsest level is too large for a dense factorisation when coarsening stalls.
 const DENSE_LIMIT: usize = 400;
+/// Relative block norm above which two nodes are strongly connected; halved on each level.
+const STRENGTH: f64 = 0.08;
+/// Damping of the prolongator smoothing, as a multiple of 1/λ_max: of 4/3 to 1.6, what takes the fewest iterations on
+/// shells and heads (25 to 28).
+const DAMPING: f64 = 1.4;
+/// Maximum number of levels.
+const MOST_LEVELS: usize = 12;
 /// Vectors that a pass of the smoother reads or writes: d, r twice, the next d, x twice.
 const VECTORS_PER_PASS: usize = 6;
 
@@ -47,11 +54,11 @@ impl<P: Precision> Hierarchy<P> {
     ) -> Self {
         let mut coarse = Vec::new();
         let mut coarsest = None;
-        let (finest, mut next) = Level::new(a, scaling, modes, (options, 0));
+        let (finest, mut next) = Level::new(a, scaling, modes, 0);
         while let Some(mut system) = next {
             let depth = coarse.len() + 1;
             let rows = system.a.n_rows();
-            if rows <= options.coarsest_rows || depth + 1 >= options.max_levels {
+            if rows <= options.coarsest_rows || depth + 1 >= MOST_LEVELS {
                 if rows <= DENSE_LIMIT {
                     coarsest = Some(DenseCholesky::new(&system.a, &system.scaling));
                 } else {
@@ -60,7 +67,7 @@ impl<P: Precision> Hierarchy<P> {
                 break;
             }
             let modes = std::mem::take(&mut system.modes);
-            let (level, after) = Level::new(&system.a, &system.scaling, modes, (options, depth));
+            let (level, after) = Level::new(&system.a, &system.scaling, modes, depth);
             if after.is_none() && rows <= DENSE_LIMIT {
                 coarsest = Some(DenseCholesky::new(&system.a, &system.scaling));
                 break;
@@ -223,18 +230,18 @@ impl<const N: usize, P: Precision> Level<N, P> {
         a: &impl SystemRows<N>,
         scaling: &Scaling<N>,
         mut modes: Vec<[[f64; MODES]; N]>,
-        (options, depth): (&MultigridOptions, usize),
+        depth: usize,
     ) -> (Self, Option<CoarseSystem>) {
         let mut level = Self::lone(a, scaling);
         let matrix = &level.matrix;
-        let strength = options.strength * 0.5_f64.powi(depth.try_into().unwrap_or(i32::MAX));
+        let strength = STRENGTH * 0.5_f64.powi(depth.try_into().unwrap_or(i32::MAX));
         let aggregates = Aggregates::new(matrix, strength);
         if aggregates.count == 0 || aggregates.count as f64 > STALL * matrix.n_rows() as f64 {
             return (level, None);
         }
         scale_modes(&mut modes, scaling);
         let coarse_modes = orthonormalise(&aggregates, &mut modes);
-        let damping = options.prolongator_damping / matrix.largest_eigenvalue;
+        let damping = DAMPING / matrix.largest_eigenvalue;
         let p = Prolongator::smoothed(matrix, &aggregates, &modes, damping, scaling);
         drop(modes);
         let transposed = p.transposed();

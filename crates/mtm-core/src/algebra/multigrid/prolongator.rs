@@ -2,10 +2,11 @@
 
 use rayon::prelude::*;
 
+use crate::algebra::blocks::running_sum;
 use crate::algebra::simd::{Kernel, widest};
 
 use super::aggregation::{Aggregates, UNASSIGNED};
-use super::block_rows::{RowsPart, row_index, running_sum, split_rows};
+use super::block_rows::{RowsPart, split_rows};
 use super::precision::Stored;
 use super::rigid_modes::MODES;
 use super::scaled_matrix::ScaledMatrix;
@@ -47,7 +48,7 @@ impl<const N: usize> Prolongator<N> {
                 seen.len()
             })
             .collect();
-        let row_start = running_sum(&counts);
+        let row_start = running_sum(counts);
         let total = row_start[n];
         let mut columns = vec![0_u32; total];
         let mut blocks = vec![[[0.0; MODES]; N]; total];
@@ -76,15 +77,15 @@ impl<const N: usize> Prolongator<N> {
         for &c in &self.columns {
             sizes[c as usize] += 1;
         }
-        let start = running_sum(&sizes);
+        let start = running_sum(sizes);
         let mut next = start.clone();
         let mut rows = vec![0; self.columns.len()];
         let mut positions = vec![0; self.columns.len()];
         for i in 0..self.row_start.len() - 1 {
             for k in self.row_start[i]..self.row_start[i + 1] {
                 let slot = &mut next[self.columns[k] as usize];
-                rows[*slot] = row_index(i);
-                positions[*slot] = row_index(k);
+                rows[*slot] = i as u32;
+                positions[*slot] = k as u32;
                 *slot += 1;
             }
         }

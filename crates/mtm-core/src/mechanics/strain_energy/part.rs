@@ -4,7 +4,7 @@
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 
-use crate::algebra::blocks::BlockMatrix;
+use crate::algebra::blocks::{BlockMatrix, running_sum};
 use crate::mechanics::element::MOST_NODES;
 use crate::mechanics::hyperelastic::Tangent;
 use crate::mechanics::strain_energy::{
@@ -134,12 +134,9 @@ fn pattern(tets: &[PartTet], n_rows: usize) -> BlockMatrix {
             neighbours[row].extend(tet.rows().flatten().map(|column| column as u32));
         }
     }
-    let (mut row_start, mut columns) = (vec![0], Vec::new());
-    for mut row in neighbours {
+    for row in &mut neighbours {
         row.sort_unstable();
         row.dedup();
-        columns.extend(row);
-        row_start.push(columns.len());
     }
-    BlockMatrix::from_pattern(row_start, columns)
+    BlockMatrix::from_pattern(running_sum(neighbours.iter().map(Vec::len)), neighbours.concat())
 }

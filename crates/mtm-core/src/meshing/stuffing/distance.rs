@@ -100,22 +100,10 @@ fn scan(row: &mut [f32], spacing: f32, most: f32, target: impl Fn(usize) -> bool
     let n = row.len();
     // From each target as far as `most` or half-way to the next one.
     let spread = |row: &mut [f32], from: usize, to: usize| {
-        for (k, value) in row[from..to].iter_mut().enumerate() {
-            *value = (k as f32 * spacing).powi(2);
-            if *value > most {
-                *value = FAR;
-                break;
-            }
-        }
+        fill_away(row[from..to].iter_mut().zip(0..), spacing, most);
     };
     let spread_back = |row: &mut [f32], from: usize, to: usize| {
-        for (k, value) in row[from..to].iter_mut().rev().enumerate() {
-            *value = ((k + 1) as f32 * spacing).powi(2);
-            if *value > most {
-                *value = FAR;
-                break;
-            }
-        }
+        fill_away(row[from..to].iter_mut().rev().zip(1..), spacing, most);
     };
     let mut last: Option<usize> = None;
     for k in (0..n).filter(|&k| target(k)) {
@@ -132,6 +120,17 @@ fn scan(row: &mut [f32], spacing: f32, most: f32, target: impl Fn(usize) -> bool
     }
     if let Some(last) = last {
         spread(row, last, n);
+    }
+}
+
+/// Writes squared distances of values so many steps away from a target, up to the first beyond `most`.
+fn fill_away<'a>(values: impl Iterator<Item = (&'a mut f32, u32)>, spacing: f32, most: f32) {
+    for (value, steps) in values {
+        *value = (steps as f32 * spacing).powi(2);
+        if *value > most {
+            *value = FAR;
+            break;
+        }
     }
 }
 

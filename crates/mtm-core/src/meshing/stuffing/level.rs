@@ -105,26 +105,19 @@ impl LevelImage {
             for (row, labels) in rows.chunks_mut(nz).zip(labels.chunks(nz)) {
                 let at = |k: usize| if labels[k] { 1.0 } else { OUTSIDE };
                 for k in 0..nz {
-                    let low = if k > 0 { at(k - 1) } else { OUTSIDE };
-                    let high = if k + 1 < nz { at(k + 1) } else { OUTSIDE };
-                    row[k] = 0.25 * (low + high) + 0.5 * at(k);
+                    row[k] = smoothed(k, nz, at);
                 }
             }
             for j in 0..ny {
                 for k in 0..nz {
-                    let low = if j > 0 { rows[(j - 1) * nz + k] } else { OUTSIDE };
-                    let high = if j + 1 < ny { rows[(j + 1) * nz + k] } else { OUTSIDE };
-                    out[j * nz + k] = 0.25 * (low + high) + 0.5 * rows[j * nz + k];
+                    out[j * nz + k] = smoothed(j, ny, |j| rows[j * nz + k]);
                 }
             }
         });
         let mut values = vec![0.0_f32; grid.len()];
         values.par_chunks_mut(plane).enumerate().for_each(|(i, out)| {
             for (p, value) in out.iter_mut().enumerate() {
-                let at = |i: usize| smooth[i * plane + p];
-                let low = if i > 0 { at(i - 1) } else { OUTSIDE };
-                let high = if i + 1 < nx { at(i + 1) } else { OUTSIDE };
-                let level = 0.25 * (low + high) + 0.5 * at(i);
+                let level = smoothed(i, nx, |i| smooth[i * plane + p]);
                 *value = if inside[i * plane + p] {
                     level.max(LABEL_FLOOR)
                 } else {
@@ -254,4 +247,12 @@ impl LevelImage {
             })
             .count() as u64
     }
+}
+
+/// Place `i` of a line of `n` values under the filter (1 2 1)/4; beyond its ends is outside.
+#[inline(always)]
+fn smoothed(i: usize, n: usize, at: impl Fn(usize) -> f32) -> f32 {
+    let low = if i > 0 { at(i - 1) } else { OUTSIDE };
+    let high = if i + 1 < n { at(i + 1) } else { OUTSIDE };
+    0.25 * (low + high) + 0.5 * at(i)
 }

@@ -275,7 +275,7 @@ impl Cover {
     fn active(&self, level: &LevelImage) -> Vec<bool> {
         let grid = level.grid();
         let [nx, ny, nz] = self.counts;
-        let occupied: Vec<bool> = (0..nx * ny * nz)
+        (0..nx * ny * nz)
             .into_par_iter()
             .map(|c| {
                 let cube = [c / (ny * nz), c / nz % ny, c % nz];
@@ -298,26 +298,15 @@ impl Cover {
                     })
                 })
             })
-            .collect();
-        occupied
+            .collect()
     }
 }
 
 /// Smallest box around the voxel centres inside.
 fn inside_bounds(level: &LevelImage) -> Option<([f64; 3], [f64; 3])> {
-    let grid = level.grid();
-    let [_, ny, nz] = grid.shape;
-    let voxels = level
-        .values()
-        .par_iter()
-        .enumerate()
-        .filter(|(_, v)| **v > 0.0)
-        .map(|(index, _)| [index / (ny * nz), index / nz % ny, index % nz])
-        .map(|voxel| (voxel, voxel))
-        .reduce_with(|(a, b), (c, d)| {
-            ([0, 1, 2].map(|x| a[x].min(c[x])), [0, 1, 2].map(|x| b[x].max(d[x])))
-        })?;
-    let place =
-        |voxel: [usize; 3]| [0, 1, 2].map(|a| grid.origin[a] + voxel[a] as f64 * grid.spacing[a]);
-    Some((place(voxels.0), place(voxels.1)))
+    let inside = level.values().par_iter().enumerate().filter(|(_, v)| **v > 0.0);
+    let centres = inside.map(|(index, _)| level.grid().centre(index));
+    centres.map(|x| (x, x)).reduce_with(|(a, b), (c, d)| {
+        ([0, 1, 2].map(|i| a[i].min(c[i])), [0, 1, 2].map(|i| b[i].max(d[i])))
+    })
 }

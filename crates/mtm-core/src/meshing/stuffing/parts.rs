@@ -86,16 +86,5 @@ fn bodies(tets: &[[u32; 4]]) -> Vec<u32> {
     for pair in faces.windows(2).filter(|pair| pair[0].0 == pair[1].0) {
         forest.join(pair[0].1 as usize, pair[1].1 as usize);
     }
-    let mut number = vec![u32::MAX; tets.len()];
-    let mut next = 0;
-    (0..tets.len())
-        .map(|t| {
-            let root = forest.root(t);
-            if number[root] == u32::MAX {
-                number[root] = next;
-                next += 1;
-            }
-            number[root]
-        })
-        .collect()
+    forest.numbered()
 }

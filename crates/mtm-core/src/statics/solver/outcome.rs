@@ -57,7 +57,7 @@ impl StaticSolver {
         motions: &[&Motion],
     ) -> ContactResult {
         let (Some(sliding), Some(state)) = (&self.sliding, state) else {
-            return ContactResult::default();
+            return ContactResult { converged: true, ..ContactResult::default() };
         };
         let at_rest = sliding.carried_back(motions, &state);
         ContactResult {
