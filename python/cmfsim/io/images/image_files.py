@@ -15,7 +15,7 @@ from cmfsim.errors import ImageError, ImageInputError, third_party
 from cmfsim.io.files.leftovers import abandoned, temporary_folder
 from cmfsim.io.files.reading_writing import is_there, utf8_path
 from cmfsim.io.images.dicom.series import read_dicom_file, read_dicom_folder
-from cmfsim.io.images.image_grids import aligned, shear_of, turn_of, upright
+from cmfsim.io.images.image_grids import on_axes
 from cmfsim.io.images.image_headers import KNOWN
 from cmfsim.io.images.nifti import GZIP, is_nifti, read_nifti
 from cmfsim.io.images.nrrd import is_meta, read_meta, read_nrrd
@@ -98,8 +98,6 @@ SUFFIXES = (".nrrd", ".nii", ".nii.gz", ".mha")
 OTHER_SUFFIXES = (".nrrd", ".nhdr", ".nii", ".gz", ".mha", ".mhd", ".hdr")
 # What tells formats apart.
 FIRST_BYTES = 1024
-# Axes farther from a right angle than this are reported as sheared, degrees.
-SHEARED = 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,39 +229,10 @@ def placed(
 ) -> ImageFile:
     """The image of voxels with their map to LPS, on axes of the patient."""
     if values.dtype.kind == "f":
-        _check_finite(values, path)
-    image = aligned(values, affine)
-    if image is None:
-        return ImageFile(
-            upright(values, affine, path.name), "", (*findings, _resampled(path, affine))
-        )
-    return ImageFile(image, "", findings)
-
-
-def _resampled(path: Path, affine: NDArray[np.float64]) -> Finding:
-    shear = shear_of(affine)
-    if shear <= SHEARED:
-        return Finding(
-            "image-oblique",
-            f"the image's axes are turned by {turn_of(affine):.1f}° from the patient's; it was "
-            "resampled",
-            severity="note",
-            where=path.name,
-        )
-    return Finding(
-        "image-oblique",
-        f"the image's axes are {shear:.1f}° from right angles, as in a CT with a tilted gantry; it "
-        "was resampled by its stated axes",
-        severity="warning",
-        where=path.name,
-        why="a program that assumes perpendicular axes would show the head sheared",
-        fix="compare the skin with the scan visually",
-    )
-
-
-def _check_finite(values: NDArray[Any], path: Path) -> None:
-    count = sum(int(np.count_nonzero(~np.isfinite(layer))) for layer in values.T)
-    if count:
-        raise ImageInputError(
-            f"{path.name}: {count} voxels are NaN or infinite: every value must be finite"
-        )
+        count = sum(int(np.count_nonzero(~np.isfinite(layer))) for layer in values.T)
+        if count:
+            raise ImageInputError(
+                f"{path.name}: {count} voxels are NaN or infinite: every value must be finite"
+            )
+    image, more = on_axes(values, affine, path.name)
+    return ImageFile(image, "", (*findings, *more))

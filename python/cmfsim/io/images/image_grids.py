@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageError, ImageInputError, third_party
 from cmfsim.io.images.image_headers import MOST_VOXELS
+from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -25,6 +26,30 @@ FINE = 1.0
 SIDES = (-1, 0, 1, 2)
 # A place this near to a voxel's centre, in voxels, is that voxel.
 SAME = 1e-6
+# Axes farther from a right angle than this are reported as sheared, degrees.
+SHEARED = 0.06
+
+
+def on_axes(
+    values: NDArray[Any], affine: Floats, name: str
+) -> tuple[ImageData, tuple[Finding, ...]]:
+    """The image of voxels with their map to LPS, on axes of the patient; a finding if resampled."""
+    image = aligned(values, affine)
+    if image is not None:
+        return image, ()
+    image, shear = upright(values, affine, name), shear_of(affine)
+    if shear <= SHEARED:
+        what = f"the image's axes are turned by {turn_of(affine):.1f}° from the patient's; it was "
+        what += "resampled"
+        return image, (Finding("image-oblique", what, severity="note", where=name),)
+    what = (
+        f"the image's axes are {shear:.1f}° from right angles, as in a CT with a tilted gantry; it "
+        "was resampled by its stated axes"
+    )
+    why = "a program that assumes perpendicular axes would show the head sheared"
+    fix = "compare the skin with the scan visually"
+    found = Finding("image-oblique", what, severity="warning", where=name, why=why, fix=fix)
+    return image, (found,)
 
 
 def aligned(values: NDArray[Any], affine: NDArray[np.float64]) -> ImageData | None:
@@ -175,7 +200,8 @@ def of_slices(
             u = [(across - starts[k, 0]) / spacing[0] for k in slices]
             inside = [_is_in_slice(values, *w) for w in zip(u, v, strict=True)]
         four = np.logical_and.reduce([*inside, below > 0, below < len(heights) - 2])
-        weights = [np.where(four, c, w) for c, w in zip(weights, _linear(part), strict=True)]
+        straight = [0.0 * part, 1.0 - part, part, 0.0 * part]
+        weights = [np.where(four, c, w) for c, w in zip(weights, straight, strict=True)]
         if by_rows:
             layer = _from_rows(values, slices, v, weights, inside, outside=outside)
         else:
@@ -199,8 +225,8 @@ def _between(place: Floats, last: int) -> tuple[NDArray[np.intp], Floats]:
 
 
 def _rows_to_left(
-    values: NDArray[Any], positions: NDArray[np.float64], axes: NDArray[np.float64], spacing: float
-) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.float64]]:
+    values: NDArray[Any], positions: Floats, axes: Floats, spacing: float
+) -> tuple[NDArray[Any], Floats, Floats]:
     """The same slices with rows that run to the patient's left, in ascending order again."""
     if axes[0, 0] >= 0.0:
         return values, positions, axes
@@ -228,16 +254,9 @@ def _cubic(part: Floats, before: Floats | float = 1.0, after: Floats | float = 1
     ]
 
 
-def _linear(part: Floats) -> list[Floats]:
-    """The same of linear interpolation."""
-    return [0.0 * part, 1.0 - part, part, 0.0 * part]
-
-
 def _limited(total: Floats, nearest: Sequence[NDArray[Any]]) -> Floats:
     """Interpolated values, no farther than the nearest that they lie between."""
-    low, high = nearest[0], nearest[0]
-    for other in nearest[1:]:
-        low, high = np.minimum(low, other), np.maximum(high, other)
+    low, high = np.minimum.reduce(nearest), np.maximum.reduce(nearest)
     return np.clip(total, low, high, out=total)
 
 
@@ -292,9 +311,7 @@ def _in_slice(values: NDArray[Any], k: NDArray[np.intp], u: Floats, v: Floats) -
     return found
 
 
-def _grid(
-    corners: NDArray[np.float64], spacing: NDArray[np.float64], name: str
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _grid(corners: Floats, spacing: Floats, name: str) -> tuple[Floats, NDArray[np.int64]]:
     """First place and number of voxels of the grid that holds the corners."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     count = np.ceil((high - low) / spacing - SAME).astype(np.int64) + 1

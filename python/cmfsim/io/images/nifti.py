@@ -98,10 +98,15 @@ def read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], tuple[Fin
     affine, findings = _affine(path, header)
     check_affine(path.name, affine, header.size)
     if not header.has_unit:
-        findings.append(_no_unit(path, header.spacing))
+        text = " × ".join(f"{s:.4g}" for s in header.spacing)
+        what = f"it states no unit of length: voxels were taken as {text} mm"
+        findings.append(Finding("image-unit-unstated", what, where=path.name))
     ignored = header.ignored + ((f"{left} bytes after the last voxel",) if left else ())
     if ignored:
-        findings.append(_ignored(path, ignored))
+        what = f"ignored: {'; '.join(ignored)}"
+        why = "its header was written by a program with errors; all else in it agrees"
+        fix = "compare the image with the patient, or convert the DICOM series again"
+        findings.append(Finding("field-ignored", what, where=path.name, why=why, fix=fix))
     return values, affine, tuple(findings)
 
 
@@ -150,7 +155,16 @@ def _header(path: Path, data: bytes) -> _Header:
     if codes[1] > 0 >= codes[0] and not _is_spacing(spacing[1:]) and np.isfinite(rows).all():
         ignored.append(f"pixdim {spacing[1:].tolist()}: its sform states the size of a voxel")
         spacing[1:] = np.linalg.norm(rows[:, :3], axis=0)
-    _check_numbers(path, codes, spacing=spacing, turn=turn, rows=rows, scale=scale, start=start)
+    numbers = {
+        "pixdim": spacing[1:],
+        "pixdim[0], the quaternion and offset of its qform": (spacing[0], *turn)
+        if codes[0] > 0
+        else (),
+        "sform": rows if codes[1] > 0 else (),
+        "slope and intercept": scale,
+        "start of the data": start,
+    }
+    _check_numbers(path, numbers)
     if not _is_spacing(spacing[1:]):
         raise ImageInputError(f"{path.name}: spacing is {spacing[1:].tolist()}: must be above 0")
     if not first <= start <= MOST_START:
@@ -172,26 +186,11 @@ def _header(path: Path, data: bytes) -> _Header:
     )
 
 
-def _check_numbers(
-    path: Path,
-    codes: tuple[int, int],
-    *,
-    spacing: NDArray[np.float64],
-    turn: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    scale: tuple[float, float],
-    start: float,
-) -> None:
+def _check_numbers(path: Path, used: Mapping[str, Any]) -> None:
     """Refuses the numbers of a header that are used and not finite."""
-    for name, values, is_used in (
-        ("pixdim", spacing[1:], True),
-        ("pixdim[0], the quaternion and offset of its qform", (spacing[0], *turn), codes[0] > 0),
-        ("sform", rows, codes[1] > 0),
-        ("slope and intercept", scale, True),
-        ("start of the data", start, True),
-    ):
+    for name, values in used.items():
         numbers = np.ravel(values)
-        if is_used and not (np.abs(numbers) <= MOST_NUMBER).all():
+        if not (np.abs(numbers) <= MOST_NUMBER).all():
             raise ImageInputError(
                 f"{path.name}: {name} is {numbers.tolist()}: every number must be finite; convert "
                 "the DICOM series again"
@@ -262,25 +261,6 @@ def _voxels(path: Path, stream: Any, header: _Header, *, packed: bool) -> tuple[
     return values * np.float32(slope) + np.float32(intercept), len(left)
 
 
-def _ignored(path: Path, what: tuple[str, ...]) -> Finding:
-    return Finding(
-        "field-ignored",
-        f"ignored: {'; '.join(what)}",
-        where=path.name,
-        why="its header was written by a program with errors; all else in it agrees",
-        fix="compare the image with the patient, or convert the DICOM series again",
-    )
-
-
-def _no_unit(path: Path, spacing: NDArray[np.float64]) -> Finding:
-    text = " × ".join(f"{s:.4g}" for s in spacing)
-    return Finding(
-        "image-unit-unstated",
-        f"it states no unit of length: voxels were taken as {text} mm",
-        where=path.name,
-    )
-
-
 def _affine(path: Path, header: _Header) -> tuple[NDArray[np.float64], list[Finding]]:
     """The map to LPS, from the file's two statements of it (qform, sform)."""
     code_turn, code_rows = header.codes
@@ -313,13 +293,9 @@ def _affine(path: Path, header: _Header) -> tuple[NDArray[np.float64], list[Find
 
 
 def _template(path: Path, code: int, severity: str, used: str) -> Finding:
-    return Finding(
-        "image-template-space",
-        f"its sform (code {code}) leads to the space of a template{used}",
-        severity=severity,
-        where=path.name,
-        fix="nothing to do" if used else "",
-    )
+    what = f"its sform (code {code}) leads to the space of a template{used}"
+    fix = "nothing to do" if used else ""
+    return Finding("image-template-space", what, severity=severity, where=path.name, fix=fix)
 
 
 def _from_quaternion(path: Path, header: _Header) -> NDArray[np.float64]:
@@ -359,12 +335,10 @@ def _check_lengths(path: Path, rows: NDArray[np.float64], spacing: NDArray[np.fl
     size = float(np.linalg.norm(normal))
     # Slices of a tilted scan: their distance is measured across them, or along the table.
     across = abs(float(rows[:, 2] @ normal)) / size if size > 0.0 else 0.0
-    stated = spacing
-    wrong = np.abs(lengths - stated) > SPACINGS_AGREE * stated
-    if abs(across - stated[2]) <= SPACINGS_AGREE * stated[2]:
-        wrong[2] = False
+    wrong = np.abs(lengths - spacing) > SPACINGS_AGREE * spacing
+    wrong[2] &= abs(across - spacing[2]) > SPACINGS_AGREE * spacing[2]
     if wrong.any():
         raise ImageInputError(
-            f"{path.name}: its voxels are {stated.tolist()} by pixdim and "
+            f"{path.name}: its voxels are {spacing.tolist()} by pixdim and "
             f"{lengths.round(4).tolist()} by its sform: convert the DICOM series again"
         )

@@ -128,12 +128,9 @@ PACKINGS: Mapping[str, str] = {
 }  # fmt: skip
 # NRRD's anatomical spaces: what takes each axis to L, P and S.
 SPACES: Mapping[str, tuple[float, float, float]] = {
-    "right-anterior-superior": (-1.0, -1.0, 1.0),
-    "ras": (-1.0, -1.0, 1.0),
-    "left-anterior-superior": (1.0, -1.0, 1.0),
-    "las": (1.0, -1.0, 1.0),
-    "left-posterior-superior": (1.0, 1.0, 1.0),
-    "lps": (1.0, 1.0, 1.0),
+    **dict.fromkeys(("right-anterior-superior", "ras"), (-1.0, -1.0, 1.0)),
+    **dict.fromkeys(("left-anterior-superior", "las"), (1.0, -1.0, 1.0)),
+    **dict.fromkeys(("left-posterior-superior", "lps"), (1.0, 1.0, 1.0)),
 }
 TYPES: Mapping[str, str] = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
@@ -311,10 +308,7 @@ def _unstated_affine(
 
 def _vectors(path: Path, key: str, text: str) -> list[list[float] | None]:
     """The vectors "(1,0,0) none (0,1,0)" of a field."""
-    found: list[list[float] | None] = []
-    for part in re.findall(r"\([^)]*\)|none", text):
-        if part == "none":
-            found.append(None)
-        else:
-            found.append([number(path, key, n) for n in part[1:-1].split(",")])
-    return found
+    return [
+        None if part == "none" else [number(path, key, n) for n in part[1:-1].split(",")]
+        for part in re.findall(r"\([^)]*\)|none", text)
+    ]

@@ -116,9 +116,9 @@ def are_labels(values: NDArray[Any]) -> bool:
         return False
     if len(np.unique(layers)) <= FEW_VALUES:
         return True
-    inside = layers[1:][layers[1:] != 0]
-    same = layers[1:][layers[1:] != 0] == layers[:-1][layers[1:] != 0]
-    return inside.size > 0 and float(same.mean()) > SAME_NEIGHBOURS
+    is_inside = layers[1:] != 0
+    same = (layers[1:] == layers[:-1])[is_inside]
+    return same.size > 0 and float(same.mean()) > SAME_NEIGHBOURS
 
 
 def read_labels(path: Path) -> Segmentation:

@@ -200,7 +200,10 @@ class _Reader:
             self.explicit = first[4:6].isalpha()
         self._data_set(found, self.size, 0)
         self._check_pixels(found)
-        frames = tuple(_frames(found))
+        # What all frames share, and what each states itself.
+        shared = _flat(found.sequences.get("shared", []))
+        each = found.sequences.get("per_frame", [])
+        frames = tuple({**shared, **_flat([item])} for item in each)
         has_pixels = self.pixels is not None
         return DicomHeader(self.path, found.tags, has_pixels, frames, tuple(self.odd))
 
@@ -270,11 +273,8 @@ class _Reader:
         begin = self.stream.tell()
         if tag >> 16 & 1 and len(more := self.stream.read(4)) == 4:
             (short,) = struct.unpack(f"{self.order}H", head[6:])
-            for start, length in (
-                (begin, short),
-                (begin, self._long(head[4:])),
-                (begin + 4, self._long(more)),
-            ):
+            starts = (begin, short), (begin, self._long(head[4:])), (begin + 4, self._long(more))
+            for start, length in starts:
                 if self._is_followed(tag, start + length):
                     self.stream.seek(start)
                     if self.depth == 0:
@@ -356,12 +356,6 @@ class _Reader:
         if left < needed:
             message = f"{left} of {needed} bytes of pixels"
             raise EOFError(message)
-
-
-def _frames(found: _Found) -> list[Tags]:
-    """The frames of an enhanced image: what all share, and what each states itself."""
-    shared = _flat(found.sequences.get("shared", []))
-    return [{**shared, **_flat([item])} for item in found.sequences.get("per_frame", [])]
 
 
 def _flat(items: list[_Found]) -> dict[str, str | int]:

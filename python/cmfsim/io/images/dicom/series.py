@@ -63,21 +63,16 @@ class Series:
         """Number, description, slices and spacing, as a person tells series apart."""
         number = self.first.text("series_number") or "-"
         parts = [f"number {number}", f"{self.count} slices"]
-        if (gap := self._gap()) is not None:
-            parts.append(f"{gap:.3g} mm apart")
+        places = [h.numbers("position", 3) for h in self.headers]
+        across = self.first.numbers("orientation", 6)
+        known = [p for p in places if p is not None]
+        if across is not None and len(known) > 1:
+            heights = np.sort(np.array(known) @ np.cross(across[:3], across[3:]))
+            parts.append(f"{np.median(np.diff(heights)):.3g} mm apart")
         if self.modality not in {"", "CT"}:
             parts.append(self.modality)
         name = self.first.text("series_description") or "no description"
         return f"{name!r} ({', '.join(parts)}; {self.uid})"
-
-    def _gap(self) -> float | None:
-        places = [h.numbers("position", 3) for h in self.headers]
-        across = self.first.numbers("orientation", 6)
-        known = [p for p in places if p is not None]
-        if across is None or len(known) < 2:
-            return None
-        heights = np.sort(np.array(known) @ np.cross(across[:3], across[3:]))
-        return float(np.median(np.diff(heights)))
 
 
 def read_dicom_folder(
@@ -135,7 +130,14 @@ def dicom_places(folders: Sequence[Path]) -> list[tuple[Path, str | None]]:
 
     folders: That directly hold DICOM files.
     """
-    held = {folder: _series_in(folder) for folder in folders}
+    held = {folder: Counter[str]() for folder in folders}
+    for folder, counts in held.items():
+        for path in sorted(p for p in folder.iterdir() if p.is_file()):
+            # Damaged files are found later.
+            with contextlib.suppress(ImageInputError, OSError):
+                header = dicom_header(path)
+                if header is not None and header.has_pixels:
+                    counts[header.text("series_uid")] += 1
     # A DICOMDIR alone is no image.
     groups: list[tuple[list[Path], Counter[str]]] = []
     for folder, counts in held.items():
@@ -155,17 +157,6 @@ def dicom_places(folders: Sequence[Path]) -> list[tuple[Path, str | None]]:
         largest = max(sorted(counts), key=lambda uid: counts[uid])
         places.append((place, largest if others else None))
     return sorted(places)
-
-
-def _series_in(folder: Path) -> Counter[str]:
-    """How many images of each series a folder holds; those that are damaged are found later."""
-    counts: Counter[str] = Counter()
-    for path in sorted(p for p in folder.iterdir() if p.is_file()):
-        with contextlib.suppress(ImageInputError, OSError):
-            header = dicom_header(path)
-            if header is not None and header.has_pixels:
-                counts[header.text("series_uid")] += 1
-    return counts
 
 
 def _below(folder: Path) -> Iterator[Path]:
@@ -201,7 +192,12 @@ def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[
     below, damaged = _headers_below(folder, {*map(_key, headers)}, wanted)
     if not headers and damaged:
         raise ImageInputError(damaged[0])
-    findings = _below_findings(folder, headers, below)
+    findings, where, skipped = list[Finding](), folder.name, "dicom-skipped"
+    places = Counter(h.path.parent.relative_to(folder).as_posix() for h in below)
+    if len(places) + bool(headers) > 1:
+        parts = [f"{name} ({n})" for name, n in sorted(places.items())]
+        what = f"images were also read from folders below: {listed(parts)}"
+        findings.append(Finding("dicom-folders", what, where=where))
     headers += below
     if not headers:
         raise ImageInputError(
@@ -209,36 +205,20 @@ def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[
             f"({len(paths)} files in it)"
         )
     if damaged:
-        findings.append(
-            Finding(
-                "dicom-skipped",
-                f"skipped {counted(len(damaged), 'file')} in folders below: {damaged[0]}",
-                severity="warning",
-                where=folder.name,
-            )
-        )
+        what = f"skipped {counted(len(damaged), 'file')} in folders below: {damaged[0]}"
+        findings.append(Finding(skipped, what, severity="warning", where=where))
     missing = [p.name for p in sorted(folder.iterdir()) if p.is_symlink() and not p.exists()]
     if missing:
-        findings.append(
-            Finding(
-                "dicom-skipped",
-                f"skipped {counted(len(missing), 'link')} to files that are not here: "
-                f"{listed(missing)}",
-                severity="warning",
-                where=folder.name,
-                why="slices at the ends of a series are not missed when they are absent",
-                fix="fetch the files (with DataLad: datalad get)",
-            )
+        what = (
+            f"skipped {counted(len(missing), 'link')} to files that are not here: {listed(missing)}"
         )
+        why = "slices at the ends of a series are not missed when they are absent"
+        fix = "fetch the files (with DataLad: datalad get)"
+        found = Finding(skipped, what, severity="warning", where=where, why=why, fix=fix)
+        findings.append(found)
     if others:
-        findings.append(
-            Finding(
-                "dicom-skipped",
-                f"skipped {counted(len(others), 'file')} not in DICOM: {listed(others)}",
-                severity="note",
-                where=folder.name,
-            )
-        )
+        what = f"skipped {counted(len(others), 'file')} not in DICOM: {listed(others)}"
+        findings.append(Finding(skipped, what, severity="note", where=where))
     return headers, findings
 
 
@@ -262,22 +242,6 @@ def _headers_below(
         if not own or is_wanted or (header.text("series_uid") and _key(header) in own):
             headers.append(header)
     return headers, damaged
-
-
-def _below_findings(
-    folder: Path, own: list[DicomHeader], below: list[DicomHeader]
-) -> list[Finding]:
-    places = Counter(h.path.parent.relative_to(folder).as_posix() for h in below)
-    if len(places) + bool(own) < 2:
-        return []
-    parts = [f"{name} ({n})" for name, n in sorted(places.items())]
-    return [
-        Finding(
-            "dicom-folders",
-            f"images were also read from folders below: {listed(parts)}",
-            where=folder.name,
-        )
-    ]
 
 
 def _check_number(folder: Path, count: int) -> None:
@@ -345,11 +309,5 @@ def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Seri
         raise ImageInputError(f"{folder.name}: {several}; {how}: {listed}")
     if len(found) == 1:
         return first, []
-    finding = Finding(
-        "dicom-series",
-        f"{len(found)} series in the folder; the largest CT, {first.described()}, was chosen from: "
-        f"{listed}",
-        where=folder.name,
-        fix=how,
-    )
-    return first, [finding]
+    what = f"{len(found)} series in the folder; the largest CT, {first.described()}, was chosen "
+    return first, [Finding("dicom-series", f"{what}from: {listed}", where=folder.name, fix=how)]

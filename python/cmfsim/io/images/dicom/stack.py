@@ -29,7 +29,7 @@ from cmfsim.io.images.dicom.headers import (
     listed,
     numbers_of,
 )
-from cmfsim.io.images.image_grids import aligned, of_slices, turn_of, upright
+from cmfsim.io.images.image_grids import of_slices, on_axes
 from cmfsim.io.images.image_headers import check_shape
 from cmfsim.processes.child import ReaderError, read_in_child
 from cmfsim.processes.worker import ReadLimits
@@ -65,25 +65,35 @@ def volume_of(
     name: str, slices: list[Slice], modality: str, findings: list[Finding]
 ) -> tuple[ImageData, str, tuple[Finding, ...]]:
     """The volume of slices, its modality, and what was noticed."""
-    slices, more = _with_orientations(name, slices)
-    findings += more
-    slices, more = _without_scouts(name, slices)
-    findings += more
+    slices = _with_orientations(name, slices, findings)
+    slices = _without_scouts(name, slices, findings)
     stack = _stack(name, slices)
     values = _pixels(name, stack)
-    kept, more = _without_copies(name, stack, values)
-    findings += more
+    kept = _without_copies(name, stack, values, findings)
     if len(kept) < len(stack.slices):
         stack, values = stack.kept(kept), values[kept]
-    findings += _acquisition_findings(name, stack)
+    _check_acquisitions(name, stack, findings)
     uneven = _check_steps(name, stack)
-    findings += _assumed_findings(name, stack)
-    image, more = _placed(name, stack, values, uneven)
-    findings += [*more, *_rescale_findings(name, stack)]
+    if assumed := next((a for s in stack.slices if (a := s.text("assumed"))), ""):
+        what = (
+            f"the file states the place of its first frame alone; the {len(stack.slices)} frames "
+            f"were placed one after the other along its normal, {assumed}"
+        )
+        findings.append(Finding("dicom-frames-assumed", what, where=name))
+    image = _placed(name, stack, values, uneven, findings)
+    if any(s.text("photometric") == SHOWN_INVERTED for s in stack.slices):
+        what = f"{SHOWN_INVERTED} is ignored: it states that the lowest value is shown white"
+        why = "what is shown follows the rescaling: the values in HU are the same (PS3.3 C.7.6.3.1)"
+        fix = "check that bone is brighter than air in anatomy.png; otherwise export the CT again"
+        findings.append(Finding("field-ignored", what, where=name, why=why, fix=fix))
+    kinds = {s.text("rescale_type").upper() for s in stack.slices} - UNSTATED_SCALES
+    if kinds:
+        what = f"the header states that values are {', '.join(sorted(kinds))!r}, not HU"
+        findings.append(Finding("ct-not-hu", what, where=name))
     return image, modality, tuple(findings)
 
 
-def _with_orientations(name: str, slices: list[Slice]) -> tuple[list[Slice], list[Finding]]:
+def _with_orientations(name: str, slices: list[Slice], findings: list[Finding]) -> list[Slice]:
     """The slices, those that state no orientation with that of all others.
 
     Their places show that they belong to the row: the steps between slices are checked.
@@ -91,36 +101,20 @@ def _with_orientations(name: str, slices: list[Slice]) -> tuple[list[Slice], lis
     silent = [s for s in slices if not s.text("orientation").strip()]
     stated = {s.text("orientation") for s in slices if s not in silent}
     if not silent or len(stated) != 1 or 2 * len(silent) >= len(slices):
-        return slices, []
+        return slices
     tags = {"orientation": stated.pop()}
-    finding = Finding(
-        "field-ignored",
+    what = (
         f"{counted(len(silent), 'slice')} without an orientation were taken to have that of all "
-        f"others: {listed([s.name for s in silent])}",
-        where=name,
-        why="a slice that is turned within its plane would be out of place",
-        fix="check these slices visually, or export the series again",
+        f"others: {listed([s.name for s in silent])}"
     )
-    return [replace(s, tags={**s.tags, **tags}) if s in silent else s for s in slices], [finding]
+    why = "a slice that is turned within its plane would be out of place"
+    fix = "check these slices visually, or export the series again"
+    findings.append(Finding("field-ignored", what, where=name, why=why, fix=fix))
+    return [replace(s, tags={**s.tags, **tags}) if s in silent else s for s in slices]
 
 
-def _assumed_findings(name: str, stack: Stack) -> list[Finding]:
-    """A warning where the places of frames are not stated, but follow from that of the first."""
-    assumed = next((a for s in stack.slices if (a := s.text("assumed"))), "")
-    if not assumed:
-        return []
-    return [
-        Finding(
-            "dicom-frames-assumed",
-            f"the file states the place of its first frame alone; the {len(stack.slices)} frames "
-            f"were placed one after the other along its normal, {assumed}",
-            where=name,
-        )
-    ]
-
-
-def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[Finding]]:
-    """The slices without localizers and with one orientation; what was left out."""
+def _without_scouts(name: str, slices: list[Slice], findings: list[Finding]) -> list[Slice]:
+    """The slices without localizers and with one orientation."""
     scouts = [s for s in slices if is_localizer(s.header)]
     rest = [s for s in slices if not is_localizer(s.header)]
     if not rest:
@@ -128,12 +122,10 @@ def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[F
     groups: list[list[Slice]] = []
     for one in rest:
         across = one.numbers("orientation", 6)
-        group = next(
-            (g for g in groups
-             if np.abs(g[0].numbers("orientation", 6) - across).max() <= PARALLEL),
-            None,
-        )  # fmt: skip
-        if group is None:
+        close = (
+            g for g in groups if np.abs(g[0].numbers("orientation", 6) - across).max() <= PARALLEL
+        )
+        if (group := next(close, None)) is None:
             groups.append([one])
         else:
             group.append(one)
@@ -149,19 +141,16 @@ def _without_scouts(name: str, slices: list[Slice]) -> tuple[list[Slice], list[F
             "one volume in the folder"
         )
     left = sorted(s.name for s in [*scouts, *others])
-    if not left:
-        return groups[0], []
-    finding = Finding(
-        "dicom-skipped",
-        f"skipped {counted(len(left), 'scout')} (localisers, or slices of another "
-        "orientation): "
-        f"{listed(left)}",
-        severity="note" if not others else "warning",
-        where=name,
-        why="they show the head from different directions",
-        fix="nothing to do" if not others else "",
-    )
-    return groups[0], [finding]
+    if left:
+        what = (
+            f"skipped {counted(len(left), 'scout')} (localisers, or slices of another "
+            f"orientation): {listed(left)}"
+        )
+        severity, fix = ("warning", "") if others else ("note", "nothing to do")
+        why = "they show the head from different directions"
+        found = Finding("dicom-skipped", what, severity=severity, where=name, why=why, fix=fix)
+        findings.append(found)
+    return groups[0]
 
 
 def _stack(name: str, slices: list[Slice]) -> Stack:
@@ -177,11 +166,9 @@ def _stack(name: str, slices: list[Slice]) -> Stack:
             f"{' × '.join(common)} pixels, such as {odd[0].name} with {odd[0].text('columns')} × "
             f"{odd[0].text('rows')}: keep the slices of one volume in the folder"
         )
-    odd = [
-        s
-        for s, spacing in zip(slices, spacings, strict=True)
-        if np.abs(spacing - usual).max() > 1e-4 * float(usual.max())
-    ]
+    least = 1e-4 * float(usual.max())
+    pairs = zip(slices, spacings, strict=True)
+    odd = [s for s, spacing in pairs if np.abs(spacing - usual).max() > least]
     if odd:
         raise ImageInputError(
             f"{name}: {len(odd)} of {len(slices)} slices have another pixel spacing than "
@@ -239,7 +226,13 @@ def _pixels(name: str, stack: Stack) -> NDArray[Any]:
         frames = {path: _of_frames(header, limits) for path, header in parts.items()}
     except ReaderError as error:
         raise ImageInputError(f"{name}: {error}") from error
-    _check_scales(name, stack)
+    scales = {(s.text("slope"), s.text("intercept")) for s in stack.slices}
+    if len(scales) > 1:
+        # The reader applies one of them to all.
+        raise ImageInputError(
+            f"{name}: its frames have {len(scales)} different rescale slopes and intercepts: "
+            "export the series as one file per slice"
+        )
     return np.stack([frames[s.header.path][s.frame] for s in stack.slices])
 
 
@@ -283,19 +276,9 @@ def _of_frames(header: DicomHeader, limits: ReadLimits) -> NDArray[Any]:
     return values if values.ndim == 3 else values[None]
 
 
-def _check_scales(name: str, stack: Stack) -> None:
-    """Refuses frames with several slopes: the reader applies one of them to all."""
-    scales = {(s.text("slope"), s.text("intercept")) for s in stack.slices}
-    if len(scales) > 1:
-        raise ImageInputError(
-            f"{name}: its frames have {len(scales)} different rescale slopes and intercepts: "
-            "export the series as one file per slice"
-        )
-
-
 def _without_copies(
-    name: str, stack: Stack, values: NDArray[Any]
-) -> tuple[list[int], list[Finding]]:
+    name: str, stack: Stack, values: NDArray[Any], findings: list[Finding]
+) -> list[int]:
     """The slices without those that are there twice; an error where two at one place differ."""
     kept, copies = [0], []
     heights = stack.heights
@@ -308,29 +291,21 @@ def _without_copies(
         shift = float(np.linalg.norm(stack.positions[i] - stack.positions[before]))
         if shift > ONE_PLACE or not np.array_equal(values[i], values[before]):
             count = int(np.count_nonzero(np.diff(heights) <= ONE_PLACE))
+            place = ", ".join(f"{x:.2f}" for x in stack.positions[i])
             raise ImageInputError(
-                f"{name}: {one.name} and {other.name} lie in the same place ({_place(stack, i)}) "
+                f"{name}: {one.name} and {other.name} lie in the same place (first pixel at "
+                f"{place} mm) "
                 f"with different pixels, as {counted(count, 'pair')} of slices do: more than one "
                 "scan, reconstruction or time in the series; keep one of them in the folder"
             )
         copies.append(other.name)
-    if not copies:
-        return kept, []
-    finding = Finding(
-        "dicom-skipped",
-        f"skipped {counted(len(copies), 'copy')} of slices with the same place and pixels: "
-        f"{listed(copies)}",
-        severity="note",
-        where=name,
-        why="the image is the same without them",
-        fix="nothing to do",
-    )
-    return kept, [finding]
-
-
-def _place(stack: Stack, i: int) -> str:
-    text = ", ".join(f"{x:.2f}" for x in stack.positions[i])
-    return f"first pixel at {text} mm"
+    if copies:
+        what = f"skipped {counted(len(copies), 'copy')} of slices with the same place and pixels: "
+        what += listed(copies)
+        why, fix = "the image is the same without them", "nothing to do"
+        found = Finding("dicom-skipped", what, severity="note", where=name, why=why, fix=fix)
+        findings.append(found)
+    return kept
 
 
 def _off_even(heights: NDArray[np.float64]) -> float:
@@ -339,7 +314,7 @@ def _off_even(heights: NDArray[np.float64]) -> float:
     return float(np.abs(heights - even).max())
 
 
-def _acquisition_findings(name: str, stack: Stack) -> list[Finding]:
+def _check_acquisitions(name: str, stack: Stack, findings: list[Finding]) -> None:
     """Refuses slices of several scans between one another, unless their places show one row.
 
     A slice without a number says nothing about which scan it is from.
@@ -359,18 +334,14 @@ def _acquisition_findings(name: str, stack: Stack) -> list[Finding]:
                 "keep the slices of one acquisition in the folder"
             )
         if low < high:
-            return [
-                Finding(
-                    "field-ignored",
-                    f"the slices of acquisitions {first} and {second} alternate, and together "
-                    "they are evenly spaced: they were taken as one scan",
-                    where=name,
-                    why="if they are two scans, the patient may have moved between them",
-                    fix="look for steps in the skin; keep the slices of one acquisition if there "
-                    "are any",
-                )
-            ]
-    return []
+            what = (
+                f"the slices of acquisitions {first} and {second} alternate, and together they are "
+                "evenly spaced: they were taken as one scan"
+            )
+            why = "if they are two scans, the patient may have moved between them"
+            fix = "look for steps in the skin; keep the slices of one acquisition if there are any"
+            findings.append(Finding("field-ignored", what, where=name, why=why, fix=fix))
+            return
 
 
 def _check_steps(name: str, stack: Stack) -> list[int]:
@@ -383,11 +354,9 @@ def _check_steps(name: str, stack: Stack) -> list[int]:
         multiples = steps[wide] / usual
         whole = np.abs(multiples - np.round(multiples)) < MULTIPLE
         lost = int(np.sum(np.round(multiples[whole]) - 1))
-        what = (
-            f"{counted(lost, 'slice')} missing"
-            if whole.all()
-            else "slices missing or unevenly spaced"
-        )
+        what = "slices missing or unevenly spaced"
+        if whole.all():
+            what = f"{counted(lost, 'slice')} missing"
         raise ImageInputError(
             f"{name}: {what}: slices are {usual:.3g} mm apart, but {_steps(stack, wide)}; export "
             "the whole series again (nothing is interpolated over a gap of more than "
@@ -418,37 +387,34 @@ def _steps(stack: Stack, which: Sequence[int] | NDArray[np.intp]) -> str:
 
 
 def _placed(
-    name: str, stack: Stack, values: NDArray[Any], uneven: list[int]
-) -> tuple[ImageData, list[Finding]]:
+    name: str, stack: Stack, values: NDArray[Any], uneven: list[int], findings: list[Finding]
+) -> ImageData:
     """The image of a stack on axes of the patient, resampled where its slices ask for it."""
     heights, normal = stack.heights, np.cross(*stack.axes)
     shifts = stack.positions - np.outer(heights, normal)
     along = (shifts - shifts[0]) @ stack.axes.T
     # Slices in one straight, even row, as far as positions are written exactly.
     straight = float(np.abs(along - along[0]).max()) <= ROUNDED
-    findings = _tilt_findings(name, stack, along, straight=straight)
+    findings += _tilt_findings(name, stack, along, straight=straight)
     if uneven:
-        findings.append(_uneven(name, stack, uneven))
+        steps = np.diff(heights)
+        what = (
+            f"slices are {np.median(steps):.3g} mm apart, from {steps.min():.3g} to "
+            f"{steps.max():.3g} mm: {_steps(stack, uneven)}; resampled by their positions"
+        )
+        findings.append(Finding("dicom-uneven", what, where=name))
     if straight and not uneven:
         gap = float(heights[-1] - heights[0]) / (len(heights) - 1)
-        affine = np.column_stack(
-            [
-                stack.axes[0] * stack.spacing[0],
-                stack.axes[1] * stack.spacing[1],
-                normal * gap,
-                stack.positions[0],
-            ]
-        )
-        voxels = values.transpose(2, 1, 0)
-        image = aligned(voxels, affine)
-        if image is None:
-            image = upright(voxels, affine, name)
-            findings.append(_oblique(name, turn_of(affine)))
-        return image, findings
+        across = stack.axes.T * stack.spacing
+        affine = np.column_stack([across, normal * gap, stack.positions[0]])
+        image, more = on_axes(values.transpose(2, 1, 0), affine, name)
+        findings += more
+        return image
     gap = float(np.median(np.diff(heights)))
     if gap > COARSE_SLICES:
-        findings.append(_coarse(name, gap))
-    return of_slices(values, stack.positions, stack.axes, stack.spacing, name), findings
+        what, most = f"slices are {gap:.3g} mm apart", {"most": COARSE_SLICES}
+        findings.append(Finding("ct-spacing-coarse", what, where=name, facts=most))
+    return of_slices(values, stack.positions, stack.axes, stack.spacing, name)
 
 
 def _tilt_findings(
@@ -467,31 +433,25 @@ def _tilt_findings(
         signed = math.copysign(angle, tilt) if tilt else angle
         what = f"gantry tilt {signed:.1f}°".replace("-", "−")
         if off > max(ROUNDED, 0.01 * float(np.linalg.norm(along[-1]))):
-            what = (
-                f"slices shifted against one another by up to {np.ptp(along, axis=0).max():.1f} mm"
-            )
-        findings.append(
-            Finding(
-                "dicom-tilted",
-                f"{what}, resampled by the position of each slice "
-                f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)",
-                where=name,
-                why=f"without resampling, the head would be sheared; between slices {gap:.1f} mm "
-                f"apart the skin is known to {SKIN_SHARE * gap:.1f} mm; outside the slices "
-                "there is air, so the neck may end on an oblique plane on which nothing is "
-                "fixed",
-                fix=f"check the skin visually; {_whole_heights(stack)}",
-            )
+            shift = np.ptp(along, axis=0).max()
+            what = f"slices shifted against one another by up to {shift:.1f} mm"
+        what += (
+            ", resampled by the position of each slice "
+            f"({np.linalg.norm(along[-1]):.1f} mm from first to last slice)"
         )
+        why = (
+            f"without resampling, the head would be sheared; between slices {gap:.1f} mm apart the "
+            f"skin is known to {SKIN_SHARE * gap:.1f} mm; outside the slices there is air, so the "
+            "neck may end on an oblique plane on which nothing is fixed"
+        )
+        fix = f"check the skin visually; {_whole_heights(stack)}"
+        findings.append(Finding("dicom-tilted", what, where=name, why=why, fix=fix))
     if abs(abs(tilt) - angle) > TILTS_AGREE:
-        findings.append(
-            Finding(
-                "dicom-tilted",
-                f"the header states a gantry tilt of {tilt:g}°, the positions of the slices one of "
-                f"{angle:.1f}°; the positions were used",
-                where=name,
-            )
+        what = (
+            f"the header states a gantry tilt of {tilt:g}°, the positions of the slices one of "
+            f"{angle:.1f}°; the positions were used"
         )
+        findings.append(Finding("dicom-tilted", what, where=name))
     return findings
 
 
@@ -508,45 +468,3 @@ def _whole_heights(stack: Stack) -> str:
         f"{high.min():.1f} mm: lower = {low.max():.1f} in [region] ends the tissue on a plane that "
         "fixes it, where the face allows that"
     )
-
-
-def _uneven(name: str, stack: Stack, uneven: list[int]) -> Finding:
-    steps = np.diff(stack.heights)
-    return Finding(
-        "dicom-uneven",
-        f"slices are {np.median(steps):.3g} mm apart, from {steps.min():.3g} to "
-        f"{steps.max():.3g} mm: {_steps(stack, uneven)}; resampled by their positions",
-        where=name,
-    )
-
-
-def _oblique(name: str, angle: float) -> Finding:
-    return Finding(
-        "image-oblique",
-        f"the image's axes are turned by {angle:.1f}° from the patient's; it was resampled",
-        severity="note",
-        where=name,
-    )
-
-
-def _coarse(name: str, gap: float) -> Finding:
-    return Finding(
-        "ct-spacing-coarse",
-        f"slices are {gap:.3g} mm apart",
-        where=name,
-        facts={"most": COARSE_SLICES},
-    )
-
-
-def _rescale_findings(name: str, stack: Stack) -> list[Finding]:
-    findings = []
-    if any(s.text("photometric") == SHOWN_INVERTED for s in stack.slices):
-        what = f"{SHOWN_INVERTED} is ignored: it states that the lowest value is shown white"
-        why = "what is shown follows the rescaling: the values in HU are the same (PS3.3 C.7.6.3.1)"
-        fix = "check that bone is brighter than air in anatomy.png; otherwise export the CT again"
-        findings.append(Finding("field-ignored", what, where=name, why=why, fix=fix))
-    kinds = {s.text("rescale_type").upper() for s in stack.slices} - UNSTATED_SCALES
-    if kinds:
-        what = f"the header states that values are {', '.join(sorted(kinds))!r}, not HU"
-        findings.append(Finding("ct-not-hu", what, where=name))
-    return findings
