@@ -1,10 +1,12 @@
-"""The options of the command line."""
+"""The commands and the options of the command line."""
 
 import argparse
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
-from cmfsim.cli.options import add_band_options, file, number, switch, whole
 from cmfsim.cli.patients import (
     case_commands,
     landmarks_command,
@@ -12,29 +14,47 @@ from cmfsim.cli.patients import (
     scene_commands,
     template_commands,
 )
-from cmfsim.cli.patients.plan_command import add_bite, add_splint
 from cmfsim.cli.research import lab_commands, study_commands
-from cmfsim.cli.research.lab_commands import add_population_commands
 from cmfsim.io import result_suffixes
+from cmfsim.io.results.populations import PARTS, TEST
+from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.lab.frontier import EDGES, FACTORS
+from cmfsim.lab.virtual.population import TRUTHS
 from cmfsim.muscles.template import WHERE
 from cmfsim.planning.replanning import CORRECTIONS, TRIALS
 from cmfsim.values.case_parts import PROCEDURES
+from cmfsim.values.dental_arch import JAWS
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
+from cmfsim.values.solver_options import MODELS as SOLVED_MODELS
 
 MOST_PORT = 65535
-# How `predict` and `evaluate` take models.
-MODEL_CHOICES: dict[str, Any] = {
-    "metavar": "MODEL",
-    "choices": (*MODELS, "all"),
-    "action": "append",
-}
+Parser = argparse.ArgumentParser
 
 
-def make_parser() -> argparse.ArgumentParser:
+def option(command: Parser, spec: str, words: str, **more: Any) -> None:
+    """Adds an option, or an argument whose name has no dash.
+
+    spec: Its names, and, in capitals, what stands for its value in the help.
+    words: Its help.
+    """
+    names = spec.split()
+    if names[-1].isupper() and not names[-1].startswith("-"):
+        more["metavar"] = names.pop()
+    command.add_argument(*names, help=words, **more)
+
+
+switch = partial(option, action="store_true")
+file = partial(option, type=Path)
+number = partial(option, type=float)
+whole = partial(option, type=int)
+# How `predict`, `evaluate` and `study` take models.
+models = partial(option, choices=(*MODELS, "all"), action="append")
+
+
+def make_parser() -> Parser:
     """The parser of every command; `options.run` is the function that does it."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="cmfsim",
         description="Predict soft tissue after cranio-maxillofacial surgery with the "
         "mass-tensor model.",
@@ -42,266 +62,112 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"cmfsim {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    common = argparse.ArgumentParser(add_help=False)
+    common = Parser(add_help=False)
     switch(common, "--json", "print the result, or the error, as a JSON object")
     switch(common, "-q --quiet", "print only warnings and errors, no progress")
     _add_case_commands(commands, common)
     _add_scene_commands(commands, common)
     _add_template_commands(commands, common)
-    _add_bench_commands(commands, common)
-    add_population_commands(commands, common)
+    _add_frontier(commands, common)
+    _add_virtual_patients(commands, common)
+    _add_benchmark(commands, common)
     return parser
 
 
-def _add_case_commands(commands: Any, common: argparse.ArgumentParser) -> None:
-    named = argparse.ArgumentParser(add_help=False, parents=[common])
-    file(named, "case", "CASE", "case.toml, or the folder that contains it")
+def _command(
+    commands: Any,
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    words: str,
+    parent: Parser,
+    *,
+    epilog: str | None = None,
+) -> Parser:
+    """A command with the options of its parent; `words` are its help."""
+    made: Parser = commands.add_parser(name, parents=[parent], help=words, epilog=epilog)
+    made.set_defaults(run=run)
+    return made
 
-    _add_demo(commands, common)
-    _add_init(commands, common)
-    _add_desk(commands, common)
-    _add_view(commands, common)
 
-    doctor = commands.add_parser(
-        "doctor",
-        parents=[named],
-        help="check a case, and report how to fix its problems",
-        epilog="Exit codes: 0 no errors found, 2 errors found or the case file cannot be read.",
-    )
-    doctor.set_defaults(run=case_commands.doctor)
+def _add_case_commands(commands: Any, common: Parser) -> None:
+    named = Parser(add_help=False, parents=[common])
+    file(named, "case CASE", "case.toml, or the folder that contains it")
 
+    _add_first_commands(commands, common)
+    words = "check a case, and report how to fix its problems"
+    epilog = "Exit codes: 0 no errors found, 2 errors found or the case file cannot be read."
+    _command(commands, "doctor", case_commands.doctor, words, named, epilog=epilog)
     _add_landmarks(commands, named)
 
-    changed = argparse.ArgumentParser(add_help=False, parents=[named])
-    file(changed, "-o --output", "OUT", "output folder (default: that of the case)")
-    number(changed, "--edge-length", "H", "tet edges, mm (default: those of the case)")
+    changed = Parser(add_help=False, parents=[named])
+    file(changed, "-o --output OUT", "output folder (default: that of the case)")
+    number(changed, "--edge-length H", "tet edges, mm (default: those of the case)")
     switch(changed, "--no-doctor", "skip the checks of the case")
 
-    build = commands.add_parser(
-        "build", parents=[changed], help="build the scene of a case from its images"
-    )
-    build.set_defaults(run=case_commands.build)
-
-    _add_study_commands(commands, common, changed)
-    add_splint(commands, named)
-    add_bite(commands, named)
-
-    _add_phantom(commands, common)
-
-
-def _add_demo(commands: Any, common: argparse.ArgumentParser) -> None:
-    demo = commands.add_parser(
-        "demo", parents=[common], help="predict the face of a built-in case, and open the report"
-    )
-    file(
-        demo,
-        "folder",
-        "FOLDER",
-        f"new, empty or from an earlier demo (default {scene_commands.DEMO_FOLDER})",
-        nargs="?",
-        default=scene_commands.DEMO_FOLDER,
-    )
-    number(demo, "--edge-length", "H", "tet edges, mm (default 6)", default=6.0)
-    switch(demo, "--no-open", "do not open the report")
-    demo.set_defaults(run=scene_commands.demo, models=scene_commands.DEMO_MODELS)
-
-
-def _add_init(commands: Any, common: argparse.ArgumentParser) -> None:
-    init = commands.add_parser(
-        "init",
-        parents=[common],
-        help="write a commented case.toml for the files in a folder, or for a 3D Slicer scene",
-        epilog="Anything unclear is written as a line with a question mark, which doctor rejects.",
-    )
-    file(init, "folder", "FOLDER", "folder, or 3D Slicer scene (.mrml, .mrb)")
-    switch(init, "--force", "replace an existing case.toml")
-    init.add_argument(
-        "--cut",
-        action="append",
-        default=[],
-        choices=tuple(PROCEDURES),
-        help="cut by this procedure; again for another",
-    )
-    init.add_argument(
-        "--move",
-        action="append",
-        default=[],
-        nargs="+",
-        metavar=("SEGMENT", "WORD=NUMBER"),
-        help="move a segment, such as: --move maxilla forwards=4 up=1 pitch=2. Words: forwards, "
-        "backwards, up, down, left, right in mm; pitch (front up), yaw (front to the left), roll "
-        "(left side up) in degrees, about the teeth or the chin. Again for another segment",
-    )
-    init.set_defaults(run=case_commands.init)
-
-
-def _add_desk(commands: Any, common: argparse.ArgumentParser) -> None:
-    desk = commands.add_parser(
-        "desk",
-        parents=[common],
-        help="from a folder with a scan to a saved plan and its report, in the browser",
-        epilog="Everything is saved in the case.toml there. Only this machine can open the page.",
-    )
-    file(desk, "folder", "FOLDER", "folder with a CT or surfaces, or with a case")
-    _add_page_options(desk)
-    desk.set_defaults(run=plan_command.desk)
-
-
-def _add_page_options(command: argparse.ArgumentParser) -> None:
-    """Where a page is served, and whether it is opened."""
-    command.add_argument(
-        "--port",
-        metavar="N",
-        type=_port,
-        default=0,
-        help="port from 1024 to 65535 (default: a free one)",
-    )
-    switch(command, "--no-open", "do not open the page")
-
-
-def _add_view(commands: Any, common: argparse.ArgumentParser) -> None:
-    view = commands.add_parser(
-        "view", parents=[common], help="display a prediction, model, scene, result or surface"
-    )
-    file(
-        view,
-        "path",
-        "FOLDER_OR_FILE",
-        "folder written by predict, build or demo; case.toml, scene, result or surface",
-    )
-    view.add_argument(
-        "--model",
-        choices=MODELS,
-        help="which of several predictions (default: the last of H, M, H+S, M+S)",
-    )
-    file(view, "--screenshot", "PNG", "write a picture instead of opening a window")
-    view.set_defaults(run=case_commands.view)
-
-
-def _add_phantom(commands: Any, common: argparse.ArgumentParser) -> None:
-    phantom = commands.add_parser(
-        "phantom", parents=[common], help="write the case of a synthetic head"
-    )
-    file(phantom, "folder", "FOLDER", "output folder")
-    whole(phantom, "--person", "N", "number of the person; each N gives a different head")
-    number(phantom, "--spacing", "MM", "CT voxel size (default 1)", default=1.0)
-    phantom.set_defaults(run=lab_commands.phantom)
-
-
-def _add_study_commands(commands: Any, common: Any, changed: argparse.ArgumentParser) -> None:
+    words = "build the scene of a case from its images"
+    _command(commands, "build", case_commands.build, words, changed)
     _add_predict(commands, changed)
     _add_plan(commands, changed)
     _add_evaluate(commands, changed)
     _add_sensitivity(commands, changed)
-    study = commands.add_parser(
-        "study",
-        parents=[common],
-        help="predict and evaluate every case of a cohort with every model",
-        epilog="Tables and figures of Kim et al. (2010) are written below the cohort's folder: "
-        "study.csv, table3.md, figure9.png, figure10.png, and report.html (docs/kim2010.md). With "
-        "--variants, the cohort runs as given and once for each named change of settings in FILE, "
-        "which has tables such as [variants.soft] with lines such as muscles.young_along = 0.06 "
-        "(docs/evaluation.md). Errors of each patient, region and variant, and their changes, are "
-        "written to variants.csv, variants.md, variants.json and report.html.",
-    )
-    file(study, "cohort", "COHORT", "cohort.toml, or a folder of cases")
-    whole(study, "--workers", "N", "number of cases processed at a time")
-    study.add_argument(
-        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
-    )
-    switch(study, "--fresh", "repeat finished cases")
-    study.add_argument(
-        "--model",
-        **MODEL_CHOICES,
-        help="H, M, H+S, M+S or all; may be repeated (default: those of the cohort)",
-    )
-    file(study, "-o --output", "OUT", "output folder (default: that of the cohort)")
-    file(
-        study,
-        "--variants",
-        "FILE",
-        "compare named changes of any keys of a case file with the cases as given",
-    )
-    study.set_defaults(run=study_commands.study)
+    _add_study(commands, common)
+    _add_report(commands, common)
+    _add_splint(commands, named)
+    _add_bite(commands, named)
 
-    report = commands.add_parser(
-        "report", parents=[common], help="regenerate the report of a results folder"
-    )
-    file(report, "folder", "FOLDER", "folder written by predict, or that of its case")
-    switch(report, "--pdf", "also write report.pdf, one page for the chart")
-    file(
-        report,
-        "--dicom",
-        "CT",
-        "also write report.dcm, that page as DICOM in the study of the CT, whose folder is given",
-    )
-    file(
-        report,
-        "--animation",
-        "FILE",
-        "also write the face on its way from before to after: .gif, or .mp4 by ffmpeg",
-    )
-    report.set_defaults(run=study_commands.report)
+    words = "write the case of a synthetic head"
+    phantom = _command(commands, "phantom", lab_commands.phantom, words, common)
+    file(phantom, "folder FOLDER", "output folder")
+    whole(phantom, "--person N", "number of the person; each N gives a different head")
+    number(phantom, "--spacing MM", "CT voxel size (default 1)", default=1.0)
 
 
-def _add_predict(commands: Any, changed: argparse.ArgumentParser) -> None:
-    predict = commands.add_parser(
-        "predict", parents=[changed], help="predict the post-operative face"
+def _add_first_commands(commands: Any, common: Parser) -> None:
+    """`demo`, `init`, `desk` and `view`: what a newcomer needs."""
+    words = "predict the face of a built-in case, and open the report"
+    demo = _command(commands, "demo", scene_commands.demo, words, common)
+    folder = scene_commands.DEMO_FOLDER
+    words = f"new, empty or from an earlier demo (default {folder})"
+    file(demo, "folder FOLDER", words, nargs="?", default=folder)
+    number(demo, "--edge-length H", "tet edges, mm (default 6)", default=6.0)
+    switch(demo, "--no-open", "do not open the report")
+    demo.set_defaults(models=scene_commands.DEMO_MODELS)
+
+    words = "write a commented case.toml for the files in a folder, or for a 3D Slicer scene"
+    epilog = "Anything unclear is written as a line with a question mark, which doctor rejects."
+    init = _command(commands, "init", case_commands.init, words, common, epilog=epilog)
+    file(init, "folder FOLDER", "folder, or 3D Slicer scene (.mrml, .mrb)")
+    switch(init, "--force", "replace an existing case.toml")
+    words = "cut by this procedure; again for another"
+    option(init, "--cut", words, action="append", default=[], choices=tuple(PROCEDURES))
+    words = (
+        "move a segment, such as: --move maxilla forwards=4 up=1 pitch=2. Words: forwards, "
+        "backwards, up, down, left, right in mm; pitch (front up), yaw (front to the left), roll "
+        "(left side up) in degrees, about the teeth or the chin. Again for another segment"
     )
-    predict.add_argument(
-        "--model",
-        **MODEL_CHOICES,
-        help="H (homogeneous), M (muscles), H+S or M+S (with sliding), or all; may be repeated "
-        "(default M+S)",
-    )
-    file(predict, "--plan", "PLAN", "plan.toml to use instead of the case's plan")
-    add_band_options(predict)
-    _add_output_options(predict)
-    predict.set_defaults(run=study_commands.predict)
+    metavar = ("SEGMENT", "WORD=NUMBER")
+    option(init, "--move", words, action="append", default=[], nargs="+", metavar=metavar)
+
+    words = "from a folder with a scan to a saved plan and its report, in the browser"
+    epilog = "Everything is saved in the case.toml there. Only this machine can open the page."
+    desk = _command(commands, "desk", plan_command.desk, words, common, epilog=epilog)
+    file(desk, "folder FOLDER", "folder with a CT or surfaces, or with a case")
+    _add_page_options(desk)
+
+    words = "display a prediction, model, scene, result or surface"
+    view = _command(commands, "view", case_commands.view, words, common)
+    words = "folder written by predict, build or demo; case.toml, scene, result or surface"
+    file(view, "path FOLDER_OR_FILE", words)
+    words = "which of several predictions (default: the last of H, M, H+S, M+S)"
+    option(view, "--model", words, choices=MODELS)
+    file(view, "--screenshot PNG", "write a picture instead of opening a window")
 
 
-def _add_plan(commands: Any, changed: argparse.ArgumentParser) -> None:
-    plan = commands.add_parser(
-        "plan",
-        parents=[changed],
-        help="write a page on which you move the bones and the face follows",
-        epilog="The page is a single file that needs neither a server nor a network.",
-    )
-    plan.add_argument("--model", choices=MODELS, default="M+S", help="model (default M+S)")
-    whole(
-        plan,
-        "--trials",
-        "N",
-        f"exact solutions for measuring the error of the page (default {TRIALS})",
-        default=TRIALS,
-    )
-    whole(
-        plan,
-        "--corrections",
-        "N",
-        "exact solutions for correcting the face at plans other than the case's, if tissue "
-        f"slides; 0 for none (default {CORRECTIONS})",
-        default=CORRECTIONS,
-    )
-    file(
-        plan,
-        "--towards",
-        "FILE",
-        "find the plan whose face is closest to a surface, or to named skin landmarks",
-    )
-    switch(
-        plan,
-        "--keep-bite",
-        "with --towards: keep the mandible in its planned position relative to the maxilla",
-    )
-    switch(
-        plan,
-        "--serve",
-        "solve plans exactly while the page is open, on this machine only, until Ctrl-C",
-    )
-    add_band_options(plan)
-    _add_page_options(plan)
-    plan.set_defaults(run=plan_command.plan)
+def _add_page_options(command: Parser) -> None:
+    """Where a page is served, and whether it is opened."""
+    words = "port from 1024 to 65535 (default: a free one)"
+    option(command, "--port N", words, type=_port, default=0)
+    switch(command, "--no-open", "do not open the page")
 
 
 def _port(text: str) -> int:
@@ -312,230 +178,305 @@ def _port(text: str) -> int:
     return int(text)
 
 
-def _add_evaluate(commands: Any, changed: argparse.ArgumentParser) -> None:
-    evaluate = commands.add_parser(
-        "evaluate",
-        parents=[changed],
-        help="predict the face, and compare it with the post-operative face",
+def _add_band_options(command: Parser) -> None:
+    words = "add an uncertainty band of the face to the report, the files and the terminal output"
+    switch(command, "--band", words)
+    words = (
+        "calibration of the band, from cases whose outcome is known; without one, the band "
+        "is marked as uncalibrated"
     )
-    evaluate.add_argument("--model", **MODEL_CHOICES, help="as in predict (default all)")
-    switch(
-        evaluate,
-        "--fit-thickness",
+    file(command, "--calibration FILE", words)
+    number(command, "--coverage SHARE", "coverage of the band (default 0.9, that is 90 %%)")
+    option(command, "--group NAME", "use only the calibration cases of this group")
+
+
+def _add_study(commands: Any, common: Parser) -> None:
+    words = "predict and evaluate every case of a cohort with every model"
+    epilog = (
+        "Tables and figures of Kim et al. (2010) are written below the cohort's folder: "
+        "study.csv, table3.md, figure9.png, figure10.png, and report.html (docs/kim2010.md). With "
+        "--variants, the cohort runs as given and once for each named change of settings in FILE, "
+        "which has tables such as [variants.soft] with lines such as muscles.young_along = 0.06 "
+        "(docs/evaluation.md). Errors of each patient, region and variant, and their changes, are "
+        "written to variants.csv, variants.md, variants.json and report.html."
+    )
+    study = _command(commands, "study", study_commands.study, words, common, epilog=epilog)
+    file(study, "cohort COHORT", "cohort.toml, or a folder of cases")
+    whole(study, "--workers N", "number of cases processed at a time")
+    option(study, "--scheduler ADDRESS", "Dask cluster with access to the same files")
+    switch(study, "--fresh", "repeat finished cases")
+    words = "H, M, H+S, M+S or all; may be repeated (default: those of the cohort)"
+    models(study, "--model MODEL", words)
+    file(study, "-o --output OUT", "output folder (default: that of the cohort)")
+    words = "compare named changes of any keys of a case file with the cases as given"
+    file(study, "--variants FILE", words)
+
+
+def _add_report(commands: Any, common: Parser) -> None:
+    words = "regenerate the report of a results folder"
+    report = _command(commands, "report", study_commands.report, words, common)
+    file(report, "folder FOLDER", "folder written by predict, or that of its case")
+    switch(report, "--pdf", "also write report.pdf, one page for the chart")
+    words = (
+        "also write report.dcm, that page as DICOM in the study of the CT, whose folder is given"
+    )
+    file(report, "--dicom CT", words)
+    words = "also write the face on its way from before to after: .gif, or .mp4 by ffmpeg"
+    file(report, "--animation FILE", words)
+
+
+def _add_predict(commands: Any, changed: Parser) -> None:
+    words = "predict the post-operative face"
+    predict = _command(commands, "predict", study_commands.predict, words, changed)
+    words = (
+        "H (homogeneous), M (muscles), H+S or M+S (with sliding), or all; may be repeated "
+        "(default M+S)"
+    )
+    models(predict, "--model MODEL", words)
+    file(predict, "--plan PLAN", "plan.toml to use instead of the case's plan")
+    _add_band_options(predict)
+    _add_output_options(predict)
+
+
+def _add_plan(commands: Any, changed: Parser) -> None:
+    words = "write a page on which you move the bones and the face follows"
+    epilog = "The page is a single file that needs neither a server nor a network."
+    plan = _command(commands, "plan", plan_command.plan, words, changed, epilog=epilog)
+    option(plan, "--model", "model (default M+S)", choices=MODELS, default="M+S")
+    words = f"exact solutions for measuring the error of the page (default {TRIALS})"
+    whole(plan, "--trials N", words, default=TRIALS)
+    words = (
+        "exact solutions for correcting the face at plans other than the case's, if tissue "
+        f"slides; 0 for none (default {CORRECTIONS})"
+    )
+    whole(plan, "--corrections N", words, default=CORRECTIONS)
+    words = "find the plan whose face is closest to a surface, or to named skin landmarks"
+    file(plan, "--towards FILE", words)
+    words = "with --towards: keep the mandible in its planned position relative to the maxilla"
+    switch(plan, "--keep-bite", words)
+    words = "solve plans exactly while the page is open, on this machine only, until Ctrl-C"
+    switch(plan, "--serve", words)
+    _add_band_options(plan)
+    _add_page_options(plan)
+
+
+def _add_evaluate(commands: Any, changed: Parser) -> None:
+    words = "predict the face, and compare it with the post-operative face"
+    evaluate = _command(commands, "evaluate", study_commands.evaluate, words, changed)
+    models(evaluate, "--model MODEL", "as in predict (default all)")
+    words = (
         "fit one change of thickness (swelling, weight) where nothing was operated on, and "
-        "also report the errors with this change",
+        "also report the errors with this change"
     )
+    switch(evaluate, "--fit-thickness", words)
     _add_output_options(evaluate)
-    evaluate.set_defaults(run=study_commands.evaluate)
 
 
-def _add_output_options(command: argparse.ArgumentParser) -> None:
+def _add_output_options(command: Parser) -> None:
     """Which files `predict` and `evaluate` write."""
     switch(command, "--no-report", "do not write report.html")
     switch(command, "--slicer", "also write prediction.mrb for 3D Slicer")
 
 
-def _add_sensitivity(commands: Any, changed: argparse.ArgumentParser) -> None:
-    sensitivity = commands.add_parser(
-        "sensitivity", parents=[changed], help="measure the effect of landmark errors on the face"
-    )
-    sensitivity.add_argument(
-        "--model", choices=("M", "M+S"), default="M+S", help="model (default M+S)"
-    )
-    whole(sensitivity, "--trials", "N", "(default 3)", default=3)
-    number(
-        sensitivity,
-        "--std",
-        "MM",
-        "standard deviation of a landmark along each axis (default 2)",
-        default=2.0,
-    )
-    sensitivity.add_argument("--seed", type=int, default=0, help="random seed (default 0)")
-    file(
-        sensitivity,
-        "--landmarks",
-        "FILE",
-        "landmarks placed again by hand, one file per trial, instead of random ones",
-        action="append",
-    )
-    sensitivity.set_defaults(run=study_commands.sensitivity)
+def _add_sensitivity(commands: Any, changed: Parser) -> None:
+    words = "measure the effect of landmark errors on the face"
+    sensitivity = _command(commands, "sensitivity", study_commands.sensitivity, words, changed)
+    option(sensitivity, "--model", "model (default M+S)", choices=("M", "M+S"), default="M+S")
+    whole(sensitivity, "--trials N", "(default 3)", default=3)
+    words = "standard deviation of a landmark along each axis (default 2)"
+    number(sensitivity, "--std MM", words, default=2.0)
+    whole(sensitivity, "--seed", "random seed (default 0)", default=0)
+    words = "landmarks placed again by hand, one file per trial, instead of random ones"
+    file(sensitivity, "--landmarks FILE", words, action="append")
 
 
-def _add_scene_commands(commands: Any, common: argparse.ArgumentParser) -> None:
-    common = argparse.ArgumentParser(add_help=False, parents=[common])
-    file(common, "scene", "SCENE", "scene.npz or scene.toml")
-
-    solve = commands.add_parser("solve", parents=[common], help="solve a scene")
-    file(
-        solve,
-        "-o --output",
-        "OUT",
-        f"result file; its suffix sets the format: {' '.join(result_suffixes())}",
-        required=True,
+def _add_splint(commands: Any, named: Parser) -> None:
+    words = "write a surgical splint between the planned tooth rows, as STL"
+    epilog = (
+        "The teeth must be in the bones of the case. A splint for a closed bite needs room: "
+        "the error states by how many degrees the lower jaw has to be opened."
     )
-    solve.add_argument("--method", choices=METHODS, help="solver (default: that of the scene)")
-    solve.add_argument("--contact", choices=CONTACTS, help="contact (default: that of the scene)")
-    solve.add_argument("--tolerance", type=float, help="relative error of the iterative methods")
-    file(solve, "--plan", "PLAN", "plan.toml or plan.json, instead of the scene's plan")
-    solve.set_defaults(run=scene_commands.solve)
-
-    info = commands.add_parser("info", parents=[common], help="list the contents of a scene")
-    info.set_defaults(run=scene_commands.info)
-
-
-def _add_landmarks(commands: Any, named: argparse.ArgumentParser) -> None:
-    landmarks = commands.add_parser(
-        "landmarks",
-        parents=[named],
-        help="find the landmarks of skull and skin, and draw them for checking",
+    splint = _command(commands, "splint", plan_command.splint_case, words, named, epilog=epilog)
+    words = (
+        "the splint after one jaw: maxilla (default) or mandible first; without it, the final "
+        "splint with both jaws as planned"
     )
-    file(landmarks, "-o --output", "OUT", "output folder (default: that of the case)")
-    file(
-        landmarks,
-        "--template",
-        "FOLDER",
+    first = ("maxilla", "mandible")
+    option(splint, "--intermediate FIRST", words, nargs="?", const=first[0], choices=first)
+    number(splint, "--thickness MM", "least thickness of walls (default 2)")
+    words = "open the lower jaw about its joint heads (default 0)"
+    number(splint, "--open DEGREES", words, default=0.0)
+    option(splint, "--label TEXT", "raised letters on the front", default="")
+    names = "splint-final.stl or splint-intermediate.stl"
+    _add_plan_and_file(splint, names)
+
+
+def _add_bite(commands: Any, named: Parser) -> None:
+    words = "write the plan in which the lower jaw follows the upper one into the final bite"
+    epilog = (
+        "Both scans of the teeth are exported in occlusion, in one frame: any. They are "
+        "registered to the tooth rows of the case, which must have the teeth."
+    )
+    bite = _command(commands, "bite", plan_command.bite_case, words, named, epilog=epilog)
+    for jaw in JAWS:
+        file(bite, f"--{jaw} SCAN", f"{jaw} teeth, such as STL", required=True)
+    _add_plan_and_file(bite, "bite.toml")
+
+
+def _add_plan_and_file(command: Parser, names: str) -> None:
+    """The plan that `splint` and `bite` take, and the file that they write."""
+    file(command, "--plan PLAN", "plan.toml to use instead of the case's plan")
+    words = f"file to write (default: {names} among the results of the case)"
+    file(command, "-o --out FILE", words)
+    switch(command, "--no-doctor", "skip the checks of the case")
+    command.set_defaults(edge_length=None, output=None)
+
+
+def _add_scene_commands(commands: Any, common: Parser) -> None:
+    common = Parser(add_help=False, parents=[common])
+    file(common, "scene SCENE", "scene.npz or scene.toml")
+
+    solve = _command(commands, "solve", scene_commands.solve, "solve a scene", common)
+    words = f"result file; its suffix sets the format: {' '.join(result_suffixes())}"
+    file(solve, "-o --output OUT", words, required=True)
+    option(solve, "--method", "solver (default: that of the scene)", choices=METHODS)
+    option(solve, "--contact", "contact (default: that of the scene)", choices=CONTACTS)
+    number(solve, "--tolerance", "relative error of the iterative methods")
+    file(solve, "--plan PLAN", "plan.toml or plan.json, instead of the scene's plan")
+
+    _command(commands, "info", scene_commands.info, "list the contents of a scene", common)
+
+
+def _add_landmarks(commands: Any, named: Parser) -> None:
+    words = "find the landmarks of skull and skin, and draw them for checking"
+    landmarks = _command(commands, "landmarks", landmarks_command.landmarks, words, named)
+    file(landmarks, "-o --output OUT", "output folder (default: that of the case)")
+    words = (
         "a head whose landmarks are known (cranium, mandible, skull_landmarks.mrk.json); "
-        "may be repeated",
-        action="append",
+        "may be repeated"
     )
-    landmarks.add_argument(
-        "--names",
-        choices=("cmfsim", "ali"),
-        default="cmfsim",
-        help="labels of the files: gonion_L (default), or LGo as in cephalometry and ALI_CBCT",
-    )
-    switch(
-        landmarks,
-        "--page",
-        "also write landmarks.html, a page in which the landmarks are checked and placed",
-    )
+    file(landmarks, "--template FOLDER", words, action="append")
+    words = "labels of the files: gonion_L (default), or LGo as in cephalometry and ALI_CBCT"
+    option(landmarks, "--names", words, choices=("cmfsim", "ali"), default="cmfsim")
+    words = "also write landmarks.html, a page in which the landmarks are checked and placed"
+    switch(landmarks, "--page", words)
     switch(landmarks, "--no-open", "do not open the page in the browser")
-    landmarks.set_defaults(run=landmarks_command.landmarks)
 
 
-def _add_template_commands(commands: Any, common: argparse.ArgumentParser) -> None:
+def _add_template_commands(commands: Any, common: Parser) -> None:
     template = commands.add_parser("template", help="muscle templates: list, check, import, morph")
     actions = template.add_subparsers(dest="action", metavar="ACTION", required=True)
-    named = argparse.ArgumentParser(add_help=False, parents=[common])
-    named.add_argument(
-        "template", metavar="TEMPLATE", help="folder, archive or name of a built-in template"
+    named = Parser(add_help=False, parents=[common])
+    option(named, "template TEMPLATE", "folder, archive or name of a built-in template")
+
+    words = "list the built-in templates"
+    _command(actions, "list", template_commands.list_templates, words, common)
+
+    words = "report what is wrong with a template, and how to fix it"
+    epilog = "Exit codes: 0 no errors found, 2 errors found or there is no such template."
+    _command(actions, "check", template_commands.check, words, named, epilog=epilog)
+
+    words = "make a template from the files of an atlas"
+    epilog = f"BodyParts3D: download the OBJ files from {WHERE}."
+    imports = _command(
+        actions, "import", template_commands.import_atlas, words, common, epilog=epilog
     )
-
-    listing = actions.add_parser("list", parents=[common], help="list the built-in templates")
-    listing.set_defaults(run=template_commands.list_templates)
-
-    check = actions.add_parser(
-        "check",
-        parents=[named],
-        help="report what is wrong with a template, and how to fix it",
-        epilog="Exit codes: 0 no errors found, 2 errors found or there is no such template.",
-    )
-    check.set_defaults(run=template_commands.check)
-
-    _add_template_import(actions, common)
-    _add_template_morph(actions, named)
-    _add_template_show(actions, named)
-
-
-def _add_template_import(actions: Any, common: argparse.ArgumentParser) -> None:
-    imports = actions.add_parser(
-        "import",
-        parents=[common],
-        help="make a template from the files of an atlas",
-        epilog=f"BodyParts3D: download the OBJ files from {WHERE}.",
-    )
-    imports.add_argument("atlas", choices=["bodyparts3d"], help="which atlas")
-    file(imports, "folder", "FOLDER", "folder of the atlas files")
-    file(
-        imports,
-        "--landmarks",
-        "FILE",
-        "skull landmarks on the bones of the atlas (.mrk.json)",
-        required=True,
-    )
-    file(imports, "-o --output", "OUT", "folder, or .npz file", required=True)
+    option(imports, "atlas", "which atlas", choices=["bodyparts3d"])
+    file(imports, "folder FOLDER", "folder of the atlas files")
+    words = "skull landmarks on the bones of the atlas (.mrk.json)"
+    file(imports, "--landmarks FILE", words, required=True)
+    file(imports, "-o --output OUT", "folder, or .npz file", required=True)
     switch(imports, "--any-files", "accept files with unknown hashes")
-    imports.set_defaults(run=template_commands.import_atlas)
 
+    words = "transfer the muscles of a template to a patient by landmarks"
+    morph = _command(actions, "morph", template_commands.morph, words, named)
+    file(morph, "landmarks LANDMARKS", "skull landmarks of the patient, .mrk.json or .fcsv")
+    file(morph, "-o --output OUT", "folder, or .npz file", required=True)
+    number(morph, "--smoothing MM", "0 (default): exact landmarks", default=0.0)
 
-def _add_template_morph(actions: Any, named: argparse.ArgumentParser) -> None:
-    morph = actions.add_parser(
-        "morph",
-        parents=[named],
-        help="transfer the muscles of a template to a patient by landmarks",
-    )
-    file(morph, "landmarks", "LANDMARKS", "skull landmarks of the patient, .mrk.json or .fcsv")
-    file(morph, "-o --output", "OUT", "folder, or .npz file", required=True)
-    number(morph, "--smoothing", "MM", "0 (default): exact landmarks", default=0.0)
-    morph.set_defaults(run=template_commands.morph)
-
-
-def _add_template_show(actions: Any, named: argparse.ArgumentParser) -> None:
-    show = actions.add_parser("show", parents=[named], help="draw a template's muscles")
-    file(show, "-o --output", "PNG", "picture to write", required=True)
-    show.add_argument(
-        "--only", metavar="NAME", nargs="+", help="only these muscles; without _L or _R, both sides"
-    )
+    words = "draw a template's muscles"
+    show = _command(actions, "show", template_commands.show, words, named)
+    file(show, "-o --output PNG", "picture to write", required=True)
+    option(show, "--only NAME", "only these muscles; without _L or _R, both sides", nargs="+")
     switch(show, "--fibres", "draw fibre boxes and directions instead of names")
-    show.set_defaults(run=template_commands.show)
 
 
-def _add_bench_commands(commands: Any, common: argparse.ArgumentParser) -> None:
+def _add_frontier(commands: Any, common: Parser) -> None:
     bench = commands.add_parser("bench", help="benchmarks: error against run time")
     actions = bench.add_subparsers(dest="action", metavar="ACTION", required=True)
-
-    frontier = actions.add_parser(
-        "frontier",
-        parents=[common],
-        help="measure the run time and the accuracy of each setting of a prediction",
-        epilog="Finished runs are kept in the output folder, so an interrupted sweep is resumed.",
-    )
-    file(frontier, "case", "CASE", "case.toml (default: a synthetic head)", nargs="?")
-    file(
-        frontier,
-        "-o --output",
-        "OUT",
-        f"output folder (default {lab_commands.FRONTIER_FOLDER})",
-        default=lab_commands.FRONTIER_FOLDER,
-    )
-    number(
-        frontier,
-        "--edge-length",
-        "H",
-        "edge length of the base run, mm (default: that of the case)",
-    )
-    frontier.add_argument("--model", choices=MODELS, help="model of the base run (default M+S)")
-    number(frontier, "--edges", "H", "edge lengths of the grid, mm", nargs="+", default=EDGES)
+    words = "measure the run time and the accuracy of each setting of a prediction"
+    epilog = "Finished runs are kept in the output folder, so an interrupted sweep is resumed."
+    frontier = _command(actions, "frontier", lab_commands.frontier, words, common, epilog=epilog)
+    file(frontier, "case CASE", "case.toml (default: a synthetic head)", nargs="?")
+    folder = lab_commands.FRONTIER_FOLDER
+    file(frontier, "-o --output OUT", f"output folder (default {folder})", default=folder)
+    words = "edge length of the base run, mm (default: that of the case)"
+    number(frontier, "--edge-length H", words)
+    option(frontier, "--model", "model of the base run (default M+S)", choices=MODELS)
+    number(frontier, "--edges H", "edge lengths of the grid, mm", nargs="+", default=EDGES)
     for name, known in (("elements", ELEMENTS), ("kinematics", KINEMATICS)):
-        frontier.add_argument(
-            f"--{name}",
-            choices=known,
-            nargs="+",
-            default=known,
-            help=f"{name} of the grid (default all)",
-        )
-    frontier.add_argument(
-        "--factors",
-        choices=FACTORS,
-        nargs="*",
-        default=list(FACTORS),
-        metavar="FACTOR",
-        help=f"settings to vary one at a time, none if empty (default {' '.join(FACTORS)})",
-    )
-    number(
-        frontier,
-        "--reference-edge",
-        "H",
-        "edge length of the reference, mm (default: the smallest of the sweep)",
-    )
-    frontier.add_argument(
-        "--reference-kinematics",
-        choices=KINEMATICS,
-        default="hyperelastic",
-        help="kinematics of the reference (default hyperelastic)",
-    )
-    whole(frontier, "--repeats", "N", "timing rounds (default 3)", default=3)
-    whole(frontier, "--threads", "N", "number of threads (default: all cores)")
-    number(frontier, "--time-limit", "S", "time limit per job, s (default 600)", default=600.0)
+        words = f"{name} of the grid (default all)"
+        option(frontier, f"--{name}", words, choices=known, nargs="+", default=known)
+    words = f"settings to vary one at a time, none if empty (default {' '.join(FACTORS)})"
+    factors = list(FACTORS)
+    option(frontier, "--factors FACTOR", words, choices=FACTORS, nargs="*", default=factors)
+    words = "edge length of the reference, mm (default: the smallest of the sweep)"
+    number(frontier, "--reference-edge H", words)
+    words = "kinematics of the reference (default hyperelastic)"
+    option(frontier, "--reference-kinematics", words, choices=KINEMATICS, default="hyperelastic")
+    whole(frontier, "--repeats N", "timing rounds (default 3)", default=3)
+    whole(frontier, "--threads N", "number of threads (default: all cores)")
+    number(frontier, "--time-limit S", "time limit per job, s (default 600)", default=600.0)
     switch(frontier, "--fresh", "repeat finished runs")
-    frontier.set_defaults(run=lab_commands.frontier)
+
+
+def _add_virtual_patients(commands: Any, common: Parser) -> None:
+    words = "write virtual patients with their post-operative faces (in silico)"
+    epilog = "Existing patients with the same settings are kept."
+    run = lab_commands.virtual_patients
+    parser = _command(commands, "virtual-patients", run, words, common, epilog=epilog)
+    file(parser, "folder FOLDER", "output folder")
+    words = "patients, 1 to 6 (default 1 to 4; the lips of 5 and 6 touch, which takes longer)"
+    whole(parser, "--patients N", words, nargs="+")
+    words = "draw N patients at random (shape, tissue, operation, plan) instead of --patients"
+    whole(parser, "--count N", words)
+    words = "number of drawn patients made at a time, one process each (default 1)"
+    whole(parser, "--workers N", words, default=1)
+    whole(parser, "--seed N", "random seed (default 0)", default=0)
+    words = (
+        "true tissue of drawn patients: their own (default), or the phantom's, whose muscles "
+        "and moduli the models assume"
+    )
+    option(parser, "--truth", words, choices=TRUTHS)
+    words = "edge length of the true mesh, mm (default 6)"
+    number(parser, "--edge-length H", words, default=6.0)
+    number(parser, "--spacing MM", "CT voxel size (default 2)", default=2.0)
+    option(parser, "--scheduler ADDRESS", "Dask cluster with access to the same files")
+
+
+def _add_benchmark(commands: Any, common: Parser) -> None:
+    words = "score predictions for a population of virtual patients, by method and region"
+    epilog = (
+        "To enter a method, add predictions/METHOD/PATIENT.npz (docs/benchmark.md). "
+        "Results are written to FOLDER/benchmark; except for the run times, they have "
+        "the same bytes each time."
+    )
+    parser = _command(commands, "benchmark", lab_commands.benchmark, words, common, epilog=epilog)
+    file(parser, "folder FOLDER", "folder written by virtual-patients --count")
+    words = (
+        f"entries of this package to run first, none if empty (default {' '.join(ENTRIES)}; "
+        f"{' '.join(ON_REQUEST)} takes longer)"
+    )
+    known = (*ENTRIES, *ON_REQUEST)
+    option(parser, "--entries ENTRY", words, nargs="*", choices=known, default=list(ENTRIES))
+    words = (
+        "models whose band of 90 %% is calibrated on the part calibration and tested on "
+        "the scored patients"
+    )
+    option(parser, "--band MODEL", words, nargs="+", choices=SOLVED_MODELS, default=[])
+    words = "parts on which bands are calibrated (default calibration, unless it is scored)"
+    option(parser, "--band-parts PART", words, nargs="*", choices=PARTS)
+    option(parser, "--part", "patients to score (default test)", choices=PARTS, default=TEST)
+    words = "number of patients predicted at a time, one process each (default 1)"
+    whole(parser, "--workers N", words, default=1)
+    option(parser, "--scheduler ADDRESS", "Dask cluster with access to the same files")

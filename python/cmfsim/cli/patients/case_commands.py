@@ -17,12 +17,13 @@ from typing import Any, TextIO
 import numpy as np
 
 from cmfsim._core import TetMesh
-from cmfsim.cli.exit_codes import BAD_INPUT, DONE
+from cmfsim.cli import BAD_INPUT, DONE
 from cmfsim.cli.terminal import FindingsError, Notices, StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.drafting import CASE_FILE, init_case, read_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
+from cmfsim.io.results.calibrations import read_calibration
 from cmfsim.io.results.predictions import predictions_of
 from cmfsim.io.results.result_files import is_model_file
 from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
@@ -34,6 +35,7 @@ from cmfsim.values.checks import as_positive
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import SEVERITIES, Finding
 from cmfsim.values.mesh_report import MeshReport
+from cmfsim.values.skin_band import BandOptions
 from cmfsim.values.surface_data import SurfaceData
 
 # Columns of the text in a pipe, and at most on a terminal.
@@ -190,6 +192,20 @@ def case_of(options: argparse.Namespace) -> Case:
         output = options.output.resolve() if options.output.is_symlink() else options.output
         case = dataclasses.replace(case, output=output)
     return case
+
+
+def band_options(options: argparse.Namespace, case: Case) -> BandOptions | None:
+    """The band that the command line or the case asks for; the command line comes first."""
+    given = (options.calibration, options.coverage, options.group)
+    if not (options.band or case.band.asked or any(value is not None for value in given)):
+        return None
+    file = case.band.calibration if options.calibration is None else options.calibration
+    return BandOptions(
+        coverage=case.band.coverage if options.coverage is None else options.coverage,
+        calibration=None if file is None else read_calibration(file),
+        group=case.band.group if options.group is None else options.group,
+        source="" if file is None else file.name,
+    )
 
 
 def _warn_of_other_state(case: Case, path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.cli.exit_codes import DONE
+from cmfsim.cli import DONE
 from cmfsim.cli.patients.case_commands import print_findings
 from cmfsim.cli.terminal import StageProgress, escaped, open_page
 from cmfsim.errors import CmfsimError, LandmarkError

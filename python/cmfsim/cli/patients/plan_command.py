@@ -9,13 +9,11 @@ import webbrowser
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cmfsim.cli.exit_codes import DONE
-from cmfsim.cli.options import band_options
-from cmfsim.cli.patients.case_commands import case_of, checked
+from cmfsim.cli import DONE
+from cmfsim.cli.patients.case_commands import band_options, case_of, checked
 from cmfsim.cli.terminal import Notices, StageProgress, can_open, escaped, open_page
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface, write_plan, write_surface
@@ -25,7 +23,6 @@ from cmfsim.pipeline.planning import TARGET_STD, PlanningPage, make_planning_pag
 from cmfsim.planning.face_planning import FacePlan
 from cmfsim.planning.replanning import USUAL, ExpectedError, PlanCorrection
 from cmfsim.planning.server import open_port, serve_planning
-from cmfsim.values.dental_arch import JAWS
 from cmfsim.values.progress import BUILDING, PLANNING
 
 
@@ -162,58 +159,6 @@ def _towards_text(found: FacePlan, path: str) -> str:
     return "\n".join(escaped(line) for line in [*lines, f"       saved as {path}"])
 
 
-# Jaws that may be operated on first.
-FIRST = ("maxilla", "mandible")
-
-
-def add_splint(commands: Any, named: argparse.ArgumentParser) -> None:
-    """Adds the command and its options."""
-    splint = commands.add_parser(
-        "splint",
-        parents=[named],
-        help="write a surgical splint between the planned tooth rows, as STL",
-        epilog="The teeth must be in the bones of the case. A splint for a closed bite needs room: "
-        "the error states by how many degrees the lower jaw has to be opened.",
-    )
-    splint.add_argument(
-        "--intermediate",
-        metavar="FIRST",
-        nargs="?",
-        const=FIRST[0],
-        choices=FIRST,
-        help="the splint after one jaw: maxilla (default) or mandible first; without it, the final "
-        "splint with both jaws as planned",
-    )
-    splint.add_argument(
-        "--thickness", metavar="MM", type=float, help="least thickness of walls (default 2)"
-    )
-    splint.add_argument(
-        "--open",
-        metavar="DEGREES",
-        type=float,
-        default=0.0,
-        help="open the lower jaw about its joint heads (default 0)",
-    )
-    splint.add_argument("--label", metavar="TEXT", default="", help="raised letters on the front")
-    _add_plan(splint)
-    splint.add_argument(
-        "-o",
-        "--out",
-        metavar="FILE",
-        type=Path,
-        help="file to write (default: splint-final.stl or splint-intermediate.stl among the "
-        "results of the case)",
-    )
-    splint.add_argument("--no-doctor", action="store_true", help="skip the checks of the case")
-    splint.set_defaults(run=splint_case, edge_length=None, output=None)
-
-
-def _add_plan(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--plan", metavar="PLAN", type=Path, help="plan.toml to use instead of the case's plan"
-    )
-
-
 def _free_path(case: Case, out: Path | None, name: str) -> Path:
     """The file to write, by default among the results; it replaces no input of the case."""
     path: Path = out or case.output / name
@@ -261,31 +206,6 @@ def splint_case(options: argparse.Namespace) -> int:
     if made.opening:
         print(f"       the lower jaw is opened by {made.opening:g}° about its joint heads")
     return DONE
-
-
-def add_bite(commands: Any, named: argparse.ArgumentParser) -> None:
-    """Adds the command and its options."""
-    bite = commands.add_parser(
-        "bite",
-        parents=[named],
-        help="write the plan in which the lower jaw follows the upper one into the final bite",
-        epilog="Both scans of the teeth are exported in occlusion, in one frame: any. They are "
-        "registered to the tooth rows of the case, which must have the teeth.",
-    )
-    for jaw in JAWS:
-        bite.add_argument(
-            f"--{jaw}", metavar="SCAN", type=Path, required=True, help=f"{jaw} teeth, such as STL"
-        )
-    _add_plan(bite)
-    bite.add_argument(
-        "-o",
-        "--out",
-        metavar="FILE",
-        type=Path,
-        help="file to write (default: bite.toml among the results of the case)",
-    )
-    bite.add_argument("--no-doctor", action="store_true", help="skip the checks of the case")
-    bite.set_defaults(run=bite_case, edge_length=None, output=None)
 
 
 def bite_case(options: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.cli.exit_codes import DONE, FAILED
+from cmfsim.cli import DONE, FAILED
 from cmfsim.cli.terminal import Notices, StageProgress, escaped, open_page
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.cli.exit_codes import BAD_INPUT, DONE
+from cmfsim.cli import BAD_INPUT, DONE
 from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
 from cmfsim.doctor import findings_text
 from cmfsim.errors import CaseInputError

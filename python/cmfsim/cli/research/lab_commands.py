@@ -5,16 +5,13 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from cmfsim.cli.exit_codes import DONE
-from cmfsim.cli.options import file, number, whole
+from cmfsim.cli import DONE
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
-from cmfsim.io.results.populations import FAILED, MADE, PARTS, PENDING, TEST
+from cmfsim.io.results.populations import FAILED, MADE, PARTS, PENDING
 from cmfsim.lab.benchmark import run_benchmark
-from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.lab.frontier import (
     FACTORS,
     WHOLE,
@@ -30,10 +27,9 @@ from cmfsim.lab.virtual import PatientOutcome, virtual_population
 from cmfsim.lab.virtual import virtual_patients as write_patients
 from cmfsim.lab.virtual.demo import write_phantom_case
 from cmfsim.lab.virtual.patient_folder import PATIENTS_WITH_JOINED_LIPS
-from cmfsim.lab.virtual.population import OWN, TRUTHS
+from cmfsim.lab.virtual.population import OWN
 from cmfsim.phantom import HeadParameters, make_head
 from cmfsim.values.checks import as_positive
-from cmfsim.values.solver_options import MODELS
 
 FRONTIER_FOLDER = Path("cmfsim-frontier")
 # Voxel size of the synthetic head's CT, mm.
@@ -139,108 +135,6 @@ def phantom(options: argparse.Namespace) -> int:
     else:
         print(f"wrote {case}; build it with: cmfsim build {case}")
     return DONE
-
-
-def add_population_commands(commands: Any, common: argparse.ArgumentParser) -> None:
-    """Adds both commands."""
-    _add_virtual_patients(commands, common)
-    _add_benchmark(commands, common)
-
-
-def _add_virtual_patients(commands: Any, common: argparse.ArgumentParser) -> None:
-    parser = commands.add_parser(
-        "virtual-patients",
-        parents=[common],
-        help="write virtual patients with their post-operative faces (in silico)",
-        epilog="Existing patients with the same settings are kept.",
-    )
-    file(parser, "folder", "FOLDER", "output folder")
-    whole(
-        parser,
-        "--patients",
-        "N",
-        "patients, 1 to 6 (default 1 to 4; the lips of 5 and 6 touch, which takes longer)",
-        nargs="+",
-    )
-    whole(
-        parser,
-        "--count",
-        "N",
-        "draw N patients at random (shape, tissue, operation, plan) instead of --patients",
-    )
-    whole(
-        parser,
-        "--workers",
-        "N",
-        "number of drawn patients made at a time, one process each (default 1)",
-        default=1,
-    )
-    whole(parser, "--seed", "N", "random seed (default 0)", default=0)
-    parser.add_argument(
-        "--truth",
-        choices=TRUTHS,
-        help="true tissue of drawn patients: their own (default), or the phantom's, whose muscles "
-        "and moduli the models assume",
-    )
-    number(
-        parser, "--edge-length", "H", "edge length of the true mesh, mm (default 6)", default=6.0
-    )
-    number(parser, "--spacing", "MM", "CT voxel size (default 2)", default=2.0)
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
-    )
-    parser.set_defaults(run=virtual_patients)
-
-
-def _add_benchmark(commands: Any, common: argparse.ArgumentParser) -> None:
-    parser = commands.add_parser(
-        "benchmark",
-        parents=[common],
-        help="score predictions for a population of virtual patients, by method and region",
-        epilog="To enter a method, add predictions/METHOD/PATIENT.npz (docs/benchmark.md). "
-        "Results are written to FOLDER/benchmark; except for the run times, they have "
-        "the same bytes each time.",
-    )
-    file(parser, "folder", "FOLDER", "folder written by virtual-patients --count")
-    parser.add_argument(
-        "--entries",
-        metavar="ENTRY",
-        nargs="*",
-        choices=(*ENTRIES, *ON_REQUEST),
-        default=list(ENTRIES),
-        help=f"entries of this package to run first, none if empty (default {' '.join(ENTRIES)}; "
-        f"{' '.join(ON_REQUEST)} takes longer)",
-    )
-    parser.add_argument(
-        "--band",
-        metavar="MODEL",
-        nargs="+",
-        choices=MODELS,
-        default=[],
-        help="models whose band of 90 %% is calibrated on the part calibration and tested on "
-        "the scored patients",
-    )
-    parser.add_argument(
-        "--band-parts",
-        metavar="PART",
-        nargs="*",
-        choices=PARTS,
-        help="parts on which bands are calibrated (default calibration, unless it is scored)",
-    )
-    parser.add_argument(
-        "--part", choices=PARTS, default=TEST, help="patients to score (default test)"
-    )
-    whole(
-        parser,
-        "--workers",
-        "N",
-        "number of patients predicted at a time, one process each (default 1)",
-        default=1,
-    )
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="Dask cluster with access to the same files"
-    )
-    parser.set_defaults(run=benchmark)
 
 
 def virtual_patients(options: argparse.Namespace) -> int:

@@ -11,9 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cmfsim.cli.exit_codes import DONE, FAILED
-from cmfsim.cli.options import band_options
-from cmfsim.cli.patients.case_commands import case_of, checked
+from cmfsim.cli import DONE, FAILED
+from cmfsim.cli.patients.case_commands import band_options, case_of, checked
 from cmfsim.cli.terminal import Notices, StageProgress, escaped
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
