@@ -1,55 +1,28 @@
 """Pictures of a case, drawn off screen: anatomy, muscles, segments, node kinds, errors."""
 
-from cmfsim.pictures.anatomy import (
-    KIND_COLOURS,
-    SEGMENT_COLOURS,
-    SKIN_COLOUR,
-    picture_anatomy,
-    picture_node_kinds,
-    picture_segments,
-    segment_colours,
-)
-from cmfsim.pictures.canvas import Picture
-from cmfsim.pictures.charts import MODEL_COLOURS, chart_errors
-from cmfsim.pictures.distances import (
-    DISTANCE_LIMIT,
-    band_picture,
-    contacts_picture,
-    distance_colour,
-    picture_band,
-    picture_distance_grid,
-    picture_distances,
-)
-from cmfsim.pictures.faces import picture_plan, picture_prediction, plan_picture, prediction_picture
-from cmfsim.pictures.landmarks import picture_landmarks
-from cmfsim.pictures.muscles import picture_muscles
-from cmfsim.pictures.window import ViewPart, has_screen, view_parts
-
-__all__ = [
-    "DISTANCE_LIMIT",
-    "KIND_COLOURS",
-    "MODEL_COLOURS",
-    "SEGMENT_COLOURS",
-    "SKIN_COLOUR",
-    "Picture",
-    "ViewPart",
-    "band_picture",
-    "chart_errors",
-    "contacts_picture",
-    "distance_colour",
-    "has_screen",
-    "picture_anatomy",
-    "picture_band",
-    "picture_distance_grid",
-    "picture_distances",
-    "picture_landmarks",
-    "picture_muscles",
-    "picture_node_kinds",
-    "picture_plan",
-    "picture_prediction",
-    "picture_segments",
-    "plan_picture",
-    "prediction_picture",
-    "segment_colours",
-    "view_parts",
-]
+from cmfsim.pictures.anatomy import KIND_COLOURS as KIND_COLOURS
+from cmfsim.pictures.anatomy import SEGMENT_COLOURS as SEGMENT_COLOURS
+from cmfsim.pictures.anatomy import SKIN_COLOUR as SKIN_COLOUR
+from cmfsim.pictures.anatomy import picture_anatomy as picture_anatomy
+from cmfsim.pictures.anatomy import picture_node_kinds as picture_node_kinds
+from cmfsim.pictures.anatomy import picture_segments as picture_segments
+from cmfsim.pictures.anatomy import segment_colours as segment_colours
+from cmfsim.pictures.canvas import Picture as Picture
+from cmfsim.pictures.charts import MODEL_COLOURS as MODEL_COLOURS
+from cmfsim.pictures.charts import chart_errors as chart_errors
+from cmfsim.pictures.distances import DISTANCE_LIMIT as DISTANCE_LIMIT
+from cmfsim.pictures.distances import band_picture as band_picture
+from cmfsim.pictures.distances import contacts_picture as contacts_picture
+from cmfsim.pictures.distances import distance_colour as distance_colour
+from cmfsim.pictures.distances import picture_band as picture_band
+from cmfsim.pictures.distances import picture_distance_grid as picture_distance_grid
+from cmfsim.pictures.distances import picture_distances as picture_distances
+from cmfsim.pictures.faces import picture_plan as picture_plan
+from cmfsim.pictures.faces import picture_prediction as picture_prediction
+from cmfsim.pictures.faces import plan_picture as plan_picture
+from cmfsim.pictures.faces import prediction_picture as prediction_picture
+from cmfsim.pictures.landmarks import picture_landmarks as picture_landmarks
+from cmfsim.pictures.muscles import picture_muscles as picture_muscles
+from cmfsim.pictures.window import ViewPart as ViewPart
+from cmfsim.pictures.window import has_screen as has_screen
+from cmfsim.pictures.window import view_parts as view_parts

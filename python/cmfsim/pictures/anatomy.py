@@ -51,8 +51,7 @@ def picture_segments(
     colours = segment_colours([s.name for s in segments])
     corners = bounds([s.surface.vertices for s in segments])
 
-    def paint(plotter: Any, view: View) -> None:
-        del view
+    def paint(plotter: Any, _: View) -> None:
         for segment in segments:
             add_bone(plotter, segment.surface, colours[segment.name])
 
@@ -81,8 +80,7 @@ def picture_anatomy(
     colours = segment_colours([s.name for s in segments])
     corners = bounds([skin.vertices, *(s.surface.vertices for s in segments)])
 
-    def paint(plotter: Any, view: View) -> None:
-        del view
+    def paint(plotter: Any, _: View) -> None:
         for segment in segments:
             add_bone(plotter, segment.surface, colours[segment.name])
         shape = polydata(skin.vertices, skin.triangles)
@@ -138,19 +136,15 @@ def picture_node_kinds(
     edge = points[triangles[:, 0]] - points[triangles[:, 1]]
     rear = corners[1, 1] - 0.5 * float(np.median(np.linalg.norm(edge, axis=1)))
     closing = (points[triangles][:, :, 1] >= rear).all(axis=1)
-    entries = [
-        (f"{name} {len(kinds.nodes(name))}", KIND_COLOURS[name])
-        for name in ("fixed", "joined", "sliding", "free")
-    ]
+    shown_kinds = ("fixed", "joined", "sliding", "free")
+    entries = [(f"{name} {len(kinds.nodes(name))}", KIND_COLOURS[name]) for name in shown_kinds]
     entries += [
         (f"{name} lip {len(region.nodes)}", LIP_COLOURS[name])
         for name, region in (lips or {}).items()
     ]
 
     def paint(plotter: Any, view: View) -> None:
-        shown = triangles
-        if view.bare:
-            shown = triangles[held & ~closing]
+        shown = triangles[held & ~closing] if view.bare else triangles
         for number, colour in enumerate(colours):
             corner = _corners_of_kind(points, shown, shown_as == number)
             if len(corner):

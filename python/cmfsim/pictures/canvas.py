@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -182,20 +182,10 @@ def _placed(
         texts.append((left + SWATCH, row, text))
         left += length
     row += bool(legend)
-    lines = _wrapped(words, width)
+    wide = max(int((width - 2 * EDGE) / LETTER), 20)
+    lines = [w for text in words for w in textwrap.wrap(text, wide, subsequent_indent="    ")]
     texts += [(EDGE, row + k, line) for k, line in enumerate(lines)]
     return texts, swatches, row + len(lines)
-
-
-def _wrapped(words: Sequence[str], width: int) -> list[str]:
-    """The lines of text that fit a picture of a width in pixels."""
-    return [
-        line
-        for text in words
-        for line in textwrap.wrap(
-            text, max(int((width - 24) / LETTER), 20), subsequent_indent="    "
-        )
-    ]
 
 
 def _band_of_text(
@@ -335,12 +325,8 @@ def _png(image: NDArray[np.uint8]) -> bytes:
 def bounds(clouds: Sequence[ArrayLike]) -> Floats:
     """Lowest and highest corner of all points, (2, 3)."""
     arrays = [np.asarray(c, dtype=np.float64) for c in clouds]
-    return np.array(
-        [
-            np.min([a.min(axis=0) for a in arrays], axis=0),
-            np.max([a.max(axis=0) for a in arrays], axis=0),
-        ]
-    )
+    low = np.min([a.min(axis=0) for a in arrays], axis=0)
+    return np.array([low, np.max([a.max(axis=0) for a in arrays], axis=0)])
 
 
 def polydata(vertices: ArrayLike, triangles: ArrayLike) -> Any:
@@ -433,12 +419,7 @@ class Painter:
     def __enter__(self) -> "Painter":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._worker is not None:
             self._worker.end()
         self._queue.shutdown(cancel_futures=True)
@@ -470,10 +451,8 @@ class Painter:
     def _draw(worker: Worker, picture: Picture, path: Path) -> None:
         packed = base64.b64encode(pickle.dumps(picture)).decode()
         try:
-            worker.ask(
-                "cmfsim.pictures.canvas:draw_packed",
-                {"path": str(path.absolute()), "packed": packed},
-            )
+            place = {"path": str(path.absolute()), "packed": packed}
+            worker.ask("cmfsim.pictures.canvas:draw_packed", place)
         except WorkerEndedError as error:
             raise CaseInputError(
                 f"{path.name}: the picture cannot be drawn (OpenGL does not work); {NO_OPENGL}"

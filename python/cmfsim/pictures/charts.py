@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
+from cmfsim.pictures.canvas import write_whole
 from cmfsim.values.checks import as_floats
 
 # By model, in the order of the paper; told apart in grey too.
@@ -99,30 +100,28 @@ def write_figure(
         kind = path.suffix.lower()[1:]
         metadata = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
         figure.savefig(file, format=kind, dpi=dpi, metadata=metadata[kind])
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(file.getvalue())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, file.getvalue())
 
 
 def _draw(figure: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[str, str]) -> None:
     axes = figure.add_subplot()
     _boxes(axes, groups, colours)
-    patches = import_module("matplotlib.patches")
-    handles = [patches.Patch(facecolor=c, edgecolor="black", label=m) for m, c in colours.items()]
-    axes.legend(
-        handles=handles,
-        loc="upper center",
-        bbox_to_anchor=(0.5, 1.14),
-        ncols=len(handles),
-        frameon=False,
-    )
+    patch = import_module("matplotlib.patches").Patch
+    handles = [patch(facecolor=c, edgecolor="black", label=m) for m, c in colours.items()]
+    place = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.14), "ncols": len(handles)}
+    axes.legend(handles=handles, frameon=False, **place)
 
 
 def _boxes(axes: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[str, str]) -> None:
     step = GROUP / len(colours)
+    mean = {
+        "marker": "D", "markersize": 3.0, "markerfacecolor": "white", "markeredgecolor": "black",
+        "markeredgewidth": 0.7,
+    }  # fmt: skip
+    beyond = {
+        "marker": ".", "markersize": 1.5, "markeredgecolor": "#555555", "alpha": 0.4,
+        "rasterized": True,
+    }  # fmt: skip
     for number, by_model in enumerate(groups.values()):
         for place, (model, colour) in enumerate(colours.items()):
             if model not in by_model:
@@ -139,20 +138,8 @@ def _boxes(axes: Any, groups: Mapping[str, Mapping[str, Any]], colours: Mapping[
                 medianprops={"color": "black", "linewidth": 1.2},
                 whiskerprops={"linewidth": 0.8},
                 capprops={"linewidth": 0.8},
-                meanprops={
-                    "marker": "D",
-                    "markersize": 3.0,
-                    "markerfacecolor": "white",
-                    "markeredgecolor": "black",
-                    "markeredgewidth": 0.7,
-                },
-                flierprops={
-                    "marker": ".",
-                    "markersize": 1.5,
-                    "markeredgecolor": "#555555",
-                    "alpha": 0.4,
-                    "rasterized": True,
-                },
+                meanprops=mean,
+                flierprops=beyond,
             )
             # As the statistics count them: the low ones are the good ones.
             fliers = drawn["fliers"][0].get_ydata()

@@ -155,15 +155,10 @@ def picture_distance_grid(
             add_scale_bar(plotter, (0.87, 0.3), 5, "%+.1f")
 
     half = (1.0 + 2.0 * MARGIN) * half
-    draw(
-        path,
-        [View("front", caption) for caption in panels],
-        np.array([-half, half]),
-        (cell[0] * len(models), cell[1] * len(faces)),
-        paint,
-        columns=len(models),
-        words=(GRID_LEGEND,),
-    )
+    views = [View("front", caption) for caption in panels]
+    size = (cell[0] * len(models), cell[1] * len(faces))
+    box = np.array([-half, half])
+    draw(path, views, box, size, paint, columns=len(models), words=(GRID_LEGEND,))
 
 
 def _centred(skin: SurfaceData, distances: ArrayLike) -> tuple[Any, SkinEnds, Floats, float]:
@@ -181,12 +176,18 @@ def distance_mesh(
     plotter: Any, surface: Any, limit: float, colours: Sequence[str] = COLOURS
 ) -> None:
     """Adds a surface coloured by its "distance"."""
+    # Heavy, and `draw` has found it.
+    import pyvista as pv  # noqa: PLC0415
+
     steps = np.linspace(-limit, limit, STEPS)
-    table = np.array([_rgb(x, limit, colours) for x in steps], dtype=np.uint8)
+    table = np.array([(*_rgb(x, limit, colours), 255) for x in steps], dtype=np.uint8)
+    lookup = pv.LookupTable(values=table)
+    lookup.scalar_range = (-limit, limit)
+    lookup.nan_color = NOT_EVALUATED
     plotter.add_mesh(
         surface,
         scalars="distance",
-        cmap=_lookup(table, limit),
+        cmap=lookup,
         smooth_shading=True,
         ambient=0.45,
         diffuse=0.6,
@@ -206,17 +207,6 @@ def _rgb(distance: float, limit: float, colours: Sequence[str] = COLOURS) -> tup
     channels = [np.interp(place, np.arange(len(colours)), stops[:, k]) for k in range(3)]
     red, green, blue = (round(float(c)) for c in channels)
     return red, green, blue
-
-
-def _lookup(table: NDArray[np.uint8], limit: float) -> Any:
-    """VTK's table of the colours."""
-    import pyvista as pv  # noqa: PLC0415 (heavy, and `draw` has found it)
-
-    opaque = np.full((len(table), 1), 255, dtype=np.uint8)
-    lookup = pv.LookupTable(values=np.hstack([table, opaque]))
-    lookup.scalar_range = (-limit, limit)
-    lookup.nan_color = NOT_EVALUATED
-    return lookup
 
 
 def _values(distances: ArrayLike, count: int) -> tuple[Floats, NDArray[np.bool_]]:
@@ -324,15 +314,8 @@ def picture_contacts(
             add_scale_bar(plotter, (0.89, 0.3), 5, "%+.1f")
 
     words = ("Red, negative: overlap. White: contact. Blue, positive: gap.",)
-    draw(
-        path,
-        ROW_VIEWS,
-        corners,
-        ROWS_SIZE,
-        paint,
-        words=words,
-        legend=[("no crown", NOT_EVALUATED)],
-    )
+    legend = [("no crown", NOT_EVALUATED)]
+    draw(path, ROW_VIEWS, corners, ROWS_SIZE, paint, words=words, legend=legend)
 
 
 def _cropped(surface: SurfaceData, gaps: Gaps) -> tuple[SurfaceData, Gaps]:

@@ -173,8 +173,7 @@ def picture_faces(
 
     names = ("before", "after", "movement")
     views = tuple(View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
-    corners = bounds([before.vertices, after.vertices])
-    corners = ends.within(corners)
+    corners = ends.within(bounds([before.vertices, after.vertices]))
     draw(path, views, corners, size, paint, columns=len(names))
 
 
@@ -252,8 +251,7 @@ def picture_motions(
         shape = polydata(surface.vertices, surface.triangles)
         return plotter.add_mesh(shape, color=GHOST_COLOUR, opacity=0.3, smooth_shading=True)
 
-    def paint(plotter: Any, view: View) -> None:
-        del view
+    def paint(plotter: Any, _: View) -> None:
         for name, now in after.items():
             shown.add(plotter, name, partial(add_bone, plotter, now, colours[name]))
             if name not in still:
@@ -314,18 +312,12 @@ def animate_face(
 def _frame(
     name: str, colours: NDArray[np.uint8] | None, corners: Floats, share: float, shape: Any
 ) -> NDArray[np.uint8]:
-    def paint(plotter: Any, view: View) -> None:
-        del view
+    def paint(plotter: Any, _: View) -> None:
         add_skin(plotter, shape, colours)
 
     way = {0.0: "before", 1.0: "after"}.get(round(share, 3), f"{share:.0%} of the way")
-    return drawn(
-        name,
-        (View("front", f"{way}, front"), View("left", f"{way}, left")),
-        corners,
-        FILM_SIZE,
-        paint,
-    )
+    views = (View("front", f"{way}, front"), View("left", f"{way}, left"))
+    return drawn(name, views, corners, FILM_SIZE, paint)
 
 
 def _gif(frames: Sequence[NDArray[np.uint8]], times: Sequence[int]) -> bytes:
@@ -334,15 +326,8 @@ def _gif(frames: Sequence[NDArray[np.uint8]], times: Sequence[int]) -> bytes:
     first = picture.fromarray(frames[STEPS // 2]).quantize(256)
     rest = [picture.fromarray(frame).quantize(palette=first, dither=0) for frame in frames]
     file = io.BytesIO()
-    rest[0].save(
-        file,
-        "GIF",
-        save_all=True,
-        append_images=rest[1:],
-        duration=[*times],
-        loop=0,
-        optimize=False,
-    )
+    times_and_loop = {"duration": [*times], "loop": 0, "optimize": False}
+    rest[0].save(file, "GIF", save_all=True, append_images=rest[1:], **times_and_loop)
     return file.getvalue()
 
 

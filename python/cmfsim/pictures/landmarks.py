@@ -269,11 +269,8 @@ def _add_points(plotter: Any, view: View, points: Mapping[str, Floats], doubtful
         else:
             mark = pv.Sphere(radius=RADIUS, center=at)
         plotter.add_mesh(mark, color=DOUBTFUL_COLOUR if name in doubtful else SURE_COLOUR)
-    add_labels(
-        plotter,
-        toward,
-        [
-            Label(name, place, DOUBTFUL_COLOUR if name in doubtful else "black")
-            for name, place in shown.items()
-        ],
-    )
+    labels = [
+        Label(name, place, DOUBTFUL_COLOUR if name in doubtful else "black")
+        for name, place in shown.items()
+    ]
+    add_labels(plotter, toward, labels)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import itertools
 import os
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -63,50 +64,33 @@ def picture_muscles(
     views = tuple(View(name, name) for name in ("front", "left front", "left"))
     shown = Shown()
 
-    def paint_skull(plotter: Any) -> None:
+    names = dict.fromkeys(_without_side(muscle.name) for muscle in musculature)
+    colours = {n: MUSCLE_COLOUR if fibres else _hue(k) for k, n in enumerate(names)}
+    length = STROKE * float(np.linalg.norm(corners[1] - corners[0]))
+    lines = [_lines(muscle, length) if fibres else None for muscle in musculature]
+
+    def paint(plotter: Any, _: View) -> None:
         if skull is not None:
-            vertices, triangles = skull.vertices, skull.triangles
-            shown.add(
-                plotter,
-                "skull",
-                lambda: plotter.add_mesh(
-                    polydata(vertices, triangles), color=BONE_COLOUR, smooth_shading=True
-                ),
-            )
-
-    if fibres:
-        length = STROKE * float(np.linalg.norm(corners[1] - corners[0]))
-        drawn = [(muscle, *_lines(muscle, length)) for muscle in musculature]
-
-        def paint_fibres(plotter: Any, view: View) -> None:
-            del view
-            paint_skull(plotter)
-            for muscle, strokes, edges, colour in drawn:
-                make = partial(add_muscle, plotter, muscle, MUSCLE_COLOUR)
-                shown.add(plotter, f"muscle {muscle.name}", make)
+            shown.add(plotter, "skull", partial(add_bones, plotter, skull))
+        for muscle, drawn in zip(musculature, lines, strict=True):
+            make = partial(add_muscle, plotter, muscle, colours[_without_side(muscle.name)])
+            shown.add(plotter, f"muscle {muscle.name}", make)
+            if drawn is not None:
+                strokes, edges, colour = drawn
                 plotter.add_lines(strokes, color=LINE_COLOUR, width=2)
                 plotter.add_lines(edges, color=colour, width=1)
 
-        legend = [
-            ("muscle", MUSCLE_COLOUR),
-            ("fibre direction", LINE_COLOUR),
-            ("box", BOX_COLOUR),
-            ("box of a sheet", SHEET_COLOUR),
-        ]
-        draw(path, views, corners, size, paint_fibres, legend=legend)
-        return
+    legend = list(colours.items())
+    if fibres:
+        legend = [("muscle", MUSCLE_COLOUR), ("fibre direction", LINE_COLOUR)]
+        legend += [("box", BOX_COLOUR), ("box of a sheet", SHEET_COLOUR)]
+    draw(path, views, corners, size, paint, legend=legend)
 
-    names = list(dict.fromkeys(_without_side(muscle.name) for muscle in musculature))
-    colours = {name: _hue(number) for number, name in enumerate(names)}
 
-    def paint_names(plotter: Any, view: View) -> None:
-        del view
-        paint_skull(plotter)
-        for muscle in musculature:
-            make = partial(add_muscle, plotter, muscle, colours[_without_side(muscle.name)])
-            shown.add(plotter, f"muscle {muscle.name}", make)
-
-    draw(path, views, corners, size, paint_names, legend=list(colours.items()))
+def add_bones(plotter: Any, skull: SurfaceData) -> Any:
+    """The actor of the skull, added to a view."""
+    shape = polydata(skull.vertices, skull.triangles)
+    return plotter.add_mesh(shape, color=BONE_COLOUR, smooth_shading=True)
 
 
 def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> Any:
@@ -132,13 +116,12 @@ def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
     edges = []
     for centre, frame, extent in zip(centres, axes, half_extents, strict=True):
         for axis in range(3):
-            others = [k for k in range(3) if k != axis]
-            for a in (-1.0, 1.0):
-                for b in (-1.0, 1.0):
-                    at = centre + a * extent[others[0]] * frame[others[0]]
-                    at = at + b * extent[others[1]] * frame[others[1]]
-                    along = extent[axis] * frame[axis]
-                    edges += [at - along, at + along]
+            one, other = (k for k in range(3) if k != axis)
+            along = extent[axis] * frame[axis]
+            for a, b in itertools.product((-1.0, 1.0), repeat=2):
+                at = centre + a * extent[one] * frame[one]
+                at = at + b * extent[other] * frame[other]
+                edges += [at - along, at + along]
     colour = SHEET_COLOUR if fibres.is_sheet else BOX_COLOUR
     return strokes, np.array(edges), colour
 
