@@ -4,7 +4,7 @@ Only the case file itself is read here. Paths that it names are resolved against
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -27,7 +27,7 @@ from cmfsim.io.cases.case_tables import (
     surfaces_of,
     tissue_of,
 )
-from cmfsim.io.cases.tables import CaseChanges, read_tables
+from cmfsim.io.cases.tables import CaseChanges, Table, read_tables
 from cmfsim.io.files.reading_writing import is_there
 from cmfsim.values.case_parts import (
     CaseBand,
@@ -251,22 +251,20 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
     document.only(*TABLES)
     document.check_format(CASE_FORMAT)
     folder = path.parent
-    if ("image" in document) == ("surfaces" in document):
-        both = "image" in document
-        document.fail(
-            "surfaces" if both else None,
-            "is given together with [image]: give one of them"
-            if both
-            else "needs [image] or [surfaces]",
-        )
+    if "image" in document and "surfaces" in document:
+        document.fail("surfaces", "is given together with [image]: give one of them")
+    if "image" not in document and "surfaces" not in document:
+        document.fail(None, "needs [image] or [surfaces]")
+
+    def given(name: str, read: Callable[[Table, Path], Any]) -> Any:
+        return read(document.table(name), folder) if name in document else None
+
     return Case(
         name=document.text("name", path.resolve().parent.name or "case"),
         file=path,
         output=output_folder(document.table("output").only("folder"), folder),
-        image=image_of(document.table("image"), folder) if "image" in document else None,
-        surfaces=surfaces_of(document.table("surfaces"), folder)
-        if "surfaces" in document
-        else None,
+        image=given("image", image_of),
+        surfaces=given("surfaces", surfaces_of),
         landmarks=landmarks_of(document.table("landmarks"), folder),
         region=region_of(document.table("region"), folder),
         mesh=mesh_of(document.table("mesh"), folder),
@@ -276,15 +274,11 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
         achieved=is_achieved(document),
         node_kinds=node_kinds_of(document.table("node_kinds")),
         tissue=tissue_of(document.table("tissue")),
-        muscles=muscles_of(document.table("muscles"), folder) if "muscles" in document else None,
+        muscles=given("muscles", muscles_of),
         solver=solver_of(document.table("solver")),
         band=replace(document.table("band").part(CaseBand, folder), asked="band" in document),
-        postoperative=(
-            postoperative_of(document.table("postoperative"), folder)
-            if "postoperative" in document
-            else None
-        ),
-        photo=photo_of(document.table("photo"), folder) if "photo" in document else None,
+        postoperative=given("postoperative", postoperative_of),
+        photo=given("photo", photo_of),
         note=document.text("note") if "note" in document else "",
         places=document.all_places(),
     )

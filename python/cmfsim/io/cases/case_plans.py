@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from cmfsim.io.cases.case_tables import checked_name, file_of, plane_of, stated_frame
+from cmfsim.io.cases.case_tables import checked_name, plane_of, stated_frame
 from cmfsim.io.cases.tables import Table
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.slicer.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
@@ -89,8 +89,8 @@ def _moved(document: Table, motion: Table, name: str, folder: Path) -> CaseMotio
             f"is for bones that [surfaces.bones] names ({known}), not for {name!r}: give surface "
             "and moved_surface, the piece before and after",
         )
-    before = file_of(document.table("surfaces").table("bones"), name, folder)
-    return CaseMotion(surface=before, moved_surface=file_of(motion.only("moved"), "moved", folder))
+    before = document.table("surfaces").table("bones").path(name, folder)
+    return CaseMotion(surface=before, moved_surface=motion.only("moved").path("moved", folder))
 
 
 def _motion(table: Table, folder: Path) -> CaseMotion:
@@ -98,8 +98,8 @@ def _motion(table: Table, folder: Path) -> CaseMotion:
         return _transform(table.only("transform"), folder)
     if "moved_surface" in table or "surface" in table:
         table.only("surface", "moved_surface")
-        surface = file_of(table, "surface", folder)
-        return CaseMotion(surface=surface, moved_surface=file_of(table, "moved_surface", folder))
+        surface = table.path("surface", folder)
+        return CaseMotion(surface=surface, moved_surface=table.path("moved_surface", folder))
     frame = stated_frame(table)
     if "matrix" in table:
         matrix = table.only("matrix", "frame").matrix("matrix")
@@ -127,7 +127,7 @@ def _transform(motion: Table, folder: Path) -> CaseMotion:
     """The motion in a transform file; which way the file carries points is stated for ITK's."""
     key = "transform"
     if not isinstance(motion.need(key), dict):
-        file = file_of(motion, key, folder)
+        file = motion.path(key, folder)
         if is_itk_file(file):
             name = motion.text(key)
             motion.fail(
@@ -137,7 +137,7 @@ def _transform(motion: Table, folder: Path) -> CaseMotion:
             )
         return CaseMotion(transform=file)
     table = motion.table(key).only("file", "direction", "frame")
-    file = file_of(table, "file", folder)
+    file = table.path("file", folder)
     direction = table.text("direction", choices=DIRECTIONS) if "direction" in table else None
     frame = stated_frame(table)
     if is_itk_file(file) and direction is None:

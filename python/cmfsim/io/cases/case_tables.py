@@ -37,11 +37,6 @@ def stated_frame(table: Table) -> str | None:
     return table.text("frame", choices=FRAMES) if "frame" in table else None
 
 
-def file_of(table: Table, key: str, folder: Path) -> Path:
-    """A path to read; the case is its owner's, so that it may lead to images kept elsewhere."""
-    return table.path(key, folder)
-
-
 def output_folder(table: Table, folder: Path) -> Path:
     """The folder to write to, below that of the case: a case never writes anywhere else."""
     name = table.text("folder", "out")
@@ -114,7 +109,7 @@ def surfaces_of(table: Table, folder: Path) -> CaseSurfaces:
 def _bones(table: Table, folder: Path) -> dict[str, Path]:
     """The files of bones by name."""
     bones = table.table("bones")
-    return {checked_name(bones, name, name): file_of(bones, name, folder) for name in bones}
+    return {checked_name(bones, name, name): bones.path(name, folder) for name in bones}
 
 
 def checked_name(table: Table, key: str, name: str) -> str:
@@ -128,26 +123,14 @@ def checked_name(table: Table, key: str, name: str) -> str:
 
 def landmarks_of(table: Table, folder: Path) -> CaseLandmarks:
     """The files of [landmarks], and whether missing ones are to be found."""
-    automatic, templates = _automatic(table), _template_folders(table, folder)
+    automatic = table.plain("automatic") if "automatic" in table else True
+    if not isinstance(automatic, bool) and automatic != "missing":
+        table.fail("automatic", f'is {automatic!r}: true, false or "missing" is needed')
+    heads = table.plain("templates") if "templates" in table else []
+    if not isinstance(heads, list) or not all(isinstance(n, str) and n.strip() for n in heads):
+        table.fail("templates", f'is {heads!r}: a list of folders, such as ["heads/a", "heads/b"]')
+    templates = tuple(folder / name for name in heads)
     return table.part(CaseLandmarks, folder, automatic=automatic, templates=templates)
-
-
-def _automatic(table: Table) -> bool | str:
-    """Whether landmarks are found: true, false, or those that the files lack."""
-    given = table.plain("automatic") if "automatic" in table else True
-    if not isinstance(given, bool) and given != "missing":
-        table.fail("automatic", f'is {given!r}: true, false or "missing" is needed')
-    return given if isinstance(given, bool) else "missing"
-
-
-def _template_folders(table: Table, folder: Path) -> tuple[Path, ...]:
-    """The folders of heads whose landmarks are known."""
-    if "templates" not in table:
-        return ()
-    given = table.plain("templates")
-    if not isinstance(given, list) or not all(isinstance(n, str) and n.strip() for n in given):
-        table.fail("templates", f'is {given!r}: a list of folders, such as ["heads/a", "heads/b"]')
-    return tuple(folder / name for name in given)
 
 
 def plane_of(table: Table, key: str) -> Plane:
@@ -172,7 +155,7 @@ def mesh_of(table: Table, folder: Path) -> CaseMesh:
     """The edge lengths of [mesh], or its own mesh."""
     parting = None
     if "parting" in table:
-        parting = file_of(table.table("parting").only("surface"), "surface", folder)
+        parting = table.table("parting").only("surface").path("surface", folder)
     return table.part(CaseMesh, folder, parting=parting)
 
 
@@ -181,7 +164,7 @@ def lips_of(document: Table, folder: Path) -> CaseLips:
     table = document.table("lips")
     seam: Path | str | None = table.text("seam") if "seam" in table else None
     if seam is not None and seam not in LIP_SEAMS:
-        seam = file_of(table, "seam", folder)
+        seam = table.path("seam", folder)
         if "parting" in document.table("mesh"):
             table.fail("seam", "is a surface, as is parting in [mesh]: give one of them")
     return table.part(CaseLips, folder, seam=seam)
@@ -191,12 +174,9 @@ def node_kinds_of(table: Table) -> dict[str, Any]:
     """The options by name; regions as plain tables."""
     options = {key: table.plain(key) for key in table if key != "regions"}
     if "regions" in table:
-        options["regions"] = [_plain(region) for region in table.tables("regions")]
+        regions = table.tables("regions")
+        options["regions"] = [{key: region.plain(key) for key in region} for region in regions]
     return options
-
-
-def _plain(table: Table) -> dict[str, Any]:
-    return {key: table.plain(key) for key in table}
 
 
 def tissue_of(table: Table) -> TissueData | None:
@@ -220,7 +200,7 @@ def muscles_of(table: Table, folder: Path) -> CaseMuscles:
     """A template's name is that of one in the package; a path leads to a folder."""
     template: Path | str = table.text("template", str(CaseMuscles().template))
     if template != CaseMuscles().template:
-        template = file_of(table, "template", folder)
+        template = table.path("template", folder)
     moduli = _muscle_moduli(table)
     return table.part(CaseMuscles, folder, MODULI, template=template, moduli=moduli)
 

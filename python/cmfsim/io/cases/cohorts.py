@@ -115,11 +115,7 @@ class Variants:
         for name in tables:
             if name == AS_GIVEN:
                 tables.fail(name, "is always there, without changes: choose another name")
-            if (
-                not name
-                or len(name) > MOST_NAME
-                or not all(c.isalnum() or c in "_-+" for c in name)
-            ):
+            if not name or len(name) > MOST_NAME or not _is_name(name):
                 tables.fail(name, f"is no name: letters, digits, _-+, {MOST_NAME} at most")
             found[name] = _variant(name, tables.table(name), models, path.name, lines)
         return cls(path, models, found, description)
@@ -148,12 +144,9 @@ def _variant(
         table.fail(None, f"changes nothing: {AS_GIVEN!r} is always there for comparison")
     top = ("variants", name)
     below = {path[2:]: line for path, line in lines.items() if path[:2] == top and len(path) > 2}
-    return Variant(
-        name,
-        CaseChanges(values, without, file, below),
-        _models(table, models, models),
-        table.text("description") if "description" in table else "",
-    )
+    description = table.text("description") if "description" in table else ""
+    changes = CaseChanges(values, without, file, below)
+    return Variant(name, changes, _models(table, models, models), description)
 
 
 def _models(table: Table, default: tuple[str, ...], allowed: tuple[str, ...]) -> tuple[str, ...]:
@@ -243,9 +236,7 @@ class Cohort:
             "format", "version", "name", "note", "models", "cases", "output"
         )
         document.check_format(COHORT_FORMAT)
-        models = document.plain("models") if "models" in document else list(MODELS)
-        if not isinstance(models, list) or not models or set(models) - set(MODELS):
-            document.fail("models", f"is {models!r}: a list of {', '.join(MODELS)} is needed")
+        models = _models(document, MODELS, MODELS)
         folder = path.parent
         output = document.text("output", OUTPUT)
         if Path(output).is_absolute() or ".." in Path(output).parts:
@@ -262,14 +253,9 @@ class Cohort:
             cases[name] = file
         if not cases:
             document.fail(None, 'names no case: [[cases]] with file = "P1/case.toml"')
-        return cls(
-            document.text("name", path.resolve().parent.name or "cohort"),
-            path,
-            cases,
-            tuple(dict.fromkeys(models)),
-            folder / output,
-            document.text("note").strip() if "note" in document else "",
-        )
+        name = document.text("name", path.resolve().parent.name or "cohort")
+        note = document.text("note").strip() if "note" in document else ""
+        return cls(name, path, cases, models, folder / output, note)
 
     @classmethod
     def _of_cases_in(cls, folder: Path) -> "Cohort":

@@ -328,19 +328,16 @@ class Table:
         if key not in self._values:
             return None
         value = self._checked_number(key, self._values[key])
-        allowed = [
-            f"above {above:g}" if above is not None else "",
-            f"at least {low:g}" if low is not None else "",
-            f"at most {high:g}" if high is not None else "",
-        ]
+        limits = {"above": above, "at least": low, "at most": high}
+        allowed = [f"{words} {limit:g}" for words, limit in limits.items() if limit is not None]
         inside = (
             (above is None or value > above)
             and (low is None or value >= low)
             and (high is None or value <= high)
         )
         if not inside:
-            needed = " and ".join(filter(None, allowed))
-            self.fail(key, f"is {value:g}: must be {needed}{' ' + unit if unit else ''}")
+            needed = f"{' and '.join(allowed)} {unit}".rstrip()
+            self.fail(key, f"is {value:g}: must be {needed}")
         return value
 
     def whole(self, key: str, default: int, low: int, high: int) -> int:
@@ -382,7 +379,10 @@ class Table:
         return value
 
     def path(self, key: str, folder: Path) -> Path:
-        """A path to read, against a folder unless it is absolute; `~` is the home folder."""
+        """A path to read, against a folder unless it is absolute; `~` is the home folder.
+
+        A case is its owner's, so that it may lead to images kept elsewhere.
+        """
         name = self.text(key)
         if "\0" in name:
             self.fail(key, "contains a zero character, which no file name can have")

@@ -104,16 +104,21 @@ def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
     if kind == "face":
         triangles = triangles_of(points, lengths, corners)
     else:
-        triangles = triangles_of_strips(points, *_strips(corners, lengths))
-    return points, triangles, (_bytes_left(left),) if left else ()
-
-
-def _strips(corners: Integers, lengths: Integers) -> tuple[Integers, Integers]:
-    """How many corners each strip has, and all of these: in a list, -1 ends a strip."""
-    rows = np.repeat(np.arange(len(lengths)), lengths)
-    number = rows + np.cumsum(corners == STRIP_END)
-    kept = corners != STRIP_END
-    return np.unique(number[kept], return_counts=True)[1], corners[kept]
+        # In a list, -1 ends a strip.
+        number = np.repeat(np.arange(len(lengths)), lengths) + np.cumsum(corners == STRIP_END)
+        kept = corners != STRIP_END
+        counts = np.unique(number[kept], return_counts=True)[1]
+        triangles = triangles_of_strips(points, counts, corners[kept])
+    findings: tuple[Finding, ...] = ()
+    if left:
+        what = (
+            f"{left} after the last row were ignored: they are no row that its header could have "
+        )
+        what += "missed"
+        why = "the file may have been changed after it was written"
+        fix = "look at the surface; if a part is missing, export it again"
+        findings = (Finding("field-ignored", what, why=why, fix=fix),)
+    return points, triangles, findings
 
 
 def _may_be_a_row(source: "_Source", last: _Element, n_vertices: int) -> bool:
@@ -127,16 +132,6 @@ def _may_be_a_row(source: "_Source", last: _Element, n_vertices: int) -> bool:
     corners, lengths = _column(last, row, CORNERS)
     is_face = lengths is not None and int(lengths[0]) >= LEAST_CORNERS
     return is_face and bool(((corners >= 0) & (corners < n_vertices)).all())
-
-
-def _bytes_left(left: str) -> Finding:
-    return Finding(
-        "field-ignored",
-        f"{left} after the last row were ignored: they are no row that its header could have "
-        "missed",
-        why="the file may have been changed after it was written",
-        fix="look at the surface; if a part is missing, export it again",
-    )
 
 
 def write_ply(file: BinaryIO, vertices: Floats, triangles: NDArray[np.integer]) -> None:
@@ -235,7 +230,10 @@ def _property(words: list[bytes]) -> _Property | None:
 def _rows(source: "_Source", element: _Element) -> _Rows:
     """The rows of the next element."""
     if not element.number or not element.properties:
-        return _empty(element)
+        return _Rows(
+            tuple(_values(p, [], str) for p in element.properties),
+            tuple(np.zeros(0, dtype=np.int64) if p.count else None for p in element.properties),
+        )
     # Usually every list has the length of the first row's: then all rows are alike.
     lengths, after = list[int | None](), source.at
     for prop in element.properties:
@@ -393,13 +391,6 @@ def _values(prop: _Property, words: list[bytes], where: Callable[[int], str]) ->
     if prop.kind[0] == "f":
         return real_numbers(words, where, prop.kind)
     return whole_numbers(words, where)
-
-
-def _empty(element: _Element) -> _Rows:
-    return _Rows(
-        tuple(_values(p, [], str) for p in element.properties),
-        tuple(np.zeros(0, dtype=np.int64) if p.count else None for p in element.properties),
-    )
 
 
 def _wide(values: NDArray[np.generic]) -> Column:

@@ -26,6 +26,7 @@ FACET = (
 # A mark of UTF-8 before a text, and what some programs write after one.
 UTF8, ENDS = b"\xef\xbb\xbf", b"\0\x1a"
 CORNERS = (8, 9, 10, 12, 13, 14, 16, 17, 18)
+LOOK = "look at the surface; if a part is missing, export it again"
 
 
 def read_stl(data: bytes) -> tuple[Floats, tuple[Finding, ...]]:
@@ -47,21 +48,14 @@ def read_stl(data: bytes) -> tuple[Floats, tuple[Finding, ...]]:
         )
     if _count(data) == 0 and len(data) > HEADER + 4 and not (len(data) - HEADER - 4) % ROW.itemsize:
         count = (len(data) - HEADER - 4) // ROW.itemsize
-        finding = Finding(
-            "field-ignored",
-            f"it states 0 triangles, and has bytes for {count}, which were read",
-            why="the program that wrote it did not finish its header, or was stopped",
-            fix="look at the surface; if a part is missing, export it again",
-        )
+        why = "the program that wrote it did not finish its header, or was stopped"
+        what = f"it states 0 triangles, and has bytes for {count}, which were read"
         whole = data[:HEADER] + count.to_bytes(4, "little") + data[HEADER + 4 :]
-        return _read_binary(whole), (finding,)
+        return _read_binary(whole), (Finding("field-ignored", what, why=why, fix=LOOK),)
     if 0 < (left := len(data) - _length(data)) < ROW.itemsize:
-        finding = Finding(
-            "field-ignored",
-            f"{left} bytes after the last triangle were ignored: a triangle takes {ROW.itemsize}",
-            why="the file may have been changed after it was written",
-            fix="look at the surface; if a part is missing, export it again",
-        )
+        why = "the file may have been changed after it was written"
+        what = f"{left} bytes after the last triangle were ignored: a triangle takes {ROW.itemsize}"
+        finding = Finding("field-ignored", what, why=why, fix=LOOK)
         return _read_binary(data), (finding,)
     raise CaseInputError(
         f"is not an STL file, or is cut short or damaged: it states {_count(data)} triangles, "

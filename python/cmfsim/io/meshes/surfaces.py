@@ -15,7 +15,7 @@ from cmfsim.errors import CaseInputError, UnpairedError
 from cmfsim.io.files.reading_writing import named, replacing
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.obj import write_obj
-from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
+from cmfsim.io.meshes.plain_mesh import PlainMesh
 from cmfsim.io.meshes.ply import write_ply
 from cmfsim.io.meshes.polygons import triangles_of
 from cmfsim.io.meshes.stl import write_stl
@@ -226,19 +226,18 @@ def _numbered(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], str |
 
 
 def _triangles(mesh: PlainMesh, path: Path) -> NDArray[np.int64]:
-    """The triangles of a mesh that has nothing else but polygons."""
-    faces = [b for b in mesh.cells if b.type in {"triangle", "quad"} and len(b.data)]
+    """The triangles of a mesh that has nothing else but polygons; quads are cut."""
+    faces = [b.data for b in mesh.cells if b.type in {"triangle", "quad"} and len(b.data)]
     others = {b.type for b in mesh.cells if len(b.data)} - {"triangle", "quad", "vertex", "line"}
     if not faces or others:
         raise CaseInputError(f"{path.name}: a surface of triangles is needed, found {mesh.found}")
     with named(path):
-        return np.concatenate([_cut(mesh, block) for block in faces])
-
-
-def _cut(mesh: PlainMesh, block: Cells) -> NDArray[np.int64]:
-    """Triangles that fill the triangles or quads of a block."""
-    rows, width = block.data.shape
-    return triangles_of(mesh.points, np.full(rows, width), block.data.reshape(-1))
+        return np.concatenate(
+            [
+                triangles_of(mesh.points, np.full(len(data), data.shape[1]), data.reshape(-1))
+                for data in faces
+            ]
+        )
 
 
 def _welded(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
@@ -281,8 +280,7 @@ def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
         known = ", ".join(WRITERS)
         raise CaseInputError(f"{path.name}: a surface is written as {known}, not {path.suffix!r}")
     with replacing(path) as file:
-        vertices = surface.vertices
-        WRITERS[path.suffix](file, vertices, surface.triangles)
+        WRITERS[path.suffix](file, surface.vertices, surface.triangles)
 
 
 def _write_vtp(file: BinaryIO, vertices: Floats, triangles: NDArray[np.integer]) -> None:

@@ -56,11 +56,7 @@ def is_prediction_file(name: str) -> bool:
 
 
 _SIZE, _SHARE, _SECONDS = Span(0.0, 1e6), Span(0.0, 1.0), Span(0.0, 1e9)
-
-
 _LARGE, _VECTOR = Span(0.0, 1e12), [Span(-1e6, 1e6)] * 3
-
-
 _SCALE = Span(0.1, 10.0)
 
 
@@ -78,8 +74,6 @@ _SOLUTION = {
     **dict.fromkeys(("residual", "error_bound?", "error_estimate?"), Maybe(_LARGE)),
     "contact_gap": Maybe(Span(-1e6, 1e6)),
 }
-
-
 _FIT = {
     **dict.fromkeys(("rms_mm", "worst_mm", "median_mm", "p95_mm", "slip_mm?"), _SIZE),
     "share": _SHARE,
@@ -90,14 +84,8 @@ _FIT = {
         "open": [object],
     },
 }
-
-
 _YOUNG, _POISSON = Span(*YOUNG_RANGE), Span(-1.0, MOST_POISSON)
-
-
 _MUSCLE = {"young_along": _YOUNG, "young_across": _YOUNG, "poisson": _POISSON}
-
-
 _BAND_REGION = {
     **dict.fromkeys(
         ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm", "sd_mean_mm"), _SIZE
@@ -111,8 +99,6 @@ _BAND_REGION = {
     ),
     "sources_rms_mm": {str: _SIZE},
 }
-
-
 _BAND = {
     "state": frozenset({"calibrated", "uncalibrated"}),
     "coverage": _SHARE,
@@ -126,23 +112,15 @@ _BAND = {
     "calibration": Maybe({"file": str, "note": str, "n": COUNT, "group?": Maybe(str)}),
     "seconds": _SECONDS,
 }
-
-
 _PLACE = Span(-1e6, 1e6)
-
-
 _MEASURE = {
     **dict.fromkeys(("label", "unit", "norm", "source", "absent"), str),
     **dict.fromkeys(("before", "planned"), Maybe(_PLACE)),
 }
-
-
 _SITE = {
     **dict.fromkeys(("name", "moves_with"), str),
     **dict.fromkeys(("forwards_mm", "up_mm", "left_mm"), _PLACE),
 }
-
-
 PREDICTION = {
     **dict.fromkeys(("case", "case_key", "note?", "plan_digits?"), str),
     "model": frozenset(MODELS),
@@ -378,7 +356,8 @@ def fill_prediction(
 
 def write_timings(folder: Path, seconds: Mapping[str, float]) -> None:
     """Writes the seconds of each stage, in their order, to `timings.json` of a prediction."""
-    _write_json(folder / TIMINGS_FILE, seconds)
+    text = json.dumps(seconds, indent=1, allow_nan=False)
+    (folder / TIMINGS_FILE).write_text(text + "\n", encoding="utf-8")
 
 
 def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
@@ -463,8 +442,3 @@ def _muscle_data(prediction: Prediction) -> dict[str, np.ndarray]:
     if prediction.muscles is None or patient.fraction is None or patient.fibre is None:
         return {}
     return {"fraction": patient.fraction, "fibre": patient.fibre}
-
-
-def _write_json(path: Path, value: object) -> None:
-    text = json.dumps(value, indent=1, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8")

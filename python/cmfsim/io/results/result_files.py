@@ -111,31 +111,20 @@ def write_result(path: str | os.PathLike[str], result: SceneResult) -> None:
     if path.suffix == ".npz":
         write_archive(path, RESULT_FORMAT, "result", dict(result.summary), result.arrays())
         return
+    points = {"displacement": result.displacements, "force": result.forces}
     with replacing(path) as file:
         if path.suffix == ".vtu":
-            _write_vtu(file, result)
-        else:
-            _write_vtp(file, result)
+            write_tets(file, result.nodes, result.tets, points, {})
+            return
+        used, triangles = used_nodes(result.skin_triangles)
+        data: dict[str, NDArray[Any]] = {name: array[used] for name, array in points.items()}
+        data["node"] = used
+        write_triangles(file, result.nodes[used], triangles, data)
 
 
 def result_suffixes() -> tuple[str, ...]:
     """The file endings that `write_result` knows."""
     return (".npz", ".vtu", ".vtp")
-
-
-def _write_vtu(file: BinaryIO, result: SceneResult) -> None:
-    write_tets(file, result.nodes, result.tets, _point_data(result), {})
-
-
-def _write_vtp(file: BinaryIO, result: SceneResult) -> None:
-    used, triangles = used_nodes(result.skin_triangles)
-    data = {name: array[used] for name, array in _point_data(result).items()}
-    data["node"] = used
-    write_triangles(file, result.nodes[used], triangles, data)
-
-
-def _point_data(result: SceneResult) -> dict[str, NDArray[Any]]:
-    return {"displacement": result.displacements, "force": result.forces}
 
 
 # What models are written as: an earlier build's files of these names go when a later lacks them.

@@ -85,7 +85,12 @@ def read_vtk_legacy(path: Path) -> PlainMesh:
     points = answer.arrays["points"]
     point_data = _named(answer, "point_data")
     if kind == "POLYDATA":
-        cells = _triangles(points, answer.arrays)
+        found = []
+        for name, cut in (("POLYGONS", triangles_of), ("TRIANGLE_STRIPS", triangles_of_strips)):
+            counts = np.diff(answer.arrays[f"{name}.ends"])
+            if len(counts):
+                found.append(cut(points, counts, answer.arrays[f"{name}.corners"]))
+        cells = (Cells("triangle", np.concatenate(found)),) if found else ()
         return PlainMesh(points, cells, point_data, frame=stated_frame(data, ".vtk"))
     counts = np.diff(answer.arrays["CELLS.ends"])
     blocks, rows = cells_by_type(answer.arrays["types"], counts, answer.arrays["CELLS.corners"])
@@ -175,11 +180,8 @@ def _check_stated(data: bytes, arrays: Mapping[str, NDArray[Any]], start: int) -
             ends = arrays[f"{name}.ends"]
             n, size = len(ends) - 1, len(arrays[f"{name}.corners"])
             # VTK reads the offsets of no cell as no offsets.
-            wanted = (
-                (max(first - 1, 0), int(line["second"]))
-                if by_offsets
-                else (first, int(line["second"]) - first)
-            )
+            count = int(line["second"])
+            wanted = (max(first - 1, 0), count) if by_offsets else (first, count - first)
             if (n, size) != wanted or (np.diff(ends) < 0).any() or (ends[0], ends[-1]) != (0, size):
                 raise CaseInputError(
                     f"is cut short or damaged: it states {wanted[0]} {name} with {wanted[1]} "
@@ -207,17 +209,6 @@ def _check_last_array(data: bytes) -> None:
             return
         count += len(line.split())
         end = start
-
-
-def _triangles(
-    points: NDArray[np.float64], arrays: Mapping[str, NDArray[Any]]
-) -> tuple[Cells, ...]:
-    found = []
-    for name, cut in (("POLYGONS", triangles_of), ("TRIANGLE_STRIPS", triangles_of_strips)):
-        counts = np.diff(arrays[f"{name}.ends"])
-        if len(counts):
-            found.append(cut(points, counts, arrays[f"{name}.corners"]))
-    return (Cells("triangle", np.concatenate(found)),) if found else ()
 
 
 def _named(answer: Answer, key: str) -> dict[str, NDArray[Any]]:

@@ -13,22 +13,11 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 
 
-def _zlib(block: bytes, size: int) -> bytes:
-    worker = zlib.decompressobj()
+def _unpacked(worker: Any, block: bytes, size: int) -> bytes:
+    """The bytes of a block that a library unpacks: as many as are stated, and one at most more."""
     try:
-        out = worker.decompress(block, size + 1)
-    except zlib.error as error:
-        raise CaseInputError(f"a packed block is damaged ({error})") from error
-    if not worker.eof:
-        raise CaseInputError("a packed block is cut short, or larger than stated")
-    return out
-
-
-def _lzma(block: bytes, size: int) -> bytes:
-    worker = lzma.LZMADecompressor(memlimit=2**28)
-    try:
-        out = worker.decompress(block, size + 1)
-    except (lzma.LZMAError, EOFError) as error:
+        out: bytes = worker.decompress(block, size + 1)
+    except (zlib.error, lzma.LZMAError, EOFError) as error:
         raise CaseInputError(f"a packed block is damaged ({error})") from error
     if not worker.eof:
         raise CaseInputError("a packed block is cut short, or larger than stated")
@@ -74,7 +63,13 @@ def _lz4_length(block: bytes, at: int, length: int) -> tuple[int, int]:
 
 # By the name that VTK gives the program that packed them; each takes a block and its unpacked size.
 UNPACKERS: Mapping[str, Callable[[bytes, int], bytes]] = MappingProxyType(
-    {"vtkZLibDataCompressor": _zlib, "vtkLZ4DataCompressor": _lz4, "vtkLZMADataCompressor": _lzma}
+    {
+        "vtkZLibDataCompressor": lambda b, size: _unpacked(zlib.decompressobj(), b, size),
+        "vtkLZ4DataCompressor": _lz4,
+        "vtkLZMADataCompressor": lambda b, size: _unpacked(
+            lzma.LZMADecompressor(memlimit=2**28), b, size
+        ),
+    }
 )
 
 
@@ -138,13 +133,13 @@ def write_triangles(
     `vectors` names the array that turns with the surface; `frame` is stated as 3D Slicer does.
     """
     turning = f' Vectors="{vectors}"' if vectors else ""
-    codes = " ".join(str(ord(letter)) for letter in frame)
-    stated = (
-        '<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">'
-        f"{codes} 0</Array></FieldData>"
-        if frame
-        else ""
-    )
+    stated = ""
+    if frame:
+        codes = " ".join(str(ord(letter)) for letter in frame)
+        stated = (
+            '<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">'
+            f"{codes} 0</Array></FieldData>"
+        )
     body = (
         f'{stated}<Piece NumberOfPoints="{len(vertices)}" NumberOfVerts="0" NumberOfLines="0" '
         f'NumberOfStrips="0" NumberOfPolys="{len(triangles)}">'

@@ -38,6 +38,7 @@ TYPES = {
     "Float64": "f8",
 }
 SPACE = b" \t\r\n"
+Integers = NDArray[np.int64]
 
 
 @dataclass
@@ -178,9 +179,7 @@ def _data(piece: _Element, name: str, n: int, file: "_Arrays") -> dict[str, NDAr
     return found
 
 
-def _connectivity(
-    cells: _Element, n: int, file: "_Arrays"
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _connectivity(cells: _Element, n: int, file: "_Arrays") -> tuple[Integers, Integers]:
     """The corners of all cells, and how many each has."""
     ends = file.whole(_named(cells, "offsets"), n)
     counts = np.diff(ends, prepend=0)
