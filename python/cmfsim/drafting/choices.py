@@ -180,9 +180,8 @@ def choose_images(found: Sequence[ImageFind]) -> Images:
             before.append(find)
         elif images.after is None:
             images.after = find
-            images.taken.append(
-                Taken(find.label, "CT after the operation", f"by its name; {_said(find)}", "", "")
-            )
+            why = f"by its name; {_said(find)}"
+            images.taken.append(Taken(find.label, "CT after the operation", why))
         else:
             images.taken.append(Taken(find.label, "not used", "a second CT after the operation"))
     if len(before) == 1:
@@ -190,11 +189,9 @@ def choose_images(found: Sequence[ImageFind]) -> Images:
         _check_values(images, before[0])
     elif before:
         names = " or ".join(find.label for find in before)
-        choices = tuple(_choice(find) for find in before)
-        images.question = (f"{names}: which one is before the operation?", choices)
-        images.taken += [
-            Taken(find.label, "", images.question[0], question=True) for find in before
-        ]
+        question = f"{names}: which one is before the operation?"
+        images.question = (question, tuple(_choice(find) for find in before))
+        images.taken += [Taken(find.label, "", question, question=True) for find in before]
     return images
 
 
@@ -226,12 +223,12 @@ def _check_values(images: Images, find: ImageFind) -> None:
         )
     asked = low > HU_AIR and find.to_hu is None
     if asked:
-        offset = OFFSET_RANGE[0] <= high <= OFFSET_RANGE[1]
+        shifted = OFFSET_RANGE[0] <= high <= OFFSET_RANGE[1]
+        hint = ", as this range suggests" if shifted else ""
         images.rescale = (
             f"values are {low:g} to {high:g}: a CT in HU has air at -1000. How do they become HU?",
             (
-                "[1, -1024], if 1024 was added to HU"
-                + (", as this range suggests" if offset else ""),
+                f"[1, -1024], if 1024 was added to HU{hint}",
                 "[slope, intercept] of the program that wrote it; or remove the line: they are HU",
             ),
         )
@@ -297,10 +294,9 @@ def choose_landmarks(found: Sequence[LandmarkFind], box: Floats | None) -> Marks
             continue
         names = " or ".join(find.label for find in finds)
         choices = tuple(f'"{find.label}": {len(find.read.points)} points' for find in finds)
-        marks.questions[kind] = (f"{names}: which are the {kind} landmarks?", choices)
-        marks.taken += [
-            Taken(find.label, "", marks.questions[kind][0], question=True) for find in finds
-        ]
+        question = f"{names}: which are the {kind} landmarks?"
+        marks.questions[kind] = (question, choices)
+        marks.taken += [Taken(find.label, "", question, question=True) for find in finds]
     _choose_frame(marks, box)
     return marks
 
@@ -333,18 +329,14 @@ def _taken(find: LandmarkFind, kind: str) -> Taken:
         why += f"; never placed: {', '.join(find.read.unset)}"
     frame = find.read.frame if find.read.stated else ""
     name = "skin landmarks after the operation" if kind == "after" else f"{kind} landmarks"
-    return Taken(
-        find.label, name, f"{why}; frame {'stated' if frame else 'not stated'}", "mm", frame
-    )
+    why += f"; frame {'stated' if frame else 'not stated'}"
+    return Taken(find.label, name, why, "mm", frame)
 
 
 def _choose_frame(marks: Marks, box: Floats | None) -> None:
     """The frame of landmarks whose file states none, by where they lie."""
-    silent = [
-        find
-        for find in (marks.skull, marks.skin, marks.after)
-        if find is not None and not find.read.stated
-    ]
+    found = (marks.skull, marks.skin, marks.after)
+    silent = [find for find in found if find is not None and not find.read.stated]
     if not silent:
         return
     names = ", ".join(find.label for find in silent)

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.drafting.choices import Taken, Text, choose_images, choose_landmarks, legible, quoted
-from cmfsim.drafting.finds import ImageFind, LandmarkFind
-from cmfsim.drafting.gathering import Gathered
+from cmfsim.drafting.finds import Gathered, ImageFind, LandmarkFind
 from cmfsim.drafting.motions import (
     DraftMotion,
     Plan,
@@ -122,12 +121,20 @@ def draft_case(
         mark = "?" if entry.question or not entry.taken_for else entry.taken_for
         text.comment(f"{entry.label}: {mark} ({entry.why})", hang=4)
     text.lines += ["", 'format = "cmfsim-case"', "version = 1", f"name = {quoted(legible(name))}"]
-    achieved = not draft.plan.motions and _has_after(draft)
+    # Bones after the operation, on which the plan can be measured.
+    has_after = bool(draft.anatomy.after_bones) or _uses_image_after(draft)
+    achieved = has_after and not draft.plan.motions
     if achieved:
-        text.value(
-            "plan", '"achieved"', "measured on the post-operative bones, because no plan is given"
-        )
-    _write_head(draft)
+        why = "measured on the post-operative bones, because no plan is given"
+        text.value("plan", '"achieved"', why)
+    if not draft.by_image:
+        _write_surfaces(draft)
+    else:
+        _write_image(draft)
+        if draft.anatomy.skin is not None and draft.anatomy.bones:
+            text.lines.append("")
+            text.comment("The same head as surfaces, instead of the CT:")
+            _write_surfaces(draft, lead="# ")
     _write_landmarks(draft)
     _write_cuts(draft, typed.cuts)
     if not achieved:
@@ -140,11 +147,6 @@ def draft_case(
         if motion.shown is not None and not motion.question:
             draft.shown.motions[segment] = motion.shown
     return CaseDraft(str(text), taken, text.questions, draft.files, draft.shown)
-
-
-def _has_after(draft: Draft) -> bool:
-    """Whether there are bones after the operation, on which the plan can be measured."""
-    return bool(draft.anatomy.after_bones) or _uses_image_after(draft)
 
 
 def _uses_image_after(draft: Draft) -> bool:
@@ -248,17 +250,6 @@ def _beside_image(draft: Draft, taken: Taken) -> Taken:
     return replace(taken, taken_for="not used", why=why, question=False)
 
 
-def _write_head(draft: Draft) -> None:
-    if draft.by_image:
-        _write_image(draft)
-        if draft.anatomy.skin is not None and draft.anatomy.bones:
-            draft.text.lines.append("")
-            draft.text.comment("The same head as surfaces, instead of the CT:")
-            _write_surfaces(draft, lead="# ")
-        return
-    _write_surfaces(draft)
-
-
 def _write_image(draft: Draft) -> None:
     text, images = draft.text, draft.images
     text.table("image")
@@ -271,9 +262,8 @@ def _write_image(draft: Draft) -> None:
         if images.ct.series is not None:
             text.value("series", quoted(images.ct.series), "the folder holds others as well")
         if not np.allclose(images.ct.to_world, np.eye(4), rtol=0.0, atol=SAME):
-            text.comment(
-                "The scene turns this volume; the case is in the volume's own coordinates."
-            )
+            why = "The scene turns this volume; the case is in the volume's own coordinates."
+            text.comment(why)
     if images.rescale is not None:
         text.ask("rescale", *images.rescale)
     if images.scale:
@@ -320,9 +310,8 @@ def _write_landmarks(draft: Draft) -> None:
         text.table("landmarks", "there is no file of landmarks")
         if not _shows_skull(draft):
             text.comment("Cuts by procedures and muscles are placed from those of the skull:")
-            text.comment(
-                "skull = ..., skin = ... (.mrk.json). They are not found without a cranium."
-            )
+            why = "skull = ..., skin = ... (.mrk.json). They are not found without a cranium."
+            text.comment(why)
             return
         text.value("automatic", "true", "they will be found on bone and skin")
         text.comment('"cmfsim landmarks case.toml" shows them, with the expected error, and')
@@ -340,9 +329,8 @@ def _write_landmarks(draft: Draft) -> None:
     if "frame" in marks.questions:
         text.ask("frame", *marks.questions["frame"])
     elif marks.frame is not None:
-        text.value(
-            "frame", quoted(marks.frame), "read this way they are in the head, otherwise not"
-        )
+        why = "read this way they are in the head, otherwise not"
+        text.value("frame", quoted(marks.frame), why)
 
 
 def _shows_skull(draft: Draft) -> bool:
@@ -377,18 +365,15 @@ def _write_cuts(draft: Draft, cuts: Sequence[str]) -> None:
 def _write_plan(draft: Draft, cuts: Sequence[str]) -> None:
     text, plan = draft.text, draft.plan
     if not plan.motions:
-        _propose_plan(text, _bones_of(draft).union(*(PROCEDURES[cut] for cut in cuts)))
+        # As a comment: of a piece that is there, or of one that a procedure cuts. A whole mandible
+        # does not leave its joints: it is cut first.
+        bones = _bones_of(draft).union(*(PROCEDURES[cut] for cut in cuts)) - {"mandible"}
+        pieces = [name for name in MOVING if name in bones]
+        lines = EXAMPLE.format(name=pieces[0] if pieces else "maxilla").splitlines()
+        text.lines += ["", "# No plan was found. To move a segment, state how it moves, such as:"]
+        text.lines += [f"# {line}".rstrip() for line in (*(() if pieces else CUT), *lines)]
     for name, motion in plan.motions.items():
         _write_motion(text, name, motion)
-
-
-def _propose_plan(text: Text, bones: set[str]) -> None:
-    """Adds a plan as a comment: of a piece that is there, or of one that a procedure cuts."""
-    # A whole mandible does not leave its joints: it is cut first.
-    pieces = [name for name in MOVING if name in bones - {"mandible"}]
-    lines = EXAMPLE.format(name=pieces[0] if pieces else "maxilla").splitlines()
-    text.lines += ["", "# No plan was found. To move a segment, state how it moves, such as:"]
-    text.lines += [f"# {line}".rstrip() for line in (*(() if pieces else CUT), *lines)]
 
 
 def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:

@@ -52,28 +52,35 @@ PREAMBLE = 128
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceFind:
-    """A surface, in its file's own numbers.
+class Find:
+    """Something that was found: what reports call it, what its name says, and its file.
 
-    label: What reports call it: its path, or its scene and node.
-    path: The file; for a segment of a segmentation, that of all segments.
-    stated: The frame that its header, or its scene, states.
-    is_silent: Whether the file itself states none: its scene does, or nothing.
+    label: Its path, or its scene and node.
     to_world: (4, 4), mm, LPS. What its scene applies to it.
     chain: The names of the transforms that do, the nearest first.
-    is_made: Whether it was made of voxels: it has no file of its own.
-    joined: The labels of the teeth that were added to it.
     """
 
     label: str
     role: NameRole
     path: Path
+    to_world: Floats = field(default_factory=lambda: np.eye(4), kw_only=True)
+    chain: tuple[str, ...] = field(default=(), kw_only=True)
+    in_scene: bool = field(default=False, kw_only=True)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceFind(Find):
+    """A surface, in its file's own numbers; `path` of a segment is that of all segments.
+
+    stated: The frame that its header, or its scene, states.
+    is_silent: Whether the file itself states none: its scene does, or nothing.
+    is_made: Whether it was made of voxels: it has no file of its own.
+    joined: The labels of the teeth that were added to it.
+    """
+
     surface: SurfaceData
     stated: str | None
     is_closed: bool
-    to_world: Floats = field(default_factory=lambda: np.eye(4))
-    chain: tuple[str, ...] = ()
-    in_scene: bool = False
     is_made: bool = False
     is_silent: bool = False
     joined: tuple[str, ...] = ()
@@ -91,10 +98,9 @@ class SurfaceFind:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageFind:
-    """A CT, or another image.
+class ImageFind(Find):
+    """A CT, or another image; `path` is a folder for DICOM.
 
-    label, role, path: As of a surface; `path` is a folder for DICOM.
     modality: Of DICOM; empty where the file does not state it.
     values: Lowest and highest.
     words: Its size and spacing.
@@ -106,9 +112,6 @@ class ImageFind:
         and their peaks clearly give the scale.
     """
 
-    label: str
-    role: NameRole
-    path: Path
     modality: str = ""
     values: tuple[float, float] = (0.0, 0.0)
     words: str = ""
@@ -118,31 +121,29 @@ class ImageFind:
     findings: tuple[Finding, ...] = ()
     is_labels: bool = False
     to_hu: tuple[float, float, float] | None = None
-    to_world: Floats = field(default_factory=lambda: np.eye(4))
-    chain: tuple[str, ...] = ()
-    in_scene: bool = False
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkFind:
+class LandmarkFind(Find):
     """A file of landmarks, as read."""
 
-    label: str
-    role: NameRole
-    path: Path
     read: LandmarkFile
-    to_world: Floats = field(default_factory=lambda: np.eye(4))
-    chain: tuple[str, ...] = ()
-    in_scene: bool = False
+
+
+class TransformFind(Find):
+    """A separate transform file; its name identifies what it moves."""
 
 
 @dataclass(frozen=True, eq=False)
-class TransformFind:
-    """A separate transform file; its name identifies what it moves."""
+class LooseMotion:
+    """A transform of a scene that is applied to nothing: hardened, or never used.
+
+    matrix: (4, 4), mm, LPS.
+    """
 
     label: str
     role: NameRole
-    path: Path
+    matrix: Floats
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,37 @@ class OtherFind:
     label: str
     why: str
     paths: tuple[Path, ...] = ()
+
+
+@dataclass
+class Gathered:
+    """What was found, by kind.
+
+    scene: The label of the scene that was read; empty if there is none.
+    by_slicer: Whether 3D Slicer saved any of the files.
+    seen: Every file of the folder.
+    names: Those with the names of labels.
+    scene_files: Those that the scene names.
+    links: The transforms of the scene, with what lies directly under each.
+    """
+
+    folder: Path
+    scene: str = ""
+    by_slicer: bool = False
+    surfaces: list[SurfaceFind] = field(default_factory=list)
+    images: list[ImageFind] = field(default_factory=list)
+    landmarks: list[LandmarkFind] = field(default_factory=list)
+    transforms: list[TransformFind] = field(default_factory=list)
+    loose: list[LooseMotion] = field(default_factory=list)
+    others: list[OtherFind] = field(default_factory=list)
+    seen: list[Path] = field(default_factory=list)
+    names: list[Path] = field(default_factory=list)
+    scene_files: set[Path] = field(default_factory=set)
+    links: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def shown(self, path: Path) -> str:
+        """A path as the case file will have it."""
+        return path.relative_to(self.folder).as_posix()
 
 
 @dataclass
@@ -181,13 +213,11 @@ class Listing:
         found = []
         for (_, why), paths in self.unread.items():
             names = [path.relative_to(folder).as_posix() for path in paths]
-            if len(names) <= SHOWN:
-                found += [
-                    OtherFind(name, why, (path,)) for name, path in zip(names, paths, strict=True)
-                ]
+            if len(names) > SHOWN:
+                more = f"{', '.join(names[:SHOWN])} and {len(names) - SHOWN} more"
+                found.append(OtherFind(more, why, tuple(paths)))
                 continue
-            more = f" and {len(names) - SHOWN} more"
-            found.append(OtherFind(", ".join(names[:SHOWN]) + more, why, tuple(paths)))
+            found += [OtherFind(n, why, (path,)) for n, path in zip(names, paths, strict=True)]
         return found
 
 
@@ -289,13 +319,10 @@ def surface_find(path: Path, label: str) -> SurfaceFind:
     Raises `CaseError`: As `read_surface`.
     """
     read = surface_as_stored(path)
-    surface, stated = read.surface, read.frame
-    is_silent = stated is None
-    if is_silent and is_own_file(path):
-        stated = "LPS"
-    role = name_role(path.name[: -len(path.suffix)])
-    closed = is_closed(surface)
-    return SurfaceFind(label, role, path, surface, stated, closed, is_silent=is_silent)
+    is_silent = read.frame is None
+    stated = "LPS" if is_silent and is_own_file(path) else read.frame
+    role, closed = name_role(path.name[: -len(path.suffix)]), is_closed(read.surface)
+    return SurfaceFind(label, role, path, read.surface, stated, closed, is_silent=is_silent)
 
 
 def is_closed(surface: SurfaceData) -> bool:

@@ -1,16 +1,13 @@
 """Everything in a folder, or in the scene of 3D Slicer that it holds, read once."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
 from cmfsim.drafting.finds import (
-    ImageFind,
-    LandmarkFind,
+    Gathered,
     Listing,
     OtherFind,
-    SurfaceFind,
     TransformFind,
     image_find,
     landmark_find,
@@ -18,7 +15,7 @@ from cmfsim.drafting.finds import (
     surface_find,
 )
 from cmfsim.drafting.roles import name_role
-from cmfsim.drafting.scene_finds import LooseMotion, scene_finds, segment_finds
+from cmfsim.drafting.scene_finds import scene_finds, segment_finds
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.images.segmentations import NAMES_FILE
 from cmfsim.io.slicer.slicer_scenes import read_slicer_scene, unpack_bundle
@@ -35,37 +32,6 @@ BY_SLICER = (b"3D Slicer output", b"SPACE=LPS", b"SPACE=RAS", b"Segmentation_")
 Found = TypeVar("Found")
 
 
-@dataclass
-class Gathered:
-    """What was found, by kind.
-
-    scene: The label of the scene that was read; empty if there is none.
-    by_slicer: Whether 3D Slicer saved any of the files.
-    seen: Every file of the folder.
-    names: Those with the names of labels.
-    scene_files: Those that the scene names.
-    links: The transforms of the scene, with what lies directly under each.
-    """
-
-    folder: Path
-    scene: str = ""
-    by_slicer: bool = False
-    surfaces: list[SurfaceFind] = field(default_factory=list)
-    images: list[ImageFind] = field(default_factory=list)
-    landmarks: list[LandmarkFind] = field(default_factory=list)
-    transforms: list[TransformFind] = field(default_factory=list)
-    loose: list[LooseMotion] = field(default_factory=list)
-    others: list[OtherFind] = field(default_factory=list)
-    seen: list[Path] = field(default_factory=list)
-    names: list[Path] = field(default_factory=list)
-    scene_files: set[Path] = field(default_factory=set)
-    links: dict[str, tuple[str, ...]] = field(default_factory=dict)
-
-    def shown(self, path: Path) -> str:
-        """A path as the case file will have it."""
-        return path.relative_to(self.folder).as_posix()
-
-
 def gather(
     folder: Path, scene: Path | None, unpacked: Path, progress: Callable[[str], None]
 ) -> Gathered:
@@ -80,10 +46,10 @@ def gather(
     paths = listing(folder)
     found.others += paths.others(folder)
     found.seen = paths.seen
-    named_by_scene = found.scene_files = _gather_scene(found, paths, scene, unpacked, progress)
+    _gather_scene(found, paths, scene, unpacked, progress)
 
     def rest(of: list[Path]) -> list[Path]:
-        return [path for path in of if path.resolve() not in named_by_scene]
+        return [path for path in of if path.resolve() not in found.scene_files]
 
     if found.scene:
         for path in (*rest(paths.surfaces), *rest(paths.labels)):
@@ -105,9 +71,7 @@ def gather(
     files = [(path, None) for path in rest(paths.images)]
     places = sorted(paths.dicom, key=lambda place: place[0] == folder)
     _gather_images(found, [*files, *places], progress)
-    found.by_slicer = bool(found.scene) or any(
-        _by_slicer(path) for path in (*paths.surfaces, *paths.labels)
-    )
+    found.by_slicer = bool(found.scene) or any(map(_by_slicer, (*paths.surfaces, *paths.labels)))
     return found
 
 
@@ -148,9 +112,9 @@ def _gather_images(
                 labels.append((path, label))
             else:
                 found.images.append(image)
-    segments = segment_finds(labels)
-    found.surfaces += segments.surfaces
-    found.others += segments.others
+    surfaces, unused = segment_finds(labels)
+    found.surfaces += surfaces
+    found.others += unused
     folders = {path.parent for path, _ in labels}
     found.names = [
         path for path in found.seen if path.name == NAMES_FILE and path.parent in folders
@@ -163,8 +127,8 @@ def _gather_scene(
     scene: Path | None,
     unpacked: Path,
     progress: Callable[[str], None],
-) -> set[Path]:
-    """The files that the scene of the folder names, after what it has was added."""
+) -> None:
+    """Adds what the scene of the folder has."""
     if scene is None and len(paths.scenes) > 1:
         names = ", ".join(found.shown(path) for path in paths.scenes)
         raise CaseInputError(
@@ -174,7 +138,7 @@ def _gather_scene(
     if scene is None:
         scene = next(iter(paths.scenes), None)
     if scene is None:
-        return set()
+        return
     found.others += [
         OtherFind(found.shown(path), "another scene was given")
         for path in paths.scenes
@@ -184,20 +148,13 @@ def _gather_scene(
     progress(f"reading {found.scene}")
     bundled = scene.suffix.lower() == ".mrb"
     file = unpack_bundle(scene, unpacked) if bundled else scene
-    read = scene_finds(read_slicer_scene(file), found.scene)
-    found.surfaces += read.surfaces
-    found.images += read.images
-    found.landmarks += read.landmarks
-    found.loose += read.loose
-    found.others += read.others
-    found.links = read.links
+    scene_finds(found, read_slicer_scene(file), found.scene)
     if bundled:
         found.others += [
             OtherFind(f"{found.scene}: {path.relative_to(unpacked).as_posix()}", NOT_NAMED)
             for path in sorted(unpacked.rglob("*"))
-            if path.is_file() and path != file and path.resolve() not in read.files
+            if path.is_file() and path != file and path.resolve() not in found.scene_files
         ]
-    return read.files
 
 
 def _gather_files(found: Gathered, paths: Listing, progress: Callable[[str], None]) -> None:
@@ -207,9 +164,9 @@ def _gather_files(found: Gathered, paths: Listing, progress: Callable[[str], Non
     for path in paths.labels:
         label = found.shown(path)
         progress(f"reading {label}")
-        segments = segment_finds([(path, label)])
-        found.surfaces += segments.surfaces
-        found.others += segments.others
+        surfaces, unused = segment_finds([(path, label)])
+        found.surfaces += surfaces
+        found.others += unused
     for path in paths.transforms:
         label = found.shown(path)
         role = name_role(path.name[: -len(path.suffix)])

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.drafting.choices import Taken, quoted
-from cmfsim.drafting.finds import OtherFind, SurfaceFind, TransformFind
+from cmfsim.drafting.finds import LooseMotion, OtherFind, SurfaceFind, TransformFind
 from cmfsim.drafting.roles import MOVING, safe_key
-from cmfsim.drafting.scene_finds import LooseMotion
 from cmfsim.drafting.surfaces import Anatomy
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.slicer.transforms import is_itk_file, motion_in_lps, read_transform_file
@@ -121,9 +120,8 @@ def scene_motions(
         plan.motions[name] = DraftMotion(words, source, matrix, "", question, choices, matrix)
         plan.links |= {*find.chain} - shared
         why = f"transform to parent of {find.label} in the scene: {words}"
-        plan.taken.append(
-            Taken(", ".join(find.chain) or find.label, f"motion of {name}", why, "mm", "LPS")
-        )
+        label = ", ".join(find.chain) or find.label
+        plan.taken.append(Taken(label, f"motion of {name}", why, "mm", "LPS"))
     for name, finds in asked.items():
         if name not in known:
             motions = [back @ f.to_world if in_image else f.to_world @ back for f in finds]
@@ -187,9 +185,8 @@ def _unusual(name: str, find: SurfaceFind, words: str) -> tuple[str, tuple[str, 
 def _add_loose(plan: Plan, motion: LooseMotion) -> None:
     name = motion.role.part
     if name not in MOVING or name in plan.motions or motion.role.registers:
-        plan.others.append(
-            OtherFind(motion.label, "the scene does not apply this transform to any model")
-        )
+        why = "the scene does not apply this transform to any model"
+        plan.others.append(OtherFind(motion.label, why))
         return
     words = plan.words(name, motion.matrix)
     question = f"{motion.label} is not applied to any model: was it hardened, or is it the plan?"
@@ -198,9 +195,8 @@ def _add_loose(plan: Plan, motion: LooseMotion) -> None:
         "if it was hardened, the surface has moved already: undo that in Slicer, and init again",
     )
     plan.motions[name] = DraftMotion(words, (), motion.matrix, "", question, choices)
-    plan.taken.append(
-        Taken(motion.label, f"motion of {name}", question, "mm", "LPS", question=True)
-    )
+    what = f"motion of {name}"
+    plan.taken.append(Taken(motion.label, what, question, "mm", "LPS", question=True))
 
 
 def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool) -> None:
@@ -220,7 +216,11 @@ def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool)
             _ask_segment(plan, find)
     for name, finds in by_part.items():
         if len(finds) > 1:
-            _ask_which(plan, name, finds)
+            text = f"{' or '.join(f.label for f in finds)}: which one moves the {name}?"
+            choices = tuple(quoted(find.label) for find in finds)
+            plan.motions[name] = DraftMotion("", (), None, '"?"', text, choices)
+            what = f"motion of {name}"
+            plan.taken += [Taken(find.label, what, text, question=True) for find in finds]
             continue
         find = finds[0]
         try:
@@ -246,14 +246,6 @@ def _ask_segment(plan: Plan, find: TransformFind) -> None:
     name = safe_key(find.label.rpartition("/")[2].partition(".")[0])
     plan.motions[name] = DraftMotion("", (), None, '"?"', text, choices)
     plan.taken.append(Taken(find.label, "", text, question=True))
-
-
-def _ask_which(plan: Plan, name: str, finds: Sequence[TransformFind]) -> None:
-    names = " or ".join(find.label for find in finds)
-    text = f"{names}: which one moves the {name}?"
-    choices = tuple(quoted(find.label) for find in finds)
-    plan.motions[name] = DraftMotion("", (), None, '"?"', text, choices)
-    plan.taken += [Taken(find.label, f"motion of {name}", text, question=True) for find in finds]
 
 
 def _of_file(plan: Plan, name: str, find: TransformFind, *, by_slicer: bool) -> DraftMotion:

@@ -1,16 +1,17 @@
 """What `cmfsim init` finds in scenes of 3D Slicer and in segmentations."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.drafting.finds import (
     LABELS,
-    ImageFind,
-    LandmarkFind,
+    Gathered,
+    LooseMotion,
     OtherFind,
     SurfaceFind,
     image_find,
@@ -58,16 +59,8 @@ class _Mask:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class SegmentFinds:
-    """Segments as surfaces, and those that are not used, with the reasons."""
-
-    surfaces: list[SurfaceFind]
-    others: list[OtherFind]
-
-
-def segment_finds(files: Sequence[tuple[Path, str]]) -> SegmentFinds:
-    """The segments of files that may be skin, bone or teeth, each as a surface.
+def segment_finds(files: Sequence[tuple[Path, str]]) -> tuple[list[SurfaceFind], list[OtherFind]]:
+    """The segments of files that may be skin, bone or teeth, each as a surface, and the others.
 
     Teeth are added to the jaw that their name says, where both have the same grid; so are the bones
     that a label image cuts out of its skin.
@@ -94,7 +87,7 @@ def segment_finds(files: Sequence[tuple[Path, str]]) -> SegmentFinds:
             continue
         teeth = [other for other in masks if jaws.get(id(other)) is mask]
         surfaces.append(_surface_find(mask, teeth, masks))
-    return SegmentFinds(surfaces, others)
+    return surfaces, others
 
 
 def _masks(path: Path, label: str) -> tuple[list[_Mask], list[OtherFind]]:
@@ -149,16 +142,9 @@ def _surface_find(mask: _Mask, teeth: Sequence[_Mask], masks: Sequence[_Mask]) -
     inside = [o for o in masks if o is not mask and o.role.part != "skin" and o.is_on(mask)]
     if mask.role.part == "skin" or (not mask.role.part and inside and _encloses(mask, inside)):
         voxels = _filled(voxels, [bone.voxels() for bone in inside])
-    found = SurfaceFind(
-        mask.label,
-        mask.role,
-        mask.path,
-        _surface(mask.segment.name, voxels, mask.read),
-        "LPS",
-        is_closed=True,
-        is_made=True,
-    )
-    return replace(found, joined=tuple(other.label for other in teeth))
+    surface, joined = _surface(mask.segment.name, voxels, mask.read), tuple(o.label for o in teeth)
+    own = (mask.label, mask.role, mask.path, surface, "LPS")
+    return SurfaceFind(*own, is_closed=True, is_made=True, joined=joined)
 
 
 def _encloses(outer: _Mask, others: Sequence[_Mask]) -> bool:
@@ -191,44 +177,15 @@ def _surface(name: str, mask: NDArray[np.bool_], read: Segmentation) -> SurfaceD
     return SurfaceData(vertices, triangles[:, ::-1] if mirrored else triangles)
 
 
-@dataclass(frozen=True, eq=False)
-class LooseMotion:
-    """A transform of a scene that is applied to nothing: hardened, or never used.
-
-    matrix: (4, 4), mm, LPS.
-    """
-
-    label: str
-    role: NameRole
-    matrix: Floats
-
-
-@dataclass
-class SceneFinds:
-    """What was found in a scene, by kind, the files that it names, and what each transform moves.
-
-    `links` has the name of each with the names of what lies directly under it.
-    """
-
-    surfaces: list[SurfaceFind] = field(default_factory=list)
-    images: list[ImageFind] = field(default_factory=list)
-    landmarks: list[LandmarkFind] = field(default_factory=list)
-    loose: list[LooseMotion] = field(default_factory=list)
-    others: list[OtherFind] = field(default_factory=list)
-    files: set[Path] = field(default_factory=set)
-    links: dict[str, tuple[str, ...]] = field(default_factory=dict)
-
-
-def scene_finds(scene: SlicerScene, label: str) -> SceneFinds:
-    """The models, segments, volumes, markups and transforms of a scene.
+def scene_finds(found: Gathered, scene: SlicerScene, label: str) -> None:
+    """Adds the models, segments, volumes, markups and transforms of a scene.
 
     Raises `CaseError`: What a case would be made of lies under a transform that is not rigid, or
         that cannot be read.
     """
-    found = SceneFinds()
     for node in scene.nodes.values():
         if node.file is not None:
-            found.files.add(node.file.resolve())
+            found.scene_files.add(node.file.resolve())
         shown = f"{label}: {node.name}"
         if node.kind == "transform":
             continue
@@ -249,20 +206,18 @@ def scene_finds(scene: SlicerScene, label: str) -> SceneFinds:
                 raise
             found.others.append(OtherFind(shown, str(error)))
     _add_loose(found, scene, label)
-    return found
 
 
-def _add(found: SceneFinds, scene: SlicerScene, node: SceneNode, shown: str) -> None:
+def _add(found: Gathered, scene: SlicerScene, node: SceneNode, shown: str) -> None:
     if node.file is None:  # asked before
         raise AssertionError(node.name)
     chain = tuple(above.name for above in scene.chain(node))
-    matrix, role = scene.to_world(node), name_role(node.name)
+    matrix = scene.to_world(node)
+    place: dict[str, Any] = {"to_world": matrix, "chain": chain, "in_scene": True}
+    place["role"] = name_role(node.name)
     if node.kind == "model":
         read = surface_find(node.file, shown)
-        stated = read.stated or node.frame
-        found.surfaces.append(
-            replace(read, role=role, stated=stated, to_world=matrix, chain=chain, in_scene=True)
-        )
+        found.surfaces.append(replace(read, stated=read.stated or node.frame, **place))
     elif node.kind == "segmentation":
         _add_segments(found, node.file, shown, matrix, chain)
     elif node.kind == "volume":
@@ -270,26 +225,23 @@ def _add(found: SceneFinds, scene: SlicerScene, node: SceneNode, shown: str) -> 
         if image.is_labels:
             _add_segments(found, node.file, shown, matrix, chain)
             return
-        found.images.append(replace(image, role=role, to_world=matrix, chain=chain, in_scene=True))
+        found.images.append(replace(image, **place))
     else:
-        points = landmark_find(node.file, shown)
-        found.landmarks.append(
-            replace(points, role=role, to_world=matrix, chain=chain, in_scene=True)
-        )
+        found.landmarks.append(replace(landmark_find(node.file, shown), **place))
 
 
 def _add_segments(
-    found: SceneFinds, file: Path, shown: str, matrix: Floats, chain: tuple[str, ...]
+    found: Gathered, file: Path, shown: str, matrix: Floats, chain: tuple[str, ...]
 ) -> None:
     """Adds the segments of a file, where the scene shows them."""
-    read = segment_finds([(file, shown)])
-    found.others += read.others
+    surfaces, others = segment_finds([(file, shown)])
+    found.others += others
     found.surfaces += [
-        replace(segment, to_world=matrix, chain=chain, in_scene=True) for segment in read.surfaces
+        replace(segment, to_world=matrix, chain=chain, in_scene=True) for segment in surfaces
     ]
 
 
-def _add_loose(found: SceneFinds, scene: SlicerScene, label: str) -> None:
+def _add_loose(found: Gathered, scene: SlicerScene, label: str) -> None:
     """Adds the transforms that nothing lies under."""
     for node in scene.of("transform"):
         below = tuple(other.name for other in scene.nodes.values() if other.parent == node.id)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.drafting.choices import Images, Marks, Taken, Text, quoted
-from cmfsim.drafting.finds import EXTRACTED, ImageFind, LandmarkFind, SurfaceFind
-from cmfsim.drafting.gathering import Gathered
+from cmfsim.drafting.finds import EXTRACTED, Gathered, ImageFind, LandmarkFind, SurfaceFind
 from cmfsim.drafting.motions import Plan
 from cmfsim.drafting.roles import safe_key
 from cmfsim.drafting.surfaces import Anatomy, Question
@@ -54,10 +53,9 @@ def unaccounted(found: Gathered, plan: Plan, taken: Sequence[Taken]) -> list[Tak
     missing = []
     for path in found.seen:
         label = found.shown(path)
-        known = label in labels or any(name.startswith(f"{label} / ") for name in labels)
         known = (
-            known
-            or label == found.scene
+            label in {*labels, found.scene}
+            or any(name.startswith(f"{label} / ") for name in labels)
             or path in paths
             or any(folder in path.parents for folder in folders)
         )
@@ -286,9 +284,9 @@ def image_path(draft: Draft, image: ImageFind) -> str:
     name = f"{EXTRACTED}/{safe_key(image.path.name.partition('.')[0])}"
     name += "".join(image.path.suffixes[-2:]) if image.path.suffix == ".gz" else image.path.suffix
     data = image.path.read_bytes()
-    draft.files[name] = lambda path: _keep(path, data)
+
+    def keep(path: Path) -> None:
+        path.write_bytes(data)
+
+    draft.files[name] = keep
     return name
-
-
-def _keep(path: Path, data: bytes) -> None:
-    path.write_bytes(data)
