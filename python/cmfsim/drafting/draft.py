@@ -8,16 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from cmfsim.drafting import motions
 from cmfsim.drafting.choices import Taken, Text, choose_images, choose_landmarks, legible, quoted
 from cmfsim.drafting.finds import Gathered, ImageFind, LandmarkFind
-from cmfsim.drafting.motions import (
-    DraftMotion,
-    Plan,
-    TypedPlan,
-    add_typed,
-    file_motions,
-    scene_motions,
-)
 from cmfsim.drafting.roles import MOVING
 from cmfsim.drafting.surfaces import Anatomy, choose_surfaces
 from cmfsim.drafting.written import (
@@ -92,7 +85,7 @@ def draft_case(
     found: Gathered,
     unpacked: Path,
     name: str,
-    typed: TypedPlan | None = None,
+    typed: motions.TypedPlan | None = None,
     sites: Mapping[str, ProposedSite] = MappingProxyType({}),
 ) -> CaseDraft:
     """The case file of what was gathered.
@@ -104,11 +97,11 @@ def draft_case(
     Raises `CaseError`: What is there makes no case: neither a CT, nor a skin with a bone; cuts or
         motions that do not suit it.
     """
-    typed = typed or TypedPlan()
+    typed = typed or motions.TypedPlan()
     draft = _decide(found, unpacked)
     is_turned = not np.allclose(draft.reference, np.eye(4), rtol=0.0, atol=SAME)
     draft.plan.sites = sites
-    add_typed(draft.plan, typed, _bones_of(draft), is_turned=is_turned)
+    motions.add_typed(draft.plan, typed, _bones_of(draft), is_turned=is_turned)
     taken = _taken(draft)
     text = draft.text
     text.comment("Written by cmfsim init. Read every line: each states what a file was taken for.")
@@ -183,10 +176,10 @@ def _decide(found: Gathered, unpacked: Path) -> Draft:
         reference = anatomy.skin.to_world
     elif "cranium" in anatomy.bones:
         reference = anatomy.bones["cranium"].to_world
-    plan = Plan(anatomy, marks.points)
+    plan = motions.Plan(anatomy, marks.points)
     if found.scene:
-        scene_motions(plan, anatomy.bones, found.loose, reference, in_image=by_image)
-    file_motions(plan, found.transforms, by_slicer=found.by_slicer)
+        motions.scene_motions(plan, anatomy.bones, found.loose, reference, in_image=by_image)
+    motions.file_motions(plan, found.transforms, by_slicer=found.by_slicer)
     return Draft(found, unpacked, images, anatomy, marks, plan, reference, by_image)
 
 
@@ -376,7 +369,7 @@ def _write_plan(draft: Draft, cuts: Sequence[str]) -> None:
         _write_motion(text, name, motion)
 
 
-def _write_motion(text: Text, name: str, motion: DraftMotion) -> None:
+def _write_motion(text: Text, name: str, motion: motions.DraftMotion) -> None:
     text.table(f"plan.{name}")
     if motion.words:
         text.comment(f"It {motion.words}.")

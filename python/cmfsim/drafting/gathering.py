@@ -4,16 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from cmfsim.drafting.finds import (
-    Gathered,
-    Listing,
-    OtherFind,
-    TransformFind,
-    image_find,
-    landmark_find,
-    listing,
-    surface_find,
-)
+from cmfsim.drafting import finds
 from cmfsim.drafting.roles import name_role
 from cmfsim.drafting.scene_finds import scene_finds, segment_finds
 from cmfsim.errors import CaseInputError, CmfsimError
@@ -34,7 +25,7 @@ Found = TypeVar("Found")
 
 def gather(
     folder: Path, scene: Path | None, unpacked: Path, progress: Callable[[str], None]
-) -> Gathered:
+) -> finds.Gathered:
     """What a folder holds.
 
     scene: The scene that is meant; else the only one of the folder.
@@ -42,8 +33,8 @@ def gather(
     Raises `CaseError`: Several scenes; a scene that is damaged or hostile; a transform of a scene
         that is not rigid.
     """
-    found = Gathered(folder)
-    paths = listing(folder)
+    found = finds.Gathered(folder)
+    paths = finds.listing(folder)
     found.others += paths.others(folder)
     found.seen = paths.seen
     _gather_scene(found, paths, scene, unpacked, progress)
@@ -56,12 +47,12 @@ def gather(
             role = name_role(path.name)
             if role.is_after and path in paths.surfaces:
                 progress(f"reading {found.shown(path)}")
-                _read(found, path, surface_find, found.surfaces)
+                _read(found, path, finds.surface_find, found.surfaces)
             else:
                 why = f"the scene {found.scene} does not have it"
-                found.others.append(OtherFind(found.shown(path), why))
+                found.others.append(finds.OtherFind(found.shown(path), why))
         found.others += [
-            OtherFind(found.shown(path), f"the scene {found.scene} does not have it")
+            finds.OtherFind(found.shown(path), f"the scene {found.scene} does not have it")
             for path in rest(paths.transforms)
         ]
     else:
@@ -75,19 +66,19 @@ def gather(
     return found
 
 
-def _gather_landmarks(found: Gathered, paths: list[Path]) -> None:
+def _gather_landmarks(found: finds.Gathered, paths: list[Path]) -> None:
     """Adds the landmarks of files; those of a scene come before them."""
     has_marks = bool(found.landmarks)
     for path in paths:
         if has_marks and not name_role(path.name).is_after:
             why = f"the scene {found.scene} has landmarks of its own"
-            found.others.append(OtherFind(found.shown(path), why))
+            found.others.append(finds.OtherFind(found.shown(path), why))
         else:
-            _read(found, path, landmark_find, found.landmarks)
+            _read(found, path, finds.landmark_find, found.landmarks)
 
 
 def _gather_images(
-    found: Gathered, places: list[tuple[Path, str | None]], progress: Callable[[str], None]
+    found: finds.Gathered, places: list[tuple[Path, str | None]], progress: Callable[[str], None]
 ) -> None:
     """Adds the images of files and folders; the CT of a scene comes before them."""
     has_ct = any(not image.role.is_after and not image.error for image in found.images)
@@ -99,15 +90,17 @@ def _gather_images(
     for path, series in places:
         label = found.shown(path) + ("" if series is None else f" (series {series})")
         if has_ct and not name_role(path.name).is_after:
-            found.others.append(OtherFind(label, f"the scene {found.scene} has another CT"))
+            found.others.append(finds.OtherFind(label, f"the scene {found.scene} has another CT"))
         elif path not in read:
             why = f"more than {MAX_IMAGES} images, and its name is none of a head's part: not read"
-            found.others.append(OtherFind(label, why))
+            found.others.append(finds.OtherFind(label, why))
         else:
             progress(f"reading {label}")
-            image = image_find(path, label, series)
+            image = finds.image_find(path, label, series)
             if image.is_labels and found.scene and not image.role.is_after:
-                found.others.append(OtherFind(label, f"the scene {found.scene} does not have it"))
+                found.others.append(
+                    finds.OtherFind(label, f"the scene {found.scene} does not have it")
+                )
             elif image.is_labels:
                 labels.append((path, label))
             else:
@@ -122,8 +115,8 @@ def _gather_images(
 
 
 def _gather_scene(
-    found: Gathered,
-    paths: Listing,
+    found: finds.Gathered,
+    paths: finds.Listing,
     scene: Path | None,
     unpacked: Path,
     progress: Callable[[str], None],
@@ -140,7 +133,7 @@ def _gather_scene(
     if scene is None:
         return
     found.others += [
-        OtherFind(found.shown(path), "another scene was given")
+        finds.OtherFind(found.shown(path), "another scene was given")
         for path in paths.scenes
         if not path.samefile(scene)
     ]
@@ -151,16 +144,18 @@ def _gather_scene(
     scene_finds(found, read_slicer_scene(file), found.scene)
     if bundled:
         found.others += [
-            OtherFind(f"{found.scene}: {path.relative_to(unpacked).as_posix()}", NOT_NAMED)
+            finds.OtherFind(f"{found.scene}: {path.relative_to(unpacked).as_posix()}", NOT_NAMED)
             for path in sorted(unpacked.rglob("*"))
             if path.is_file() and path != file and path.resolve() not in found.scene_files
         ]
 
 
-def _gather_files(found: Gathered, paths: Listing, progress: Callable[[str], None]) -> None:
+def _gather_files(
+    found: finds.Gathered, paths: finds.Listing, progress: Callable[[str], None]
+) -> None:
     for path in paths.surfaces:
         progress(f"reading {found.shown(path)}")
-        _read(found, path, surface_find, found.surfaces)
+        _read(found, path, finds.surface_find, found.surfaces)
     for path in paths.labels:
         label = found.shown(path)
         progress(f"reading {label}")
@@ -171,19 +166,19 @@ def _gather_files(found: Gathered, paths: Listing, progress: Callable[[str], Non
         label = found.shown(path)
         role = name_role(path.name[: -len(path.suffix)])
         if path.suffix.lower() == ".txt" and not _is_matrix(path):
-            found.others.append(OtherFind(label, "is no transform: not 16 numbers"))
+            found.others.append(finds.OtherFind(label, "is no transform: not 16 numbers"))
             continue
-        found.transforms.append(TransformFind(label, role, path))
+        found.transforms.append(finds.TransformFind(label, role, path))
 
 
 def _read(
-    found: Gathered, path: Path, read: Callable[[Path, str], Found], into: list[Found]
+    found: finds.Gathered, path: Path, read: Callable[[Path, str], Found], into: list[Found]
 ) -> None:
     label = found.shown(path)
     try:
         into.append(read(path, label))
     except (CmfsimError, OSError) as error:
-        found.others.append(OtherFind(label, f"cannot be read: {error}"))
+        found.others.append(finds.OtherFind(label, f"cannot be read: {error}"))
 
 
 def _is_matrix(path: Path) -> bool:

@@ -8,16 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.drafting.finds import (
-    LABELS,
-    Gathered,
-    LooseMotion,
-    OtherFind,
-    SurfaceFind,
-    image_find,
-    landmark_find,
-    surface_find,
-)
+from cmfsim.drafting import finds
 from cmfsim.drafting.roles import JAWS_OF_TEETH, NameRole, name_role
 from cmfsim.errors import CmfsimError, third_party
 from cmfsim.io.images.segmentations import Segment, Segmentation, read_labels, read_segmentation
@@ -59,7 +50,9 @@ class _Mask:
         )
 
 
-def segment_finds(files: Sequence[tuple[Path, str]]) -> tuple[list[SurfaceFind], list[OtherFind]]:
+def segment_finds(
+    files: Sequence[tuple[Path, str]],
+) -> tuple[list[finds.SurfaceFind], list[finds.OtherFind]]:
     """The segments of files that may be skin, bone or teeth, each as a surface, and the others.
 
     Teeth are added to the jaw that their name says, where both have the same grid; so are the bones
@@ -69,12 +62,12 @@ def segment_finds(files: Sequence[tuple[Path, str]]) -> tuple[list[SurfaceFind],
         segment that is named after its file.
     """
     masks: list[_Mask] = []
-    others: list[OtherFind] = []
+    others: list[finds.OtherFind] = []
     for path, label in files:
         try:
             own, dropped = _masks(path, label)
         except (CmfsimError, OSError) as error:
-            others.append(OtherFind(label, f"cannot be read: {error}"))
+            others.append(finds.OtherFind(label, f"cannot be read: {error}"))
             continue
         masks += own
         others += dropped
@@ -90,9 +83,9 @@ def segment_finds(files: Sequence[tuple[Path, str]]) -> tuple[list[SurfaceFind],
     return surfaces, others
 
 
-def _masks(path: Path, label: str) -> tuple[list[_Mask], list[OtherFind]]:
+def _masks(path: Path, label: str) -> tuple[list[_Mask], list[finds.OtherFind]]:
     """The segments of a file that may be part of a case, and the others."""
-    is_slicers = path.name.lower().endswith(LABELS)
+    is_slicers = path.name.lower().endswith(finds.LABELS)
     read = read_segmentation(path) if is_slicers else read_labels(path)
     alone = not is_slicers and len(read.segments) == 1
     masks, others = [], []
@@ -101,15 +94,15 @@ def _masks(path: Path, label: str) -> tuple[list[_Mask], list[OtherFind]]:
         shown = label if alone else f"{label} / {segment.name}"
         if role.part == "other":
             why = f"its name contains {role.word!r}, which is not a bone of a case"
-            others.append(OtherFind(shown, why))
+            others.append(finds.OtherFind(shown, why))
         elif not (read.labels[segment.layer] == segment.label).any():
-            others.append(OtherFind(shown, "is empty: it has no voxel"))
+            others.append(finds.OtherFind(shown, "is empty: it has no voxel"))
         else:
             masks.append(_Mask(shown, role, path, segment, read, alone))
     return masks, others
 
 
-def _named(masks: Sequence[_Mask]) -> tuple[list[_Mask], list[OtherFind]]:
+def _named(masks: Sequence[_Mask]) -> tuple[list[_Mask], list[finds.OtherFind]]:
     """The masks without those of organs, of which there are many, and with names of their own."""
     unnamed = [mask for mask in masks if not mask.role.part]
     if len(unnamed) == len(masks):
@@ -117,7 +110,7 @@ def _named(masks: Sequence[_Mask]) -> tuple[list[_Mask], list[OtherFind]]:
     organs = unnamed if len(unnamed) > MOST_UNNAMED else [m for m in unnamed if m.is_alone]
     why = "its name is none of skin, bone or teeth, and others have such names"
     left = [mask for mask in masks if mask not in organs]
-    return left, [OtherFind(mask.label, why) for mask in organs]
+    return left, [finds.OtherFind(mask.label, why) for mask in organs]
 
 
 def _jaw_of(teeth: _Mask, masks: Sequence[_Mask]) -> _Mask | None:
@@ -135,7 +128,7 @@ def _jaw_of(teeth: _Mask, masks: Sequence[_Mask]) -> _Mask | None:
     return None
 
 
-def _surface_find(mask: _Mask, teeth: Sequence[_Mask], masks: Sequence[_Mask]) -> SurfaceFind:
+def _surface_find(mask: _Mask, teeth: Sequence[_Mask], masks: Sequence[_Mask]) -> finds.SurfaceFind:
     voxels = mask.voxels()
     for other in teeth:
         voxels = voxels | other.voxels()
@@ -144,7 +137,7 @@ def _surface_find(mask: _Mask, teeth: Sequence[_Mask], masks: Sequence[_Mask]) -
         voxels = _filled(voxels, [bone.voxels() for bone in inside])
     surface, joined = _surface(mask.segment.name, voxels, mask.read), tuple(o.label for o in teeth)
     own = (mask.label, mask.role, mask.path, surface, "LPS")
-    return SurfaceFind(*own, is_closed=True, is_made=True, joined=joined)
+    return finds.SurfaceFind(*own, is_closed=True, is_made=True, joined=joined)
 
 
 def _encloses(outer: _Mask, others: Sequence[_Mask]) -> bool:
@@ -177,7 +170,7 @@ def _surface(name: str, mask: NDArray[np.bool_], read: Segmentation) -> SurfaceD
     return SurfaceData(vertices, triangles[:, ::-1] if mirrored else triangles)
 
 
-def scene_finds(found: Gathered, scene: SlicerScene, label: str) -> None:
+def scene_finds(found: finds.Gathered, scene: SlicerScene, label: str) -> None:
     """Adds the models, segments, volumes, markups and transforms of a scene.
 
     Raises `CaseError`: What a case would be made of lies under a transform that is not rigid, or
@@ -193,22 +186,22 @@ def scene_finds(found: Gathered, scene: SlicerScene, label: str) -> None:
             why = f"no case uses a {node.tag} of 3D Slicer"
             if node.name.endswith(SLICE_MODELS):
                 why = "it is a plane in which Slicer shows the image"
-            found.others.append(OtherFind(shown, why))
+            found.others.append(finds.OtherFind(shown, why))
             continue
         if node.file is None or node.missing:
             why = node.missing or "the scene names no file for it: save the scene with its data"
-            found.others.append(OtherFind(shown, why))
+            found.others.append(finds.OtherFind(shown, why))
             continue
         try:
             _add(found, scene, node, shown)
         except (CmfsimError, OSError) as error:
             if node.kind == "model" and name_role(node.name).part not in {"", "other"}:
                 raise
-            found.others.append(OtherFind(shown, str(error)))
+            found.others.append(finds.OtherFind(shown, str(error)))
     _add_loose(found, scene, label)
 
 
-def _add(found: Gathered, scene: SlicerScene, node: SceneNode, shown: str) -> None:
+def _add(found: finds.Gathered, scene: SlicerScene, node: SceneNode, shown: str) -> None:
     if node.file is None:  # asked before
         raise AssertionError(node.name)
     chain = tuple(above.name for above in scene.chain(node))
@@ -216,22 +209,22 @@ def _add(found: Gathered, scene: SlicerScene, node: SceneNode, shown: str) -> No
     place: dict[str, Any] = {"to_world": matrix, "chain": chain, "in_scene": True}
     place["role"] = name_role(node.name)
     if node.kind == "model":
-        read = surface_find(node.file, shown)
+        read = finds.surface_find(node.file, shown)
         found.surfaces.append(replace(read, stated=read.stated or node.frame, **place))
     elif node.kind == "segmentation":
         _add_segments(found, node.file, shown, matrix, chain)
     elif node.kind == "volume":
-        image = image_find(node.file, shown)
+        image = finds.image_find(node.file, shown)
         if image.is_labels:
             _add_segments(found, node.file, shown, matrix, chain)
             return
         found.images.append(replace(image, **place))
     else:
-        found.landmarks.append(replace(landmark_find(node.file, shown), **place))
+        found.landmarks.append(replace(finds.landmark_find(node.file, shown), **place))
 
 
 def _add_segments(
-    found: Gathered, file: Path, shown: str, matrix: Floats, chain: tuple[str, ...]
+    found: finds.Gathered, file: Path, shown: str, matrix: Floats, chain: tuple[str, ...]
 ) -> None:
     """Adds the segments of a file, where the scene shows them."""
     surfaces, others = segment_finds([(file, shown)])
@@ -241,7 +234,7 @@ def _add_segments(
     ]
 
 
-def _add_loose(found: Gathered, scene: SlicerScene, label: str) -> None:
+def _add_loose(found: finds.Gathered, scene: SlicerScene, label: str) -> None:
     """Adds the transforms that nothing lies under."""
     for node in scene.of("transform"):
         below = tuple(other.name for other in scene.nodes.values() if other.parent == node.id)
@@ -252,6 +245,6 @@ def _add_loose(found: Gathered, scene: SlicerScene, label: str) -> None:
         try:
             matrix = scene.to_parent(node)
         except CmfsimError as error:
-            found.others.append(OtherFind(shown, str(error)))
+            found.others.append(finds.OtherFind(shown, str(error)))
             continue
-        found.loose.append(LooseMotion(shown, name_role(node.name), matrix))
+        found.loose.append(finds.LooseMotion(shown, name_role(node.name), matrix))

@@ -16,19 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.pictures import canvas
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
-from cmfsim.pictures.canvas import (
-    SIZE,
-    Picture,
-    Shown,
-    View,
-    add_scale_bar,
-    bounds,
-    draw,
-    drawn,
-    polydata,
-    write_whole,
-)
 from cmfsim.processes.worker import run_program
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import plan_lines
@@ -121,7 +110,9 @@ def picture_prediction(
     prediction_picture(prediction, size=size)(path)
 
 
-def prediction_picture(prediction: Prediction, *, size: tuple[int, int] = TWO_ROWS) -> Picture:
+def prediction_picture(
+    prediction: Prediction, *, size: tuple[int, int] = TWO_ROWS
+) -> canvas.Picture:
     """The picture that `picture_prediction` writes, to be drawn later."""
     return partial(
         picture_faces,
@@ -149,9 +140,9 @@ def picture_faces(
     moved = np.linalg.norm(after.vertices - before.vertices, axis=1)
     largest = max(float(moved.max()), LEAST_SCALE)
 
-    def paint(plotter: Any, view: View) -> None:
+    def paint(plotter: Any, view: canvas.View) -> None:
         surface = before if view.caption.startswith("before") else after
-        shape = polydata(surface.vertices, surface.triangles)
+        shape = canvas.polydata(surface.vertices, surface.triangles)
         shape.point_data["movement"] = moved
         if is_trimmed:
             shape = trimmed(shape, ends)
@@ -169,12 +160,12 @@ def picture_faces(
         )
         if view.direction == "left":
             # Before the forehead: the head fills the other side.
-            add_scale_bar(plotter, (0.03, 0.5), 4, "%.1f")
+            canvas.add_scale_bar(plotter, (0.03, 0.5), 4, "%.1f")
 
     names = ("before", "after", "movement")
-    views = tuple(View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
-    corners = ends.within(bounds([before.vertices, after.vertices]))
-    draw(path, views, corners, size, paint, columns=len(names))
+    views = tuple(canvas.View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
+    corners = ends.within(canvas.bounds([before.vertices, after.vertices]))
+    canvas.draw(path, views, corners, size, paint, columns=len(names))
 
 
 def prediction_html(prediction: Prediction) -> str:
@@ -191,7 +182,7 @@ def prediction_html(prediction: Prediction) -> str:
 
 
 def picture_plan(
-    path: str | os.PathLike[str], prediction: Prediction, *, size: tuple[int, int] = SIZE
+    path: str | os.PathLike[str], prediction: Prediction, *, size: tuple[int, int] = canvas.SIZE
 ) -> None:
     """Writes a picture of a plan: bone segments where they go, and behind them where they were.
 
@@ -211,8 +202,8 @@ def picture_plan(
 
 
 def plan_picture(
-    patient: PatientModel, motions: Mapping[str, Any], *, size: tuple[int, int] = SIZE
-) -> Picture:
+    patient: PatientModel, motions: Mapping[str, Any], *, size: tuple[int, int] = canvas.SIZE
+) -> canvas.Picture:
     """The picture that `picture_plan` writes, to be drawn later; `motions` as in a summary."""
     after = patient.planned_bones
     plan = {name: m["clinical"] for name, m in motions.items()}
@@ -244,22 +235,22 @@ def picture_motions(
 ) -> None:
     """Writes a picture of segments of bone before and after; see `picture_plan`."""
     colours = segment_colours(list(before))
-    corners = bounds([s.vertices for s in (*before.values(), *after.values())])
-    shown = Shown()
+    corners = canvas.bounds([s.vertices for s in (*before.values(), *after.values())])
+    shown = canvas.Shown()
 
     def ghost(plotter: Any, surface: SurfaceData) -> Any:
-        shape = polydata(surface.vertices, surface.triangles)
+        shape = canvas.polydata(surface.vertices, surface.triangles)
         return plotter.add_mesh(shape, color=GHOST_COLOUR, opacity=0.3, smooth_shading=True)
 
-    def paint(plotter: Any, _: View) -> None:
+    def paint(plotter: Any, _: canvas.View) -> None:
         for name, now in after.items():
             shown.add(plotter, name, partial(add_bone, plotter, now, colours[name]))
             if name not in still:
                 shown.add(plotter, f"{name} before", partial(ghost, plotter, before[name]))
 
-    views = tuple(View(name, name) for name in ("right", "front", "left"))
+    views = tuple(canvas.View(name, name) for name in ("right", "front", "left"))
     legend = [*colours.items(), ("before", GHOST_COLOUR)]
-    draw(path, views, corners, size, paint, legend=legend, words=words)
+    canvas.draw(path, views, corners, size, paint, legend=legend, words=words)
 
 
 # Pixels, even as films need it; pictures of the way, and how long each and both ends are seen, ms.
@@ -295,29 +286,29 @@ def animate_face(
     moving = np.linalg.norm(shift, axis=1) > MOVES
     if not moving.any():
         raise CaseInputError(f"{path.name}: no point of the face moves by more than {MOVES} mm")
-    corners = bounds([before.vertices[moving], after[moving]])
+    corners = canvas.bounds([before.vertices[moving], after[moving]])
     corners += AROUND * np.ptp(corners, axis=0) * np.array([[-1.0], [1.0]])
     frame = partial(_frame, path.name, colours, corners)
     frames = [
-        frame(share, polydata(before.vertices + share * shift, before.triangles))
+        frame(share, canvas.polydata(before.vertices + share * shift, before.triangles))
         # Slowly at both ends.
         for share in 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, STEPS + 1))
     ]
     frames += frames[-2:0:-1]
     times = [HELD if i % STEPS == 0 else EACH for i in range(len(frames))]
     data = _gif(frames, times) if ending == ".gif" else _film(path.name, frames, times)
-    write_whole(path, data)
+    canvas.write_whole(path, data)
 
 
 def _frame(
     name: str, colours: NDArray[np.uint8] | None, corners: Floats, share: float, shape: Any
 ) -> NDArray[np.uint8]:
-    def paint(plotter: Any, _: View) -> None:
+    def paint(plotter: Any, _: canvas.View) -> None:
         add_skin(plotter, shape, colours)
 
     way = {0.0: "before", 1.0: "after"}.get(round(share, 3), f"{share:.0%} of the way")
-    views = (View("front", f"{way}, front"), View("left", f"{way}, left"))
-    return drawn(name, views, corners, FILM_SIZE, paint)
+    views = (canvas.View("front", f"{way}, front"), canvas.View("left", f"{way}, left"))
+    return canvas.drawn(name, views, corners, FILM_SIZE, paint)
 
 
 def _gif(frames: Sequence[NDArray[np.uint8]], times: Sequence[int]) -> bytes:

@@ -10,24 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
+from cmfsim.pictures import canvas
 from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
-from cmfsim.pictures.canvas import (
-    LEGEND_ROW,
-    LETTER,
-    TEXT_SIZE,
-    View,
-    bounds,
-    draw,
-    polydata,
-    pyvista_module,
-)
 from cmfsim.values.checks import Floats, check_one_of
 from cmfsim.values.surface_data import SurfaceData
 
 # PyVista draws text of this size with letters twice as high, pixels.
 LABEL_SIZE = 8
 # From one line of text to the next, and from text to the edge of the view and to its line, pixels.
-ROW = LEGEND_ROW * LABEL_SIZE / TEXT_SIZE
+ROW = canvas.LEGEND_ROW * LABEL_SIZE / canvas.TEXT_SIZE
 GAP = 6.0
 LINE_COLOUR, DOT = "#333333", 7.0
 # Points as close to the middle of a view, of its width, belong to neither side.
@@ -76,7 +67,7 @@ class LabelPlaces:
 def column_width(names: Sequence[str]) -> float:
     """The width that the longest of some names takes, with a gap at either side, pixels."""
     longest = max((len(name) for name in names), default=0)
-    return longest * LETTER * LABEL_SIZE / TEXT_SIZE + 2.0 * GAP
+    return longest * canvas.LETTER * LABEL_SIZE / canvas.TEXT_SIZE + 2.0 * GAP
 
 
 def spread(heights: ArrayLike, gap: float, low: float, high: float) -> Floats:
@@ -144,7 +135,7 @@ def add_labels(plotter: Any, toward: Floats, labels: Sequence[Label]) -> None:
     """
     if not labels:
         return
-    pv = pyvista_module()
+    pv = canvas.pyvista_module()
     camera = plotter.camera
     low_x, low_y, high_x, high_y = plotter.renderer.GetViewport()
     width = (high_x - low_x) * plotter.window_size[0]
@@ -226,11 +217,11 @@ def picture_landmarks(
         size = (VIEW_SIZE[0] * len(views), VIEW_SIZE[1] * len(points))
     names = [name for sites in points.values() for name in sites]
     columns = 2.0 * column_width(names) / (size[0] / len(views))
-    corners = _room(bounds(everywhere), columns)
+    corners = _room(canvas.bounds(everywhere), columns)
     wrong = {kind: set((doubtful or {}).get(kind, ())) for kind in points}
     colours = segment_colours(list(bones))
 
-    def paint(plotter: Any, view: View) -> None:
+    def paint(plotter: Any, view: canvas.View) -> None:
         kind = "skin" if view.caption.startswith("skin") else "skull"
         if kind == "skull":
             for name, bone in bones.items():
@@ -239,10 +230,10 @@ def picture_landmarks(
             _add(plotter, skin, SKIN_COLOUR)
         _add_points(plotter, view, points[kind], wrong[kind])
 
-    panels = [View(name, f"{kind}, {name}") for kind in points for name in views]
+    panels = [canvas.View(name, f"{kind}, {name}") for kind in points for name in views]
     count = sum(len(names) for names in wrong.values())
     words = [f"Blue balls: landmarks. Red cubes with red names: doubtful ones ({count}) to check."]
-    draw(path, panels, corners, size, paint, columns=len(views), words=words)
+    canvas.draw(path, panels, corners, size, paint, columns=len(views), words=words)
 
 
 def _room(box: Floats, columns: float) -> Floats:
@@ -254,11 +245,15 @@ def _room(box: Floats, columns: float) -> Floats:
 
 
 def _add(plotter: Any, surface: SurfaceData, colour: str) -> None:
-    plotter.add_mesh(polydata(surface.vertices, surface.triangles), color=colour, specular=0.1)
+    plotter.add_mesh(
+        canvas.polydata(surface.vertices, surface.triangles), color=colour, specular=0.1
+    )
 
 
-def _add_points(plotter: Any, view: View, points: Mapping[str, Floats], doubtful: set[str]) -> None:
-    pv = pyvista_module()
+def _add_points(
+    plotter: Any, view: canvas.View, points: Mapping[str, Floats], doubtful: set[str]
+) -> None:
+    pv = canvas.pyvista_module()
     toward = np.array(VIEWS[view.direction])
     hidden = {"left": "_R", "right": "_L"}.get(view.direction)
     shown = {n: p for n, p in points.items() if hidden is None or not n.endswith(hidden)}

@@ -11,17 +11,8 @@ from typing import Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError
+from cmfsim.pictures import canvas
 from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
-from cmfsim.pictures.canvas import (
-    View,
-    bounds,
-    check_can_draw,
-    look_at,
-    polydata,
-    pyvista_module,
-    silent_vtk,
-    write_picture,
-)
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData, joined_surface
@@ -79,11 +70,11 @@ def prediction_parts(
 
 def prediction_blocks(prediction: Prediction) -> Any:
     """The surfaces and the tissue of a prediction as PyVista has them; see `to_pyvista`."""
-    pv, result = pyvista_module(), prediction.result
+    pv, result = canvas.pyvista_module(), prediction.result
     blocks = pv.MultiBlock()
     for parts in prediction.parts.values():
         for name, (surface, after) in parts.items():
-            blocks[name] = polydata(after, surface.triangles)
+            blocks[name] = canvas.polydata(after, surface.triangles)
             blocks[name].point_data["displacement"] = after - surface.vertices
     moved = result.nodes + result.displacements
     tissue = pv.UnstructuredGrid({pv.CellType.TETRA: result.tets.astype(np.int64)}, moved)
@@ -124,16 +115,16 @@ def view_parts(
             'screenshot="FILE.png" in Python)'
         )
     width, height = (int(as_positive("window size", n)) for n in size)
-    pv = pyvista_module()
-    check_can_draw("the window" if path is None else path.name)
-    corners = bounds([part.surface.vertices for part in parts])
-    with silent_vtk(), warnings.catch_warnings():
+    pv = canvas.pyvista_module()
+    canvas.check_can_draw("the window" if path is None else path.name)
+    corners = canvas.bounds([part.surface.vertices for part in parts])
+    with canvas.silent_vtk(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         plotter = pv.Plotter(off_screen=path is not None, window_size=[width, height], title=title)
         try:
             plotter.set_background("white")
             plotter.enable_anti_aliasing("ssaa")
-            look_at(plotter, View("left front", ""), corners, width / height)
+            canvas.look_at(plotter, canvas.View("left front", ""), corners, width / height)
             # A picture names what it shows; a window has a box for every part.
             named = [part for part in parts if part.shown or path is None]
             for part in parts:
@@ -149,7 +140,7 @@ def view_parts(
                     top = (row + 1) * ROW + LEFT - ROW + 4
                     colour = [int(part.colour[k : k + 2], 16) for k in (1, 3, 5)]
                     image[top : top + ROW - 10, LEFT : LEFT + ROW - 10] = colour
-                write_picture(path, image)
+                canvas.write_picture(path, image)
         finally:
             plotter.close()
 
@@ -162,7 +153,7 @@ def has_screen() -> bool:
 
 
 def _add(plotter: Any, part: ViewPart, unit: str) -> None:
-    shape = polydata(part.surface.vertices, part.surface.triangles)
+    shape = canvas.polydata(part.surface.vertices, part.surface.triangles)
     looks = {"smooth_shading": True, "ambient": 0.15, "opacity": part.opacity, "name": part.name}
     if part.values is None:
         plotter.add_mesh(shape, color=part.colour, **looks)

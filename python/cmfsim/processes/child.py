@@ -15,14 +15,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from cmfsim.processes.worker import (
-    SILENT,
-    Answer,
-    ReadLimits,
-    Worker,
-    WorkerEndedError,
-    WorkerFailedError,
-)
+from cmfsim.processes import worker
 
 # Imports the libraries of a task, in this processor time, s.
 LOADED, START = "cmfsim.processes.child:load", 60.0
@@ -39,7 +32,9 @@ class ReaderError(RuntimeError):
     """Why the child gave no answer: it crashed, or passed its limits."""
 
 
-def read_in_child(task: str, limits: ReadLimits | None = None, /, **arguments: Any) -> Answer:
+def read_in_child(
+    task: str, limits: worker.ReadLimits | None = None, /, **arguments: Any
+) -> worker.Answer:
     """The answer of a function of the package that is called in the child process.
 
     task: "module:function" within cmfsim; the `LIBRARIES` of the module are imported before its
@@ -52,12 +47,12 @@ def read_in_child(task: str, limits: ReadLimits | None = None, /, **arguments: A
     with _LOCK:
         child = _the_child()
         try:
-            limits = limits or ReadLimits()
-            child.ask(LOADED, {"task": task}, ReadLimits(START, limits.memory))
+            limits = limits or worker.ReadLimits()
+            child.ask(LOADED, {"task": task}, worker.ReadLimits(START, limits.memory))
             return child.ask(task, arguments, limits)
-        except WorkerEndedError as error:
+        except worker.WorkerEndedError as error:
             raise ReaderError(_reason(error)) from error
-        except WorkerFailedError as error:
+        except worker.WorkerFailedError as error:
             raise _error_of(error) from error
         finally:
             # Libraries that do not give memory back, as GDCM after damaged files.
@@ -74,7 +69,7 @@ def load(task: str) -> None:
             import_module(name)
 
 
-def _reason(ended: WorkerEndedError) -> str:
+def _reason(ended: worker.WorkerEndedError) -> str:
     if ended.late:
         return "reading it took longer than a file of this size should need"
     if ended.code < 0:
@@ -82,7 +77,7 @@ def _reason(ended: WorkerEndedError) -> str:
     return f"its reader ended with exit code {ended.code}"
 
 
-def _error_of(failed: WorkerFailedError) -> Exception:
+def _error_of(failed: worker.WorkerFailedError) -> Exception:
     """The error of a class that Python names, as it was raised in the child."""
     for kind in failed.kinds:
         if kind in PLAIN_ERRORS:
@@ -102,16 +97,16 @@ def _held_by(pid: int) -> int:
 
 
 _LOCK = threading.RLock()
-_children: list[Worker] = []
+_children: list[worker.Worker] = []
 
 
-def _the_child() -> Worker:
+def _the_child() -> worker.Worker:
     if not (_children and _children[0].alive):
         _end()
         if not sys.executable:
             message = "cannot be read here: this Python cannot start another (sys.executable)"
             raise ReaderError(message)
-        _children.append(Worker(log=SILENT))
+        _children.append(worker.Worker(log=worker.SILENT))
     return _children[0]
 
 

@@ -15,15 +15,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim._core import PRESETS
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    Floats,
-    Frozen,
-    as_direction,
-    as_point,
-    as_rows,
-    as_text,
-    check_one_of,
-)
+from cmfsim.values import checks
 from cmfsim.values.moduli import TissueModuli
 from cmfsim.values.tissue_data import DEFAULT_PRESET, MIXINGS
 
@@ -104,7 +96,7 @@ def stated(
 
 
 @dataclass(frozen=True, eq=False)
-class Plane(Frozen):
+class Plane(checks.Frozen):
     """A plane in space.
 
     point: (3,), mm, LPS.
@@ -112,16 +104,16 @@ class Plane(Frozen):
     Raises `CaseError`: Not three finite numbers, a normal of length zero.
     """
 
-    point: Floats
-    normal: Floats
+    point: checks.Floats
+    normal: checks.Floats
 
     def __init__(self, point: ArrayLike, normal: ArrayLike) -> None:
-        object.__setattr__(self, "point", as_point("plane point", point))
-        object.__setattr__(self, "normal", as_direction("plane normal", normal))
+        object.__setattr__(self, "point", checks.as_point("plane point", point))
+        object.__setattr__(self, "normal", checks.as_direction("plane normal", normal))
 
-    def distance(self, points: ArrayLike) -> Floats:
+    def distance(self, points: ArrayLike) -> checks.Floats:
         """The signed distances of (n, 3) points from the plane, mm: positive along its normal."""
-        offsets = as_rows("points", points, 3) - self.point
+        offsets = checks.as_rows("points", points, 3) - self.point
         return offsets @ self.normal
 
 
@@ -204,9 +196,9 @@ class CaseSurfaces:
     frame: str | None = stated(None, choices=FRAMES)
 
     def __post_init__(self) -> None:
-        check_one_of("units", self.units, tuple(UNITS))
+        checks.check_one_of("units", self.units, tuple(UNITS))
         if self.frame is not None:
-            check_one_of("frame", self.frame, FRAMES)
+            checks.check_one_of("frame", self.frame, FRAMES)
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
 
 
@@ -320,10 +312,10 @@ class CaseOsteotomy:
         if (self.procedure is None) == (self.plane is None):
             raise CaseInputError("an osteotomy is either a procedure or a plane")
         if self.procedure is not None:
-            check_one_of("procedure", self.procedure, tuple(PROCEDURES))
+            checks.check_one_of("procedure", self.procedure, tuple(PROCEDURES))
         else:
-            as_text("bone", self.bone)
-            as_text("name", self.name)
+            checks.as_text("bone", self.bone)
+            checks.as_text("name", self.name)
         object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
 
     @property
@@ -335,7 +327,7 @@ class CaseOsteotomy:
 
 
 @dataclass(frozen=True, eq=False)
-class CaseMotion(Frozen):
+class CaseMotion(checks.Frozen):
     """The motion of one segment: a matrix, a transform file, or a surface before and after.
 
     matrix: (4, 4), mm, or None, in LPS, whatever the frame of the case file's own numbers.
@@ -348,11 +340,11 @@ class CaseMotion(Frozen):
     typed: Whether the motion is given by translation, angle, axis and centre.
     """
 
-    matrix: Floats | None = None
+    matrix: checks.Floats | None = None
     transform: Path | None = None
     surface: Path | None = None
     moved_surface: Path | None = None
-    centre: Floats | None = None
+    centre: checks.Floats | None = None
     direction: str | None = None
     frame: str | None = None
     typed: bool = False
@@ -434,7 +426,7 @@ class CasePhoto:
     units: str = stated("mm", choices=UNITS)
 
     def __post_init__(self) -> None:
-        check_one_of("units", self.units, tuple(UNITS))
+        checks.check_one_of("units", self.units, tuple(UNITS))
 
 
 @dataclass(frozen=True)
@@ -468,7 +460,7 @@ class CasePostoperative:
             raise CaseInputError("post-operative data are either surfaces or an image, not both")
         if self.image is None and self.skin is None and not self.bones:
             raise CaseInputError("post-operative data need a skin, an image or a bone")
-        check_one_of("units", self.units, tuple(UNITS))
+        checks.check_one_of("units", self.units, tuple(UNITS))
         if self.frame is not None:
-            check_one_of("frame", self.frame, FRAMES)
+            checks.check_one_of("frame", self.frame, FRAMES)
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))

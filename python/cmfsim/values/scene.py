@@ -17,20 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    Floats,
-    Frozen,
-    Indices,
-    as_floats,
-    as_index_rows,
-    as_indices,
-    as_rows,
-    as_text,
-    check_instance,
-    check_one_of,
-    frozen,
-    listing,
-)
+from cmfsim.values import checks
 from cmfsim.values.motion import carried, rigid_matrix
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
@@ -43,7 +30,7 @@ DEFAULT_OPTIONS = SolverOptions()
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentData(Frozen):
+class SegmentData(checks.Frozen):
     """A bone segment: the nodes that it carries and the surface that others slide on.
 
     Attributes
@@ -65,10 +52,10 @@ class SegmentData(Frozen):
     [0, 4, 7]
     """
 
-    joined: Indices
-    sliding: Indices
+    joined: checks.Indices
+    sliding: checks.Indices
     contact: SurfaceData | None
-    gap: Floats | str
+    gap: checks.Floats | str
 
     def __init__(
         self,
@@ -77,28 +64,28 @@ class SegmentData(Frozen):
         contact: SurfaceData | None = None,
         gap: ArrayLike | str = 0.0,
     ) -> None:
-        object.__setattr__(self, "joined", as_indices("joined", joined))
-        object.__setattr__(self, "sliding", as_indices("sliding", sliding))
+        object.__setattr__(self, "joined", checks.as_indices("joined", joined))
+        object.__setattr__(self, "sliding", checks.as_indices("sliding", sliding))
         if contact is not None:
-            check_instance("contact", contact, SurfaceData)
+            checks.check_instance("contact", contact, SurfaceData)
         object.__setattr__(self, "contact", contact)
         object.__setattr__(self, "gap", self._checked_gap(gap))
 
-    def _checked_gap(self, gap: ArrayLike | str) -> Floats | str:
+    def _checked_gap(self, gap: ArrayLike | str) -> checks.Floats | str:
         if isinstance(gap, str):
-            check_one_of("gap", gap, ("rest",))
+            checks.check_one_of("gap", gap, ("rest",))
             return gap
-        distances = as_floats("gap", gap)
+        distances = checks.as_floats("gap", gap)
         if distances.shape not in {(), (len(self.sliding),)}:
             raise CaseInputError(
                 f"gap has shape {distances.shape}: one number or {len(self.sliding)} "
                 "(one per sliding node)"
             )
-        return frozen(distances)
+        return checks.frozen(distances)
 
 
 @dataclass(frozen=True, eq=False)
-class Scene(Frozen):
+class Scene(checks.Frozen):
     """Everything that one solve needs: mesh, tissue, node kinds, plan and options.
 
     Attributes
@@ -147,13 +134,13 @@ class Scene(Frozen):
     (4, 1)
     """
 
-    nodes: Floats
-    tets: Indices
+    nodes: checks.Floats
+    tets: checks.Indices
     tissue: TissueData
     segments: Mapping[str, SegmentData]
-    plan: Mapping[str, Floats | MovedSurface]
-    fixed: Indices
-    loads: Floats | None
+    plan: Mapping[str, checks.Floats | MovedSurface]
+    fixed: checks.Indices
+    loads: checks.Floats | None
     options: SolverOptions
     conflicts: str
     touching: tuple[TouchingData, ...]
@@ -174,22 +161,22 @@ class Scene(Frozen):
         obstacles: Iterable[ObstacleData] = (),
     ) -> None:
         keep = partial(object.__setattr__, self)
-        keep("nodes", as_rows("nodes", nodes, 3))
-        keep("tets", as_index_rows("tets", tets, 4, self.n_nodes, "nodes"))
-        keep("fixed", as_indices("fixed", fixed, self.n_nodes))
+        keep("nodes", checks.as_rows("nodes", nodes, 3))
+        keep("tets", checks.as_index_rows("tets", tets, 4, self.n_nodes, "nodes"))
+        keep("fixed", checks.as_indices("fixed", fixed, self.n_nodes))
         for name, value, kind in (
             ("tissue", tissue, TissueData),
             ("segments", segments, Mapping),
             ("plan", plan, Mapping),
             ("options", options, SolverOptions),
         ):
-            check_instance(name, value, kind)
+            checks.check_instance(name, value, kind)
         keep("tissue", tissue)
         keep("segments", MappingProxyType(dict(segments)))
         keep("options", options)
         self._check_parts()
         keep("loads", self._checked_loads(loads))
-        check_one_of("conflicts", conflicts, CONFLICTS)
+        checks.check_one_of("conflicts", conflicts, CONFLICTS)
         keep("conflicts", conflicts)
         keep("plan", MappingProxyType(self._checked_plan(plan)))
         keep("touching", tuple(touching))
@@ -204,15 +191,15 @@ class Scene(Frozen):
                     f"tissue {name} has {len(array)} rows: 1 or {self.n_tets} (one per tet) needed"
                 )
         for name, segment in self.segments.items():
-            as_text("segment name", name)
-            check_instance(f"segment {name!r}", segment, SegmentData)
+            checks.as_text("segment name", name)
+            checks.check_instance(f"segment {name!r}", segment, SegmentData)
             for kind in ("joined", "sliding"):
-                as_indices(f"segment {name!r} {kind}", getattr(segment, kind), self.n_nodes)
+                checks.as_indices(f"segment {name!r} {kind}", getattr(segment, kind), self.n_nodes)
 
-    def _checked_loads(self, loads: ArrayLike | None) -> Floats | None:
+    def _checked_loads(self, loads: ArrayLike | None) -> checks.Floats | None:
         if loads is None:
             return None
-        forces = as_rows("loads", loads, 3)
+        forces = checks.as_rows("loads", loads, 3)
         if len(forces) != self.n_nodes:
             raise CaseInputError(f"loads has {len(forces)} rows for {self.n_nodes} nodes")
         return forces
@@ -220,12 +207,14 @@ class Scene(Frozen):
     def _check_contact(self, n_nodes: int) -> None:
         """One-sided contact: nodes of the mesh, and segments that there are."""
         for number, touch in enumerate(self.touching):
-            check_instance(f"touching[{number}]", touch, TouchingData)
-            as_indices(f"touching[{number}] nodes", touch.nodes, n_nodes)
-            as_index_rows(f"touching[{number}] triangles", touch.triangles, 3, n_nodes, "nodes")
+            checks.check_instance(f"touching[{number}]", touch, TouchingData)
+            checks.as_indices(f"touching[{number}] nodes", touch.nodes, n_nodes)
+            checks.as_index_rows(
+                f"touching[{number}] triangles", touch.triangles, 3, n_nodes, "nodes"
+            )
         for number, obstacle in enumerate(self.obstacles):
-            check_instance(f"obstacles[{number}]", obstacle, ObstacleData)
-            as_indices(f"obstacles[{number}] nodes", obstacle.nodes, n_nodes)
+            checks.check_instance(f"obstacles[{number}]", obstacle, ObstacleData)
+            checks.as_indices(f"obstacles[{number}] nodes", obstacle.nodes, n_nodes)
             if obstacle.segment not in self.segments:
                 known = ", ".join(repr(s) for s in self.segments) or "none"
                 raise CaseInputError(
@@ -234,12 +223,12 @@ class Scene(Frozen):
 
     def _checked_plan(
         self, plan: Mapping[str, ArrayLike | MovedSurface]
-    ) -> dict[str, Floats | MovedSurface]:
+    ) -> dict[str, checks.Floats | MovedSurface]:
         for name in plan:
             if name not in self.segments:
                 known = ", ".join(repr(s) for s in self.segments) or "none"
                 raise CaseInputError(f"plan names segment {name!r}; segments are: {known}")
-        checked: dict[str, Floats | MovedSurface] = {}
+        checked: dict[str, checks.Floats | MovedSurface] = {}
         for name, segment in self.segments.items():
             if name not in plan:
                 raise CaseInputError(
@@ -249,7 +238,7 @@ class Scene(Frozen):
             if isinstance(motion, MovedSurface):
                 checked[name] = motion
                 continue
-            array = as_floats(f"plan of segment {name!r}", motion)
+            array = checks.as_floats(f"plan of segment {name!r}", motion)
             joined = len(segment.joined)
             if array.shape not in {(4, 4), (joined, 3)}:
                 raise CaseInputError(
@@ -258,7 +247,7 @@ class Scene(Frozen):
                 )
             if array.shape == (4, 4):
                 array = rigid_matrix(array, f"plan of segment {name!r}")
-            checked[name] = frozen(array)
+            checked[name] = checks.frozen(array)
         return checked
 
     def __repr__(self) -> str:
@@ -276,7 +265,7 @@ class Scene(Frozen):
             "plan": self.plan_text(),
             "solver": f"{options.method}, {options.kinematics}, element {options.element}",
         }
-        return listing("Scene", rows)
+        return checks.listing("Scene", rows)
 
     @property
     def _is_uniform(self) -> bool:
@@ -394,7 +383,7 @@ class Scene(Frozen):
 
 
 @dataclass(frozen=True, eq=False)
-class SceneResult(Frozen):
+class SceneResult(checks.Frozen):
     """The solution of a scene, with the data needed to draw it and to trace its origin.
 
     Attributes
@@ -420,17 +409,17 @@ class SceneResult(Frozen):
         findings of the solution, timings, versions and the SHA-256 of the scene's content.
     """
 
-    nodes: Floats
-    tets: Indices
-    skin_triangles: Indices
-    displacements: Floats
-    forces: Floats
-    residual_history: Floats
-    contact_nodes: Indices
-    contact_points: Floats
-    contact_normals: Floats
-    contact_forces: Floats
-    contact_gaps: Floats
+    nodes: checks.Floats
+    tets: checks.Indices
+    skin_triangles: checks.Indices
+    displacements: checks.Floats
+    forces: checks.Floats
+    residual_history: checks.Floats
+    contact_nodes: checks.Indices
+    contact_points: checks.Floats
+    contact_normals: checks.Floats
+    contact_forces: checks.Floats
+    contact_gaps: checks.Floats
     summary: Mapping[str, Any]
 
     def __repr__(self) -> str:
@@ -444,7 +433,7 @@ class SceneResult(Frozen):
             "error": "" if error is None else f"estimated at {error:.1g} mm",
             "contact": f"{len(self.contact_nodes)} nodes" if len(self.contact_nodes) else "",
         }
-        return listing("SceneResult", rows)
+        return checks.listing("SceneResult", rows)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Every array of the result by its name."""

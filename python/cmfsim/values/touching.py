@@ -7,22 +7,14 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.values.checks import (
-    Frozen,
-    Indices,
-    as_index_rows,
-    as_indices,
-    as_text,
-    check_instance,
-    frozen,
-)
+from cmfsim.values import checks
 from cmfsim.values.surface_data import SurfaceData
 
 LIPS = ("upper", "lower")
 
 
 @dataclass(frozen=True, eq=False)
-class LipRegion(Frozen):
+class LipRegion(checks.Frozen):
     """One lip on the boundary of a mesh that was separated between the lips.
 
     Attributes
@@ -43,12 +35,14 @@ class LipRegion(Frozen):
 
     def __post_init__(self) -> None:
         for name in ("triangles", "nodes"):
-            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), np.uint32)))
+            object.__setattr__(
+                self, name, checks.frozen(np.asarray(getattr(self, name), np.uint32))
+            )
         object.__setattr__(self, "released", MappingProxyType(dict(self.released)))
 
 
 @dataclass(frozen=True, eq=False)
-class TouchingData(Frozen):
+class TouchingData(checks.Frozen):
     """Nodes that may not enter other tissue: of one lip, before the surface of the other.
 
     Contact is one-sided and without friction: nodes may lift off.
@@ -67,20 +61,20 @@ class TouchingData(Frozen):
     [7, 9]
     """
 
-    nodes: Indices
-    triangles: Indices
+    nodes: checks.Indices
+    triangles: checks.Indices
 
     def __init__(self, nodes: ArrayLike, triangles: ArrayLike) -> None:
-        touching = as_indices("nodes that touch", nodes)
+        touching = checks.as_indices("nodes that touch", nodes)
         given = np.asarray(triangles)
         count = 1 + int(given.max(initial=0)) if given.dtype.kind in "iu" else 0
-        corners = as_index_rows("triangles that are touched", given, 3, count, "nodes")
+        corners = checks.as_index_rows("triangles that are touched", given, 3, count, "nodes")
         object.__setattr__(self, "nodes", touching)
         object.__setattr__(self, "triangles", corners)
 
 
 @dataclass(frozen=True, eq=False)
-class ObstacleData(Frozen):
+class ObstacleData(checks.Frozen):
     """Nodes that may not enter behind a surface that moves with a segment: lips before teeth.
 
     Contact is one-sided and without friction: nodes may lift off. Behind the border of an open
@@ -102,13 +96,13 @@ class ObstacleData(Frozen):
     'maxilla'
     """
 
-    nodes: Indices
+    nodes: checks.Indices
     segment: str
     surface: SurfaceData
 
     def __init__(self, nodes: ArrayLike, segment: str, surface: SurfaceData) -> None:
-        as_text("segment of an obstacle", segment)
-        check_instance("surface of an obstacle", surface, SurfaceData)
-        object.__setattr__(self, "nodes", as_indices("nodes before an obstacle", nodes))
+        checks.as_text("segment of an obstacle", segment)
+        checks.check_instance("surface of an obstacle", surface, SurfaceData)
+        object.__setattr__(self, "nodes", checks.as_indices("nodes before an obstacle", nodes))
         object.__setattr__(self, "segment", segment)
         object.__setattr__(self, "surface", surface)

@@ -18,17 +18,7 @@ from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
 from cmfsim.io.results.predictions import predictions_of
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
-from cmfsim.pipeline.outputs.results import (
-    REPORT_STAGE,
-    WrittenPrediction,
-    WrittenResults,
-    results_folder,
-    write_animation,
-    write_case_report,
-    write_chart_page,
-    write_dicom_page,
-    write_results,
-)
+from cmfsim.pipeline.outputs import results
 from cmfsim.pipeline.predicting import predict_models, prepare
 from cmfsim.report import Note, Table
 from cmfsim.report.band import band_blocks, summary_blocks
@@ -64,7 +54,7 @@ def predict(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
     each = (f"{work} {model}" for model in models for work in ("solving", "writing"))
-    expected = expected_stages(*each, REPORT_STAGE)
+    expected = expected_stages(*each, results.REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         predicted = partial(
             predict_models,
@@ -76,7 +66,7 @@ def predict(options: argparse.Namespace) -> int:
             observer=notices,
             band=band,
         )
-        written = write_results(
+        written = results.write_results(
             case.output,
             lambda early: _timed(_at_least_one(predicted(**early), notices.failures), before),
             models,
@@ -129,7 +119,7 @@ def evaluate(options: argparse.Namespace) -> int:
     notices = Notices(quiet=options.quiet)
     findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
     each = (f"{work} {model}" for work in ("solving", "writing") for model in models)
-    expected = expected_stages(*each, "writing the comparison", REPORT_STAGE)
+    expected = expected_stages(*each, "writing the comparison", results.REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         found = evaluate_case(
             case,
@@ -140,7 +130,7 @@ def evaluate(options: argparse.Namespace) -> int:
             observer=notices,
             fit_thickness=options.fit_thickness,
         )
-        written = write_results(
+        written = results.write_results(
             case.output,
             found.predictions,
             models,
@@ -164,7 +154,7 @@ def evaluate(options: argparse.Namespace) -> int:
     return code
 
 
-def _end(notices: Notices, output: Path, written: WrittenResults) -> None:
+def _end(notices: Notices, output: Path, written: results.WrittenResults) -> None:
     """Prints doubtful findings again, below the figures."""
     place = written.predictions[0].place
     where = written.report or f"{place}/prediction.json".lstrip("/")
@@ -312,16 +302,16 @@ def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
 
 def report(options: argparse.Namespace) -> int:
     """Regenerates the report of a folder of results, or of a case that has them."""
-    folder = results_folder(options.folder)
+    folder = results.results_folder(options.folder)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("writing the report")
-        name = write_case_report(folder)
-        pages = {"pdf": write_chart_page(folder)} if options.pdf else {}
+        name = results.write_case_report(folder)
+        pages = {"pdf": results.write_chart_page(folder)} if options.pdf else {}
         if options.dicom is not None:
-            pages["dicom"] = write_dicom_page(folder, options.dicom)
+            pages["dicom"] = results.write_dicom_page(folder, options.dicom)
         if options.animation is not None:
             progress.stage("drawing the animation")
-            write_animation(folder, options.animation)
+            results.write_animation(folder, options.animation)
             pages["animation"] = str(options.animation.absolute())
     if name is None:
         return FAILED
@@ -334,7 +324,7 @@ def report(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _figures(entry: WrittenPrediction, output: Path) -> dict[str, Any]:
+def _figures(entry: results.WrittenPrediction, output: Path) -> dict[str, Any]:
     solution = entry.summary["solution"]
     return {
         "model": entry.summary["model"],

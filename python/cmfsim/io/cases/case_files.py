@@ -11,38 +11,11 @@ from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from cmfsim.errors import CaseInputError
+from cmfsim.io.cases import case_tables
 from cmfsim.io.cases.case_plans import is_achieved, osteotomies_of, plan_of
-from cmfsim.io.cases.case_tables import (
-    image_of,
-    landmarks_of,
-    lips_of,
-    mesh_of,
-    muscles_of,
-    node_kinds_of,
-    output_folder,
-    photo_of,
-    postoperative_of,
-    region_of,
-    solver_of,
-    surfaces_of,
-    tissue_of,
-)
 from cmfsim.io.cases.tables import CaseChanges, Table, read_tables
 from cmfsim.io.files.reading_writing import is_there
-from cmfsim.values.case_parts import (
-    CaseBand,
-    CaseImage,
-    CaseLandmarks,
-    CaseLips,
-    CaseMesh,
-    CaseMotion,
-    CaseMuscles,
-    CaseOsteotomy,
-    CasePhoto,
-    CasePostoperative,
-    CaseSurfaces,
-    Region,
-)
+from cmfsim.values import case_parts
 from cmfsim.values.checks import as_text, listing
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import TissueData
@@ -106,22 +79,22 @@ class Case:
     name: str
     file: Path
     output: Path
-    image: CaseImage | None = None
-    surfaces: CaseSurfaces | None = None
-    landmarks: CaseLandmarks = field(default_factory=CaseLandmarks)
-    region: Region = field(default_factory=Region)
-    mesh: CaseMesh = field(default_factory=CaseMesh)
-    lips: CaseLips = field(default_factory=CaseLips)
-    osteotomies: tuple[CaseOsteotomy, ...] = ()
-    plan: Mapping[str, CaseMotion] = field(default_factory=dict)
+    image: case_parts.CaseImage | None = None
+    surfaces: case_parts.CaseSurfaces | None = None
+    landmarks: case_parts.CaseLandmarks = field(default_factory=case_parts.CaseLandmarks)
+    region: case_parts.Region = field(default_factory=case_parts.Region)
+    mesh: case_parts.CaseMesh = field(default_factory=case_parts.CaseMesh)
+    lips: case_parts.CaseLips = field(default_factory=case_parts.CaseLips)
+    osteotomies: tuple[case_parts.CaseOsteotomy, ...] = ()
+    plan: Mapping[str, case_parts.CaseMotion] = field(default_factory=dict)
     achieved: bool = False
     node_kinds: Mapping[str, Any] = field(default_factory=dict)
     tissue: TissueData | None = None
-    muscles: CaseMuscles | None = None
+    muscles: case_parts.CaseMuscles | None = None
     solver: SolverOptions = field(default_factory=SolverOptions)
-    band: CaseBand = field(default_factory=CaseBand)
-    postoperative: CasePostoperative | None = None
-    photo: CasePhoto | None = None
+    band: case_parts.CaseBand = field(default_factory=case_parts.CaseBand)
+    postoperative: case_parts.CasePostoperative | None = None
+    photo: case_parts.CasePhoto | None = None
     note: str = ""
     places: Mapping[str, str] = field(default_factory=dict)
 
@@ -155,7 +128,7 @@ class Case:
         """The fat of the case: `tissue`, or that of the preset of its muscles."""
         if self.tissue is not None:
             return self.tissue
-        muscles = CaseMuscles() if self.muscles is None else self.muscles
+        muscles = case_parts.CaseMuscles() if self.muscles is None else self.muscles
         return TissueData("preset", preset=muscles.preset, fraction=0.0)
 
     @classmethod
@@ -262,23 +235,25 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
     return Case(
         name=document.text("name", path.resolve().parent.name or "case"),
         file=path,
-        output=output_folder(document.table("output").only("folder"), folder),
-        image=given("image", image_of),
-        surfaces=given("surfaces", surfaces_of),
-        landmarks=landmarks_of(document.table("landmarks"), folder),
-        region=region_of(document.table("region"), folder),
-        mesh=mesh_of(document.table("mesh"), folder),
-        lips=lips_of(document, folder),
+        output=case_tables.output_folder(document.table("output").only("folder"), folder),
+        image=given("image", case_tables.image_of),
+        surfaces=given("surfaces", case_tables.surfaces_of),
+        landmarks=case_tables.landmarks_of(document.table("landmarks"), folder),
+        region=case_tables.region_of(document.table("region"), folder),
+        mesh=case_tables.mesh_of(document.table("mesh"), folder),
+        lips=case_tables.lips_of(document, folder),
         osteotomies=osteotomies_of(document),
         plan={} if is_achieved(document) else plan_of(document, folder),
         achieved=is_achieved(document),
-        node_kinds=node_kinds_of(document.table("node_kinds")),
-        tissue=tissue_of(document.table("tissue")),
-        muscles=given("muscles", muscles_of),
-        solver=solver_of(document.table("solver")),
-        band=replace(document.table("band").part(CaseBand, folder), asked="band" in document),
-        postoperative=given("postoperative", postoperative_of),
-        photo=given("photo", photo_of),
+        node_kinds=case_tables.node_kinds_of(document.table("node_kinds")),
+        tissue=case_tables.tissue_of(document.table("tissue")),
+        muscles=given("muscles", case_tables.muscles_of),
+        solver=case_tables.solver_of(document.table("solver")),
+        band=replace(
+            document.table("band").part(case_parts.CaseBand, folder), asked="band" in document
+        ),
+        postoperative=given("postoperative", case_tables.postoperative_of),
+        photo=given("photo", case_tables.photo_of),
         note=document.text("note") if "note" in document else "",
         places=document.all_places(),
     )

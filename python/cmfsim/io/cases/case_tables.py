@@ -7,20 +7,7 @@ from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, PRESETS
 from cmfsim.errors import CaseInputError
 from cmfsim.io.cases.tables import Table
 from cmfsim.io.files.reading_writing import is_there
-from cmfsim.values.case_parts import (
-    FRAMES,
-    LIP_SEAMS,
-    CaseImage,
-    CaseLandmarks,
-    CaseLips,
-    CaseMesh,
-    CaseMuscles,
-    CasePhoto,
-    CasePostoperative,
-    CaseSurfaces,
-    Plane,
-    Region,
-)
+from cmfsim.values import case_parts
 from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE, MuscleModuli, TissueModuli
 from cmfsim.values.solver_options import CONTACTS, SolverOptions
 from cmfsim.values.tissue_data import TissueData
@@ -34,7 +21,7 @@ MOST_INTERCEPT = 1e5
 
 def stated_frame(table: Table) -> str | None:
     """The frame of numbers or files, where the case states it."""
-    return table.text("frame", choices=FRAMES) if "frame" in table else None
+    return table.text("frame", choices=case_parts.FRAMES) if "frame" in table else None
 
 
 def output_folder(table: Table, folder: Path) -> Path:
@@ -54,10 +41,10 @@ def output_folder(table: Table, folder: Path) -> Path:
     return folder / relative
 
 
-def image_of(table: Table, folder: Path) -> CaseImage:
+def image_of(table: Table, folder: Path) -> case_parts.CaseImage:
     """The image of [image], with how its values become HU."""
     series, rescale = _dicom_series(table), _rescale(table)
-    image = table.part(CaseImage, folder, series=series, rescale=rescale)
+    image = table.part(case_parts.CaseImage, folder, series=series, rescale=rescale)
     for low, high in (("skin", "bone"), ("bone", "metal")):
         small, large = (getattr(image, f"{name}_threshold") for name in (low, high))
         if small is not None and large is not None and small >= large:
@@ -95,15 +82,15 @@ def _dicom_series(table: Table) -> str | None:
     return str(given)
 
 
-def surfaces_of(table: Table, folder: Path) -> CaseSurfaces:
+def surfaces_of(table: Table, folder: Path) -> case_parts.CaseSurfaces:
     """The skin and the bones of [surfaces], with their unit and frame."""
-    table.only(*CaseSurfaces.__dataclass_fields__)
+    table.only(*case_parts.CaseSurfaces.__dataclass_fields__)
     if not list(table.table("bones")):
         table.fail(
             "bones" if "bones" in table else None,
             'names no bone: add a line such as cranium = "file.ply"',
         )
-    return table.part(CaseSurfaces, folder, bones=_bones(table, folder))
+    return table.part(case_parts.CaseSurfaces, folder, bones=_bones(table, folder))
 
 
 def _bones(table: Table, folder: Path) -> dict[str, Path]:
@@ -121,7 +108,7 @@ def checked_name(table: Table, key: str, name: str) -> str:
     return name
 
 
-def landmarks_of(table: Table, folder: Path) -> CaseLandmarks:
+def landmarks_of(table: Table, folder: Path) -> case_parts.CaseLandmarks:
     """The files of [landmarks], and whether missing ones are to be found."""
     automatic = table.plain("automatic") if "automatic" in table else True
     if not isinstance(automatic, bool) and automatic != "missing":
@@ -130,44 +117,44 @@ def landmarks_of(table: Table, folder: Path) -> CaseLandmarks:
     if not isinstance(heads, list) or not all(isinstance(n, str) and n.strip() for n in heads):
         table.fail("templates", f'is {heads!r}: a list of folders, such as ["heads/a", "heads/b"]')
     templates = tuple(folder / name for name in heads)
-    return table.part(CaseLandmarks, folder, automatic=automatic, templates=templates)
+    return table.part(case_parts.CaseLandmarks, folder, automatic=automatic, templates=templates)
 
 
-def plane_of(table: Table, key: str) -> Plane:
+def plane_of(table: Table, key: str) -> case_parts.Plane:
     """The plane of a table with a point and a normal."""
     plane = table.table(key).only("point", "normal")
     point, normal = plane.vector("point"), plane.vector("normal")
     if point is None or normal is None:
         table.fail(key, "needs point = [x, y, z] and normal = [x, y, z]")
     with table.at(key):
-        return Plane(point, normal)
+        return case_parts.Plane(point, normal)
 
 
-def region_of(table: Table, folder: Path) -> Region:
+def region_of(table: Table, folder: Path) -> case_parts.Region:
     """The part of the head that is meshed, from [region]."""
     if "posterior_plane" in table and "posterior_depth" in table:
         table.fail("posterior_depth", "is given together with posterior_plane: give one of them")
     plane = plane_of(table, "posterior_plane") if "posterior_plane" in table else None
-    return table.part(Region, folder, at="lower", posterior_plane=plane)
+    return table.part(case_parts.Region, folder, at="lower", posterior_plane=plane)
 
 
-def mesh_of(table: Table, folder: Path) -> CaseMesh:
+def mesh_of(table: Table, folder: Path) -> case_parts.CaseMesh:
     """The edge lengths of [mesh], or its own mesh."""
     parting = None
     if "parting" in table:
         parting = table.table("parting").only("surface").path("surface", folder)
-    return table.part(CaseMesh, folder, parting=parting)
+    return table.part(case_parts.CaseMesh, folder, parting=parting)
 
 
-def lips_of(document: Table, folder: Path) -> CaseLips:
+def lips_of(document: Table, folder: Path) -> case_parts.CaseLips:
     """Whether and where lips are separated; a seam is a way to find it, or a surface."""
     table = document.table("lips")
     seam: Path | str | None = table.text("seam") if "seam" in table else None
-    if seam is not None and seam not in LIP_SEAMS:
+    if seam is not None and seam not in case_parts.LIP_SEAMS:
         seam = table.path("seam", folder)
         if "parting" in document.table("mesh"):
             table.fail("seam", "is a surface, as is parting in [mesh]: give one of them")
-    return table.part(CaseLips, folder, seam=seam)
+    return table.part(case_parts.CaseLips, folder, seam=seam)
 
 
 def node_kinds_of(table: Table) -> dict[str, Any]:
@@ -196,13 +183,13 @@ def tissue_of(table: Table) -> TissueData | None:
     return TissueData("isotropic", young=young, poisson=poisson)
 
 
-def muscles_of(table: Table, folder: Path) -> CaseMuscles:
+def muscles_of(table: Table, folder: Path) -> case_parts.CaseMuscles:
     """A template's name is that of one in the package; a path leads to a folder."""
-    template: Path | str = table.text("template", str(CaseMuscles().template))
-    if template != CaseMuscles().template:
+    template: Path | str = table.text("template", str(case_parts.CaseMuscles().template))
+    if template != case_parts.CaseMuscles().template:
         template = table.path("template", folder)
     moduli = _muscle_moduli(table)
-    return table.part(CaseMuscles, folder, MODULI, template=template, moduli=moduli)
+    return table.part(case_parts.CaseMuscles, folder, MODULI, template=template, moduli=moduli)
 
 
 def _muscle_moduli(table: Table) -> TissueModuli:
@@ -218,13 +205,13 @@ def _muscle_moduli(table: Table) -> TissueModuli:
         muscle=given(table), muscles={name: given(each.table(name).only(*MODULI)) for name in each}
     )
     with table.at("moduli" if "moduli" in table else None):
-        moduli.resolved(table.text("preset", CaseMuscles().preset, PRESETS))
+        moduli.resolved(table.text("preset", case_parts.CaseMuscles().preset, PRESETS))
     return moduli
 
 
-def photo_of(table: Table, folder: Path) -> CasePhoto:
+def photo_of(table: Table, folder: Path) -> case_parts.CasePhoto:
     """The 3D photo of [photo]."""
-    photo = table.part(CasePhoto, folder)
+    photo = table.part(case_parts.CasePhoto, folder)
     if photo.aligned == (photo.landmarks is not None):
         table.fail(
             "aligned" if photo.aligned else None,
@@ -234,9 +221,9 @@ def photo_of(table: Table, folder: Path) -> CasePhoto:
     return photo
 
 
-def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
+def postoperative_of(table: Table, folder: Path) -> case_parts.CasePostoperative:
     """The face and bones after the operation, from [postoperative]."""
-    table.only(*CasePostoperative.__dataclass_fields__)
+    table.only(*case_parts.CasePostoperative.__dataclass_fields__)
     bones = _bones(table, folder)
     if "skin" in table and "image" in table:
         table.fail("image", "is given together with skin: give one of them")
@@ -249,7 +236,9 @@ def postoperative_of(table: Table, folder: Path) -> CasePostoperative:
         table.fail("series", "chooses among the DICOM series of an image, but there is no image")
     if "skin" not in table and "image" not in table and not bones:
         table.fail(None, "needs skin, image or bones")
-    return table.part(CasePostoperative, folder, bones=bones, series=_dicom_series(table))
+    return table.part(
+        case_parts.CasePostoperative, folder, bones=bones, series=_dicom_series(table)
+    )
 
 
 def solver_of(table: Table) -> SolverOptions:

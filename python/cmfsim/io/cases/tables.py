@@ -15,18 +15,7 @@ from typing import Any, NoReturn, TypeVar, get_type_hints
 import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.files.reading_writing import (
-    FORMAT_VERSION,
-    LINE_IN_MESSAGE,
-    check_numbers,
-    check_plain_toml,
-    check_readable,
-    is_there,
-    named,
-    toml_hint,
-    toml_module,
-    utf8_text,
-)
+from cmfsim.io.files import reading_writing
 from cmfsim.io.files.toml_lines import KeyPath, line_of, toml_lines
 from cmfsim.values.checks import Floats, nearest
 
@@ -101,7 +90,7 @@ def read_tables(path: Path) -> "Table":
     Raises `FileNotFoundError`: The file does not exist.
     Raises `CaseError`: Not TOML, not UTF-8, larger than 1 MiB, a pipe, keys of many parts.
     """
-    check_readable(path)
+    reading_writing.check_readable(path)
     if path.suffix != ".toml":
         raise CaseInputError(f"{path.name}: a case file ends in .toml, not {path.suffix!r}")
     if path.stat().st_size > MAX_CASE_TEXT:
@@ -109,21 +98,21 @@ def read_tables(path: Path) -> "Table":
             f"{path.name}: has {path.stat().st_size} bytes, a case file at most {MAX_CASE_TEXT}"
         )
     try:
-        with named(path):
-            text = utf8_text(path.read_bytes()).replace("\r\n", "\n")
-            check_plain_toml(text)
-        values = toml_module().loads(text)
-        with named(path):
-            check_numbers(values)
+        with reading_writing.named(path):
+            text = reading_writing.utf8_text(path.read_bytes()).replace("\r\n", "\n")
+            reading_writing.check_plain_toml(text)
+        values = reading_writing.toml_module().loads(text)
+        with reading_writing.named(path):
+            reading_writing.check_numbers(values)
     except RecursionError as error:
         raise CaseInputError(f"{path.name}: is nested too deeply") from error
     except ValueError as error:
         if isinstance(error, CaseInputError):
             raise
         message = str(error)
-        found = LINE_IN_MESSAGE.search(message)
+        found = reading_writing.LINE_IN_MESSAGE.search(message)
         place = f":{found[1]}" if found else ""
-        hint = toml_hint(text, message)
+        hint = reading_writing.toml_hint(text, message)
         raise CaseInputError(f"{path.name}{place}: is not TOML: {message}{hint}") from error
     lines = toml_lines(text)
     _refuse_undecided(values, lines, text, path.name)
@@ -294,9 +283,11 @@ class Table:
         found = self.text("format")
         if found != name:
             self.fail("format", f"is {found!r}: {name!r} is needed")
-        version = self.need("version", f": write version = {FORMAT_VERSION}")
-        if isinstance(version, bool) or version != FORMAT_VERSION:
-            self.fail("version", f"is {version!r}: this cmfsim reads {FORMAT_VERSION}")
+        version = self.need("version", f": write version = {reading_writing.FORMAT_VERSION}")
+        if isinstance(version, bool) or version != reading_writing.FORMAT_VERSION:
+            self.fail(
+                "version", f"is {version!r}: this cmfsim reads {reading_writing.FORMAT_VERSION}"
+            )
 
     def text(self, key: str, default: str | None = None, choices: tuple[str, ...] = ()) -> str:
         """A text that is not empty, among the choices if there are any."""
@@ -400,7 +391,7 @@ class Table:
         except RuntimeError:
             self.fail(key, f"is {name!r}: no user has this name; write the full path")
         try:
-            found = is_there(path)
+            found = reading_writing.is_there(path)
         except CaseInputError as error:
             self.fail(key, f"names {error}")
         if not found and any(ord(c) < BLANK for c in name):

@@ -12,17 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
+from cmfsim.io.files import summaries
 from cmfsim.io.files.reading_writing import replacing
-from cmfsim.io.files.summaries import (
-    COUNT,
-    FINDING,
-    SOME,
-    Maybe,
-    Span,
-    check,
-    checked_file,
-    read_summary,
-)
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.vtk.writing import write_triangles
 from cmfsim.values.checks import Floats, as_floats, as_rows, frozen
@@ -42,34 +33,34 @@ AGAIN = "run cmfsim evaluate again"
 MOST_PICTURE = 64 * 2**20
 PNG = b"\x89PNG\r\n\x1a\n"
 
-_LENGTH, _SHARE = Span(0.0, 1e6), Span(0.0, 1.0)
+_LENGTH, _SHARE = summaries.Span(0.0, 1e6), summaries.Span(0.0, 1.0)
 _STATISTICS = {
     **dict.fromkeys(
         ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm"), _LENGTH
     ),
-    "signed_mean_mm": Span(-1e6, 1e6),
+    "signed_mean_mm": summaries.Span(-1e6, 1e6),
     "within": {"2 mm": _SHARE, **dict.fromkeys(("1 mm?", "1.5 mm?", "3 mm?"), _SHARE)},
-    "count?": COUNT,
+    "count?": summaries.COUNT,
 }
-_ERRORS = {"regions": {"whole": _STATISTICS, SOME: _STATISTICS}}
+_ERRORS = {"regions": {"whole": _STATISTICS, summaries.SOME: _STATISTICS}}
 _EVALUATION = {
     **dict.fromkeys(("case", "key", "case_key"), str),
     "models": {frozenset(MODELS): _ERRORS},
     "failed": {frozenset(MODELS): str},
     "files": [EVALUATION_FILES],
-    "not_operated?": Maybe({"regions": {str: _STATISTICS}}),
+    "not_operated?": summaries.Maybe({"regions": {str: _STATISTICS}}),
     "thickness?": {
-        "share_of_depth": Span(-1.0, 1.0),
-        "vertices": COUNT,
+        "share_of_depth": summaries.Span(-1.0, 1.0),
+        "vertices": summaries.COUNT,
         **dict.fromkeys(("mean_depth_mm", "mean_before_mm", "mean_after_mm"), _LENGTH),
         "mean_mm": {str: {str: _LENGTH}},
     },
     "no_change?": _ERRORS,
-    "wilcoxon?": {str: {"p": Maybe(_SHARE)}},
+    "wilcoxon?": {str: {"p": summaries.Maybe(_SHARE)}},
     "notes?": [str],
     "warnings?": [str],
-    "seconds?": {str: Span(0.0, 1e9)},
-    "findings?": [FINDING],
+    "seconds?": {str: summaries.Span(0.0, 1e9)},
+    "findings?": [summaries.FINDING],
 }
 
 
@@ -139,7 +130,7 @@ def read_skin_errors(
     Raises `FileNotFoundError`: The file is missing.
     Raises `CaseError`: It is none of that evaluation, was changed, or holds no distances.
     """
-    path = checked_file(Path(folder), evaluation, skin_errors_file(model), AGAIN)
+    path = summaries.checked_file(Path(folder), evaluation, skin_errors_file(model), AGAIN)
     mesh = read_mesh(path)
     missing = [name for name in (DISTANCE, EVALUATED) if name not in mesh.point_data]
     if missing or "triangle" not in mesh.cells_dict:
@@ -167,7 +158,7 @@ def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any]:
     Raises `FileNotFoundError`: There is none.
     Raises `CaseError`: It was changed, or holds what an evaluation does not.
     """
-    return read_summary(Path(folder) / EVALUATION_FILE, _EVALUATION, AGAIN)
+    return summaries.read_summary(Path(folder) / EVALUATION_FILE, _EVALUATION, AGAIN)
 
 
 def read_evaluation_picture(
@@ -178,8 +169,8 @@ def read_evaluation_picture(
     Raises `FileNotFoundError`: It is missing.
     Raises `CaseError`: It is none of that evaluation, or no PNG.
     """
-    check("files", name, EVALUATION_FILES)
-    return read_picture(checked_file(Path(folder), evaluation, name, AGAIN))
+    summaries.check("files", name, EVALUATION_FILES)
+    return read_picture(summaries.checked_file(Path(folder), evaluation, name, AGAIN))
 
 
 def read_picture(path: Path) -> bytes:
