@@ -254,6 +254,7 @@ from cmfsim.surfaces.repair import RepairOptions as RepairOptions
 from cmfsim.surfaces.repair import repair_surface as repair_surface
 from cmfsim.values.anatomy import Anatomy as Anatomy
 from cmfsim.values.anatomy import BoneSegment as BoneSegment
+from cmfsim.values.anatomy import DentalArch as DentalArch
 from cmfsim.values.calibration import BandFactor as BandFactor
 from cmfsim.values.calibration import Calibration as Calibration
 from cmfsim.values.calibration import CalibrationCase as CalibrationCase
@@ -261,7 +262,6 @@ from cmfsim.values.case_parts import CaseMuscles as CaseMuscles
 from cmfsim.values.clinical_motion import ClinicalMotion as ClinicalMotion
 from cmfsim.values.clinical_motion import clinical_motion as clinical_motion
 from cmfsim.values.clinical_motion import planned_motion as planned_motion
-from cmfsim.values.dental_arch import DentalArch as DentalArch
 from cmfsim.values.finding import Finding as Finding
 from cmfsim.values.image_data import ImageData as ImageData
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS as SKULL_LANDMARKS

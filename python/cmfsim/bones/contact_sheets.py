@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim import _core
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
+from cmfsim.values.anatomy import SHEET_DEPTH, DentalArch
 from cmfsim.values.checks import Floats, as_positive, as_rows
-from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 

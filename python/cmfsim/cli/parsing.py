@@ -22,8 +22,8 @@ from cmfsim.lab.frontier import EDGES, FACTORS
 from cmfsim.lab.virtual.population import TRUTHS
 from cmfsim.muscles.template import WHERE
 from cmfsim.planning.replanning import CORRECTIONS, TRIALS
+from cmfsim.values.anatomy import JAWS
 from cmfsim.values.case_parts import PROCEDURES
-from cmfsim.values.dental_arch import JAWS
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
 from cmfsim.values.solver_options import MODELS as SOLVED_MODELS

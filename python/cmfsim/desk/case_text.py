@@ -10,7 +10,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.io.cases.case_plans import matrix_rows, plan_head
 from cmfsim.io.files.reading_writing import toml_module
-from cmfsim.io.files.toml_lines import toml_lines
+from cmfsim.io.files.texts import toml_lines
 from cmfsim.values.checks import Floats
 
 # A line that `cmfsim init` left to a person, and what may stand there, with words about it.

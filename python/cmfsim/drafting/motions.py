@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.drafting.choices import Taken, quoted
+from cmfsim.drafting.choices import Anatomy, Taken, quoted
 from cmfsim.drafting.finds import LooseMotion, OtherFind, SurfaceFind, TransformFind
 from cmfsim.drafting.roles import MOVING, safe_key
-from cmfsim.drafting.surfaces import Anatomy
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.slicer.transforms import is_itk_file, motion_in_lps, read_transform_file
 from cmfsim.values.case_parts import PROCEDURES

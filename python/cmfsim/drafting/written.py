@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.drafting.choices import Images, Marks, Taken, Text, quoted
+from cmfsim.drafting.choices import Anatomy, Images, Marks, Question, Taken, Text, quoted
 from cmfsim.drafting.finds import EXTRACTED, Gathered, ImageFind, LandmarkFind, SurfaceFind
 from cmfsim.drafting.motions import Plan
 from cmfsim.drafting.roles import safe_key
-from cmfsim.drafting.surfaces import Anatomy, Question
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError
 from cmfsim.io import Case, read_surface
 from cmfsim.io.files.reading_writing import toml_module

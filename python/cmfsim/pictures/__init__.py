@@ -4,6 +4,7 @@ from cmfsim.pictures.anatomy import KIND_COLOURS as KIND_COLOURS
 from cmfsim.pictures.anatomy import SEGMENT_COLOURS as SEGMENT_COLOURS
 from cmfsim.pictures.anatomy import SKIN_COLOUR as SKIN_COLOUR
 from cmfsim.pictures.anatomy import picture_anatomy as picture_anatomy
+from cmfsim.pictures.anatomy import picture_muscles as picture_muscles
 from cmfsim.pictures.anatomy import picture_node_kinds as picture_node_kinds
 from cmfsim.pictures.anatomy import picture_segments as picture_segments
 from cmfsim.pictures.anatomy import segment_colours as segment_colours
@@ -22,7 +23,6 @@ from cmfsim.pictures.faces import picture_prediction as picture_prediction
 from cmfsim.pictures.faces import plan_picture as plan_picture
 from cmfsim.pictures.faces import prediction_picture as prediction_picture
 from cmfsim.pictures.landmarks import picture_landmarks as picture_landmarks
-from cmfsim.pictures.muscles import picture_muscles as picture_muscles
 from cmfsim.pictures.window import ViewPart as ViewPart
 from cmfsim.pictures.window import has_screen as has_screen
 from cmfsim.pictures.window import view_parts as view_parts

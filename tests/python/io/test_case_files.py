@@ -11,7 +11,7 @@ import pytest
 import cmfsim
 import cmfsim.values.case_parts
 from cmfsim.io.files.reading_writing import toml_module
-from cmfsim.io.files.toml_lines import line_of, toml_lines
+from cmfsim.io.files.texts import line_of, toml_lines
 from cmfsim.values import case_parts
 
 HEAD = 'format = "cmfsim-case"\nversion = 1\n'

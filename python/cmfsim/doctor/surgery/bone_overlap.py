@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.doctor.evidence import place_text
+from cmfsim.values.anatomy import LOWER_BEARERS, UPPER_BEARERS
 from cmfsim.values.checks import Floats
-from cmfsim.values.dental_arch import LOWER_BEARERS, UPPER_BEARERS
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface, SurfaceData

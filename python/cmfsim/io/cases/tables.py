@@ -16,7 +16,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files import reading_writing
-from cmfsim.io.files.toml_lines import KeyPath, line_of, toml_lines
+from cmfsim.io.files.texts import KeyPath, line_of, toml_lines
 from cmfsim.values.checks import Floats, nearest
 
 # A case file above this size is not what it says it is, bytes.

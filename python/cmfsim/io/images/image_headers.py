@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.files.reading_writing import check_readable, is_below
-from cmfsim.io.files.text_numbers import real_numbers, whole_numbers
+from cmfsim.io.files.texts import real_numbers, whole_numbers
 from cmfsim.values.finding import Finding
 
 # Larger images are refused before memory is taken, voxels: 1024 × 1024 × 2000.

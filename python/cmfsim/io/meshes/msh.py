@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.text_numbers import real_numbers, whole_numbers
+from cmfsim.io.files.texts import real_numbers, whole_numbers
 from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh
 
 # A line with a keyword is no longer than this, bytes.

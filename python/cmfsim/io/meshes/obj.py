@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.text_numbers import real_numbers, shown, whole_numbers
+from cmfsim.io.files.texts import real_numbers, shown, whole_numbers
 from cmfsim.io.meshes.polygons import triangles_of
 from cmfsim.values.checks import Floats
 

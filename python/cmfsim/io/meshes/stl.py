@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.text_numbers import real_numbers, shown
+from cmfsim.io.files.texts import real_numbers, shown
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 

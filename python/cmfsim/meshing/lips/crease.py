@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.anatomy import Anatomy, DentalArch
 from cmfsim.values.checks import Floats
-from cmfsim.values.dental_arch import DentalArch
 
 # Grid of the profiles, mm: planes across, places along a profile, and steps of a ray into the head.
 COLUMN, STEP, RAY = 1.0, 0.5, 0.5

@@ -20,7 +20,7 @@ from cmfsim.meshing.lips.crease import (
 )
 from cmfsim.meshing.lips.sheet import lip_sheet
 from cmfsim.surfaces.topology import connected_labels, edges_of
-from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.anatomy import Anatomy, DentalArch
 from cmfsim.values.case_parts import LIP_DEPTH, LIP_HEIGHT, LIP_SEAMS
 from cmfsim.values.checks import (
     Floats,
@@ -32,7 +32,6 @@ from cmfsim.values.checks import (
     check_instance,
     check_one_of,
 )
-from cmfsim.values.dental_arch import DentalArch
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds

@@ -8,9 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.meshing.node_kinds.options import KindOptions
-from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.anatomy import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch
 from cmfsim.values.checks import Floats, as_point
-from cmfsim.values.dental_arch import SHEET_DEPTH, DentalArch
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
 

@@ -19,9 +19,8 @@ from cmfsim.planning.occlusion import (
     splint_between,
     tooth_rows,
 )
-from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.anatomy import JAWS, BoneSegment
 from cmfsim.values.checks import Floats, check_one_of
-from cmfsim.values.dental_arch import JAWS
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 

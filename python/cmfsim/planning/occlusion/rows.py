@@ -17,9 +17,15 @@ from cmfsim._core import rigid_fit
 from cmfsim.errors import CaseInputError
 from cmfsim.meshing.node_kinds import dental_arches
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
-from cmfsim.values.anatomy import Anatomy, BoneSegment
+from cmfsim.values.anatomy import (
+    JAWS,
+    LOWER_BEARERS,
+    UPPER_BEARERS,
+    Anatomy,
+    BoneSegment,
+    DentalArch,
+)
 from cmfsim.values.checks import Floats
-from cmfsim.values.dental_arch import JAWS, LOWER_BEARERS, UPPER_BEARERS, DentalArch
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import carried

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import walk_xml
-from cmfsim.io.files.text_numbers import real_numbers, whole_numbers
+from cmfsim.io.files.texts import real_numbers, whole_numbers
 from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, cells_by_type, stated_in_field
 from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
 from cmfsim.io.meshes.vtk.writing import UNPACKERS

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.drafting.choices import Taken
+from cmfsim.drafting.choices import SAMPLES, TURN, UNITS, Anatomy, Question, Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.drafting.roles import JAWS_OF_TEETH, MOVING, safe_key
-from cmfsim.drafting.surfaces.anatomy import FLIP, SAMPLES, UNITS, Anatomy, Question
 from cmfsim.meshing.levels import signed_level
 from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.values.checks import Floats
@@ -348,7 +347,7 @@ def _shown_frame(
     points = np.concatenate([find.surface.vertices for find in silent]) * unit
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     others = [
-        (find.label, find.surface.vertices * unit * (FLIP if f == "RAS" else 1.0))
+        (find.label, find.surface.vertices * unit * (TURN if f == "RAS" else 1.0))
         for find in anatomy.chosen
         if (f := find.stated) is not None
     ]
@@ -356,7 +355,7 @@ def _shown_frame(
     for name, box in certain:
         fits = {
             frame: bool(((middle * signs >= box[0]) & (middle * signs <= box[1])).all())
-            for frame, signs in (("LPS", np.ones(3)), ("RAS", FLIP))
+            for frame, signs in (("LPS", np.ones(3)), ("RAS", TURN))
         }
         if fits["LPS"] != fits["RAS"]:
             frame = "LPS" if fits["LPS"] else "RAS"
