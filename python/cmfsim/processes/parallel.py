@@ -65,7 +65,16 @@ def answers(
         cluster answers.
     """
     if scheduler is not None:
-        yield from _on_cluster(function, jobs, scheduler)
+        asked = [(function, dict(job)) for job in jobs]
+        for index, answer, error in on_cluster(scheduler, answer_alone, asked):
+            if isinstance(error, errors.CmfsimError):
+                raise error
+            if error is not None:
+                raise CaseError(
+                    f"the cluster abandoned a job ({error}): run the command again; what is "
+                    "complete is kept"
+                )
+            yield index, answer
         return
     idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
 
@@ -111,21 +120,6 @@ def as_they_end(
                 ended.set()
             for worker in started:
                 worker.end()
-
-
-def _on_cluster(
-    function: str, jobs: Sequence[Mapping[str, Any]], scheduler: str
-) -> Iterator[tuple[int, Any]]:
-    asked = [(function, dict(job)) for job in jobs]
-    for index, answer, error in on_cluster(scheduler, answer_alone, asked):
-        if isinstance(error, errors.CmfsimError):
-            raise error
-        if error is not None:
-            raise CaseError(
-                f"the cluster abandoned a job ({error}): run the command again; what is complete "
-                "is kept"
-            )
-        yield index, answer
 
 
 def answer_alone(function: str, job: Mapping[str, Any]) -> Any:

@@ -43,14 +43,10 @@ class Source:
 
 
 _MODULI = "spread of the published values in docs/moduli.md"
-
-
 _EXECUTION = (
     "24 bimaxillary patients, plan against CT after the operation, √(mean² + SD²) of the absolute "
     "differences (PMC8432567, 2021)"
 )
-
-
 # Of the material; only ratios of moduli matter, so that fat, along and across together count once.
 TISSUE = (
     Source("fat modulus", 0.45, "log", _MODULI),
@@ -63,8 +59,6 @@ TISSUE = (
     Source("fibre direction about P", 10.0, "degrees", "assumed"),
     Source("fibre direction about S", 10.0, "degrees", "assumed"),
 )
-
-
 # Of each segment that the plan moves, about the middle of what is joined to it.
 PLAN = (
     Source("to the left", 0.82, "mm", _EXECUTION),
@@ -74,8 +68,6 @@ PLAN = (
     Source("roll", 0.59, "degrees", _EXECUTION),
     Source("yaw", 0.71, "degrees", _EXECUTION),
 )
-
-
 # Along the normal of the skin, without a solve.
 ADDED = (
     Source("thickness change", 0.05, "share", "assumed: share of the depth of the soft tissue"),
@@ -85,8 +77,6 @@ ADDED = (
         "form of the model", 0.5, "mm", "assumed: half the mean error on virtual patients P1 to P4"
     ),
 )
-
-
 # What no derivative gives, and what stands for it.
 NOT_COVERED = (
     (

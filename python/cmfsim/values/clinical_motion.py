@@ -210,12 +210,13 @@ def clinical_motion(
         exact = bool(np.abs(pairs[1] - pairs[0]).max(initial=0.0) <= NOTHING)
     return ClinicalMotion(
         segment,
-        forwards=_plain(-shift[1]),
-        up=_plain(shift[2]),
-        left=_plain(shift[0]),
-        pitch=_plain(-wx),
-        yaw=_plain(wz),
-        roll=_plain(-wy),
+        # Zero without a sign.
+        forwards=float(-shift[1]) + 0.0,
+        up=float(shift[2]) + 0.0,
+        left=float(shift[0]) + 0.0,
+        pitch=float(-wx) + 0.0,
+        yaw=float(wz) + 0.0,
+        roll=float(-wy) + 0.0,
         point=point,
         place=place,
         residual=residual,
@@ -282,20 +283,14 @@ def plan_lines(plan: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def _plain(value: float) -> float:
-    """The value as Python has it, zero without a sign."""
-    return float(value) + 0.0
-
-
 def _parts(entries: Iterable[tuple[float, str, str]], least: float) -> list[tuple[str, str, str]]:
     """Sign, size and words of the parts that are not zero; digits follow where all are tiny."""
     entries = list(entries)
     tiny = max(abs(value) for value, _, _ in entries) < PRINTED
-    smallest = least if tiny else PRINTED
     return [
         ("+" if value > 0.0 else "−", f"{abs(value):.2g}" if tiny else f"{abs(value):.1f}", word)
         for value, above, below in entries
-        if abs(value) >= smallest
+        if abs(value) >= (least if tiny else PRINTED)
         for word in (above if value > 0.0 else below,)
     ]
 

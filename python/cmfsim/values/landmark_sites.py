@@ -31,19 +31,14 @@ _SKULL_PAIRED: Mapping[str, tuple[float, float, float]] = {
     "zygomatic_arch": (66.6, -29.5, 1.5),
 }  # fmt: skip
 _SKIN_MIDLINE: Mapping[str, tuple[float, float, float]] = {
-    "labiale_inferius": (0.0, -100.2, -53.2),
-    "labiale_superius": (0.0, -102.2, -34.9),
-    "nasion": (0.0, -97.5, 28.5),
-    "pogonion": (0.0, -99.6, -74.0),
-    "pronasale": (0.0, -121.5, -7.3),
-    "subnasale": (0.0, -102.0, -22.6),
-}
+    "labiale_inferius": (0.0, -100.2, -53.2), "labiale_superius": (0.0, -102.2, -34.9),
+    "nasion": (0.0, -97.5, 28.5), "pogonion": (0.0, -99.6, -74.0),
+    "pronasale": (0.0, -121.5, -7.3), "subnasale": (0.0, -102.0, -22.6),
+}  # fmt: skip
 _SKIN_PAIRED: Mapping[str, tuple[float, float, float]] = {
-    "alare": (16.8, -104.5, -12.5),
-    "cheilion": (25.5, -89.6, -44.7),
-    "endocanthion": (16.8, -91.0, 17.5),
-    "exocanthion": (45.5, -80.7, 18.0),
-}
+    "alare": (16.8, -104.5, -12.5), "cheilion": (25.5, -89.6, -44.7),
+    "endocanthion": (16.8, -91.0, 17.5), "exocanthion": (45.5, -80.7, 18.0),
+}  # fmt: skip
 
 # The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
 # in its text, so the choice is ours.
@@ -91,8 +86,6 @@ _PAIRED: Mapping[str, str] = {
     "occlusal_line": "front and outer face of the ramus at the height where the teeth meet",
     "sub_m2": "body of the mandible below the lower second molar",
 }
-
-
 _SIDES: Mapping[str, str] = {"_L": "left", "_R": "right"}
 
 
@@ -117,19 +110,16 @@ def _plain(name: str) -> str:
     return name[:-2] if name[-2:] in _SIDES else name
 
 
-def _definitions() -> dict[str, str]:
-    found = {name: f"midline: {where}" for name, where in _MIDLINE.items()}
-    for name, where in _PAIRED.items():
-        found[f"{name}_L"] = f"left: {where}"
-        found[f"{name}_R"] = f"right: {where}"
-    return found
-
-
 # 10 in the midline and 11 on either side, after the sites at which Rhine & Campbell (1980) and
 # Phillips & Smuts (1996) measured the soft tissue; left and right are the patient's.
-SKULL_LANDMARKS: Mapping[str, str] = MappingProxyType(_definitions())
-
-
+SKULL_LANDMARKS: Mapping[str, str] = MappingProxyType(
+    {name: f"midline: {where}" for name, where in _MIDLINE.items()}
+    | {
+        f"{name}{side}": f"{word}: {where}"
+        for name, where in _PAIRED.items()
+        for side, word in _SIDES.items()
+    }
+)
 # The same of the skin.
 SKIN_SITES: Mapping[str, str] = MappingProxyType(
     {
@@ -182,86 +172,45 @@ class CephalometricSite:
 
 
 # Abbreviations as in cephalometry, with those of ALI_CBCT (Gillot et al. 2023) where they differ.
-CEPHALOMETRY: tuple[CephalometricSite, ...] = (
-    CephalometricSite(("N", "Na"), "skull", "nasion", "nasion", "front of the frontonasal suture"),
-    CephalometricSite(("G",), "skull", "glabella", "glabella", "foremost point between the brows"),
-    CephalometricSite(("Rhi", "Rh"), "skull", "rhinion", "rhinion", "tip of the nasal bones"),
-    CephalometricSite(
-        ("A", "SS"), "skull", "A point, subspinale", "mid_philtrum",
-        "deepest point of the maxilla between anterior nasal spine and prosthion",
-    ),
-    CephalometricSite(
-        ("Pr", "SPr"), "skull", "prosthion", "supradentale",
-        "edge of the bone between the upper central incisors",
-    ),
-    CephalometricSite(
-        ("Id",), "skull", "infradentale", "infradentale",
-        "edge of the bone between the lower central incisors",
-    ),
-    CephalometricSite(
-        ("B",), "skull", "B point", "supramentale",
-        "deepest point of the mandible between infradentale and pogonion",
-    ),
-    CephalometricSite(
-        ("Pog", "Pg"), "skull", "pogonion", "pogonion", "foremost point of the bony chin",
-    ),
-    CephalometricSite(("Me",), "skull", "menton", "menton", "lowest point of the chin"),
-    CephalometricSite(
-        ("Or",), "skull", "orbitale", "suborbital", "lowest point of the rim of the orbit",
-    ),
-    CephalometricSite(
-        ("Zy",), "skull", "zygion", "zygomatic_arch", "outermost point of the zygomatic arch",
-    ),
-    CephalometricSite(("Go",), "skull", "gonion", "gonion", "point of the angle of the mandible"),
-    CephalometricSite(("N'", "Na'"), "skin", "soft nasion", "nasion", "root of the nose"),
-    CephalometricSite(("Prn", "Pn"), "skin", "pronasale", "pronasale", "tip of the nose"),
-    CephalometricSite(("Sn",), "skin", "subnasale", "subnasale", "where septum and upper lip meet"),
-    CephalometricSite(
-        ("Ls",), "skin", "labiale superius", "labiale_superius", "border of the upper vermilion",
-    ),
-    CephalometricSite(
-        ("Li",), "skin", "labiale inferius", "labiale_inferius", "border of the lower vermilion",
-    ),
-    CephalometricSite(
-        ("Pog'", "Pg'"), "skin", "soft pogonion", "pogonion", "foremost point of the soft chin",
-    ),
-    CephalometricSite(("Ex",), "skin", "exocanthion", "exocanthion", "outer corner of the eye"),
-    CephalometricSite(("En",), "skin", "endocanthion", "endocanthion", "inner corner of the eye"),
-    CephalometricSite(("Al",), "skin", "alare", "alare", "outermost point of the nose"),
-    CephalometricSite(("Ch",), "skin", "cheilion", "cheilion", "corner of the mouth"),
-    CephalometricSite(("S",), "skull", "sella", "", "middle of the sella turcica"),
-    CephalometricSite(("Ba",), "skull", "basion", "", "front edge of the foramen magnum"),
-    CephalometricSite(("ANS",), "skull", "anterior nasal spine", "", "tip of the spine"),
-    CephalometricSite(("PNS",), "skull", "posterior nasal spine", "", "tip of the spine"),
-    CephalometricSite(
-        ("Po",), "skull", "porion", "",
-        "highest point of the opening of the ear canal, on each side",
-    ),
-    CephalometricSite(("Co",), "skull", "condylion", "", "highest point of each condyle"),
-    CephalometricSite(
-        ("Gn",), "skull", "gnathion", "", "point of the chin between pogonion and menton",
-    ),
-    CephalometricSite(
-        ("U1", "UR1O", "UL1O"), "skull", "upper incisor", "", "edge of the upper central incisor",
-    ),
-    CephalometricSite(
-        ("L1", "LR1O", "LL1O"), "skull", "lower incisor", "", "edge of the lower central incisor",
-    ),
-    CephalometricSite(
-        ("U1R", "UR1R", "UL1R"), "skull", "root of the upper incisor", "", "tip of its root",
-    ),
-    CephalometricSite(
-        ("L1R", "LR1R", "LL1R"), "skull", "root of the lower incisor", "", "tip of its root",
-    ),
-    CephalometricSite(
-        ("U6", "UR6O", "UL6O", "UR6MB", "UL6MB"), "skull", "upper first molar", "",
-        "crown of the upper first molar: middle (O), mesiobuccal cusp (MB)",
-    ),
-    CephalometricSite(
-        ("L6", "LR6O", "LL6O", "LR6MB", "LL6MB"), "skull", "lower first molar", "",
-        "crown of the lower first molar: middle (O), mesiobuccal cusp (MB)",
-    ),
-)  # fmt: skip
+# fmt: off
+CEPHALOMETRY: tuple[CephalometricSite, ...] = tuple(CephalometricSite(tuple(row[0].split()), *row[1:]) for row in (
+    ("N Na", "skull", "nasion", "nasion", "front of the frontonasal suture"),
+    ("G", "skull", "glabella", "glabella", "foremost point between the brows"),
+    ("Rhi Rh", "skull", "rhinion", "rhinion", "tip of the nasal bones"),
+    ("A SS", "skull", "A point, subspinale", "mid_philtrum", "deepest point of the maxilla between anterior nasal spine and prosthion"),
+    ("Pr SPr", "skull", "prosthion", "supradentale", "edge of the bone between the upper central incisors"),
+    ("Id", "skull", "infradentale", "infradentale", "edge of the bone between the lower central incisors"),
+    ("B", "skull", "B point", "supramentale", "deepest point of the mandible between infradentale and pogonion"),
+    ("Pog Pg", "skull", "pogonion", "pogonion", "foremost point of the bony chin"),
+    ("Me", "skull", "menton", "menton", "lowest point of the chin"),
+    ("Or", "skull", "orbitale", "suborbital", "lowest point of the rim of the orbit"),
+    ("Zy", "skull", "zygion", "zygomatic_arch", "outermost point of the zygomatic arch"),
+    ("Go", "skull", "gonion", "gonion", "point of the angle of the mandible"),
+    ("N' Na'", "skin", "soft nasion", "nasion", "root of the nose"),
+    ("Prn Pn", "skin", "pronasale", "pronasale", "tip of the nose"),
+    ("Sn", "skin", "subnasale", "subnasale", "where septum and upper lip meet"),
+    ("Ls", "skin", "labiale superius", "labiale_superius", "border of the upper vermilion"),
+    ("Li", "skin", "labiale inferius", "labiale_inferius", "border of the lower vermilion"),
+    ("Pog' Pg'", "skin", "soft pogonion", "pogonion", "foremost point of the soft chin"),
+    ("Ex", "skin", "exocanthion", "exocanthion", "outer corner of the eye"),
+    ("En", "skin", "endocanthion", "endocanthion", "inner corner of the eye"),
+    ("Al", "skin", "alare", "alare", "outermost point of the nose"),
+    ("Ch", "skin", "cheilion", "cheilion", "corner of the mouth"),
+    ("S", "skull", "sella", "", "middle of the sella turcica"),
+    ("Ba", "skull", "basion", "", "front edge of the foramen magnum"),
+    ("ANS", "skull", "anterior nasal spine", "", "tip of the spine"),
+    ("PNS", "skull", "posterior nasal spine", "", "tip of the spine"),
+    ("Po", "skull", "porion", "", "highest point of the opening of the ear canal, on each side"),
+    ("Co", "skull", "condylion", "", "highest point of each condyle"),
+    ("Gn", "skull", "gnathion", "", "point of the chin between pogonion and menton"),
+    ("U1 UR1O UL1O", "skull", "upper incisor", "", "edge of the upper central incisor"),
+    ("L1 LR1O LL1O", "skull", "lower incisor", "", "edge of the lower central incisor"),
+    ("U1R UR1R UL1R", "skull", "root of the upper incisor", "", "tip of its root"),
+    ("L1R LR1R LL1R", "skull", "root of the lower incisor", "", "tip of its root"),
+    ("U6 UR6O UL6O UR6MB UL6MB", "skull", "upper first molar", "", "crown of the upper first molar: middle (O), mesiobuccal cusp (MB)"),
+    ("L6 LR6O LL6O LR6MB LL6MB", "skull", "lower first molar", "", "crown of the lower first molar: middle (O), mesiobuccal cusp (MB)"),
+))
+# fmt: on
 
 
 def named_site(label: str, kind: str) -> str | None:
@@ -361,14 +310,10 @@ def _labels(kind: str) -> Mapping[str, str]:
 @cache
 def _sideless(kind: str) -> frozenset[str]:
     """Labels of paired sites that lack the side."""
-    names = {
-        _plain(name)
-        for name in (SKULL_LANDMARKS if kind == "skull" else SKIN_LANDMARKS)
-        if name[-2:] in _SIDES
-    }
-    return frozenset(
-        label_key(word) for name in names for word in (name, *_abbreviations(kind, name))
-    )
+    names = SKULL_LANDMARKS if kind == "skull" else SKIN_LANDMARKS
+    paired = {_plain(name) for name in names if name[-2:] in _SIDES}
+    words = (word for name in paired for word in (name, *_abbreviations(kind, name)))
+    return frozenset(map(label_key, words))
 
 
 def _abbreviations(kind: str, site: str) -> Iterator[str]:

@@ -58,10 +58,12 @@ class MeshReport:
 
     def as_text(self) -> str:
         """The report as lines for a terminal."""
+        error = self.volume_error
+        against = "" if error is None else f", {100.0 * error:+.2f} % against the image"
         lines = [
             f"mesh          {self.n_nodes} nodes, {self.n_tets} tets",
             f"edge          {self.mean_edge:.2f} mm on average",
-            f"volume        {self.volume / 1000.0:.1f} cm³" + _percent(self.volume_error),
+            f"volume        {self.volume / 1000.0:.1f} cm³{against}",
         ]
         if self.boundary_error_mean is not None:
             lines.append(
@@ -88,7 +90,3 @@ class MeshReport:
                 f"removed       {self.dropped_parts} parts of {self.dropped_volume:.1f} mm³ in all"
             )
         return "\n".join(lines)
-
-
-def _percent(error: float | None) -> str:
-    return "" if error is None else f", {100.0 * error:+.2f} % against the image"

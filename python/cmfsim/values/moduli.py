@@ -16,8 +16,6 @@ from cmfsim.values.tissue_data import TissueData
 YOUNG_RANGE = (1e-6, 1e3)
 # Above, the tets lock and the system is nearly singular; -1 itself is excluded.
 MOST_POISSON = 0.4999
-
-
 # Beyond these, moduli of soft tissue are a unit or a digit typed wrongly rather than a tissue, MPa:
 # published values of fat and of whole passive muscle lie well within (docs/moduli.md). Poisson's
 # ratio of tissue that is mostly water is 0.4 to 0.5, and 0.3 in the softest models of fat.
@@ -25,8 +23,8 @@ USUAL_YOUNG = (1e-4, 2.0)
 USUAL_POISSON = 0.2
 
 
-def unusual_moduli(named: Mapping[str, "FatModuli | MuscleModuli"]) -> list[str]:
-    """The moduli that no soft tissue has, in words, of tissues by name without gaps."""
+def moduli_unusual(named: Mapping[str, "FatModuli | MuscleModuli"], where: str) -> list[Finding]:
+    """The warning about moduli that no soft tissue has, of tissues by name without gaps."""
     low, high = USUAL_YOUNG
     found = []
     for name, moduli in named.items():
@@ -34,24 +32,11 @@ def unusual_moduli(named: Mapping[str, "FatModuli | MuscleModuli"]) -> list[str]
         found += [f"{name} {value:g} MPa" for value in young if not low <= value <= high]
         if poisson < USUAL_POISSON:
             found.append(f"{name} with a Poisson's ratio of {poisson:g}")
-    return found
-
-
-def moduli_unusual(named: Mapping[str, "FatModuli | MuscleModuli"], where: str) -> list[Finding]:
-    """The warning about them; none where there are none."""
-    found = unusual_moduli(named)
     if not found:
         return []
-    low, high = USUAL_YOUNG
-    return [
-        Finding(
-            "moduli-unusual",
-            f"no soft tissue has these moduli: {', '.join(found)}",
-            severity="warning",
-            where=where,
-            facts={"low": low, "high": high, "least": USUAL_POISSON},
-        )
-    ]
+    what = f"no soft tissue has these moduli: {', '.join(found)}"
+    facts = {"low": low, "high": high, "least": USUAL_POISSON}
+    return [Finding("moduli-unusual", what, severity="warning", where=where, facts=facts)]
 
 
 def _check_young(name: str, value: float | None) -> None:

@@ -8,18 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim._core import rigid_matrix
+from cmfsim._core import rigid_matrix as rigid_matrix  # noqa: PLC0414 (passed on)
 from cmfsim.errors import BoundaryInputError, CaseInputError
 from cmfsim.values.checks import as_unmasked
-
-__all__ = [
-    "RigidMotion",
-    "carried",
-    "decompose_motion",
-    "plan_digits",
-    "rigid_matrix",
-    "rigid_motion",
-]
 
 # Entries of motions are distinguished to a millionth, mm or of a rotation.
 DIGITS = 1e6
@@ -98,7 +89,8 @@ def rigid_motion(
     k = k / largest
     k = k / math.sqrt(float(k @ k))
     sine, cosine = _sine_cosine(theta)
-    cross = _cross_matrix(k)
+    # [k]×, for which [k]× v = k × v.
+    cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
     rotation = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
@@ -218,11 +210,6 @@ def _sine_cosine(degrees: float) -> tuple[float, float]:
     for _ in range(quarters % 4):
         sine, cosine = cosine, -sine
     return sine, cosine
-
-
-def _cross_matrix(k: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[k]×, for which [k]× v = k × v."""
-    return np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
 
 
 def plan_digits(motions: Mapping[str, NDArray[np.float64]]) -> str:

@@ -365,11 +365,8 @@ def check_version(version: object) -> None:
     if isinstance(version, bool) or not isinstance(version, int):
         raise CaseInputError(f"version is {version!r}: a whole number is needed")
     if version != FORMAT_VERSION:
-        hint = (
-            "the file was written by a newer cmfsim: update cmfsim"
-            if version > FORMAT_VERSION
-            else "unknown version"
-        )
+        hint = "the file was written by a newer cmfsim: update cmfsim"
+        hint = hint if version > FORMAT_VERSION else "unknown version"
         raise CaseInputError(f"version is {version}, this cmfsim reads {FORMAT_VERSION}; {hint}")
 
 

@@ -126,9 +126,8 @@ def markup_of(
 
 def write_markups(path: Path, markups: Sequence[Mapping[str, Any]]) -> None:
     """Replaces a `.mrk.json` file in one step."""
-    text = markups_text(markups)
     with replacing(path) as file:
-        file.write(text.encode())
+        file.write(markups_text(markups).encode())
 
 
 def markups_text(markups: Sequence[Mapping[str, Any]]) -> str:

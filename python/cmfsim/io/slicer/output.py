@@ -68,11 +68,8 @@ class _Scene:
         stored = self.store("TransformStorage", "vtkMRMLTransformStorageNode", f"{file}.tfm", text)
         ras = motion_in_lps(matrix, "RAS")
         rows = "  ".join(" ".join(repr(float(v)) for v in row) for row in ras)
-        attributes = {
-            "name": name,
-            "references": f"storage:{stored};",
-            "matrixTransformToParent": rows,
-        }
+        references = f"storage:{stored};"
+        attributes = {"name": name, "references": references, "matrixTransformToParent": rows}
         return self.add("LinearTransform", "vtkMRMLLinearTransformNode", attributes)
 
     def model(self, name: str, file: str, look: "_Look", surface: bytes) -> None:
@@ -104,17 +101,12 @@ class _Scene:
         """Adds landmarks."""
         places = [(label, np.asarray(point, dtype=np.float64)) for label, point in points.items()]
         text = markups_text([markup_of("Fiducial", places)]).encode()
-        stored = self.store(
-            "MarkupsJsonStorage", "vtkMRMLMarkupsJsonStorageNode", f"{file}.mrk.json", text
-        )
+        json_storage = ("MarkupsJsonStorage", "vtkMRMLMarkupsJsonStorageNode")
+        stored = self.store(*json_storage, f"{file}.mrk.json", text)
         shown = {"name": f"{name} display", "hideFromEditors": "true", "visibility": "false"}
         display = self.add("MarkupsFiducialDisplay", "vtkMRMLMarkupsFiducialDisplayNode", shown)
-        references = f"display:{display};storage:{stored};"
-        self.add(
-            "MarkupsFiducial",
-            "vtkMRMLMarkupsFiducialNode",
-            {"name": name, "references": references},
-        )
+        attributes = {"name": name, "references": f"display:{display};storage:{stored};"}
+        self.add("MarkupsFiducial", "vtkMRMLMarkupsFiducialNode", attributes)
 
     def text(self) -> bytes:
         """The scene as MRML."""
@@ -175,12 +167,9 @@ def write_slicer_bundle(path: str | os.PathLike[str], prediction: Prediction) ->
 def _add_faces(scene: _Scene, prediction: Prediction) -> None:
     face, before = prediction.face, prediction.face_before
     carried = face.vertices - before.vertices
-    data = {
-        DISPLACEMENT: carried,
-        LENGTH: np.linalg.norm(carried, axis=1),
-        # The patient looks along −P.
-        FORWARDS: -carried[:, 1],
-    }
+    # The patient looks along −P.
+    lengths, forwards = np.linalg.norm(carried, axis=1), -carried[:, 1]
+    data = {DISPLACEMENT: carried, LENGTH: lengths, FORWARDS: forwards}
     look = _Look(SKIN, scalars=LENGTH)
     scene.model("face predicted", "face_predicted", look, _vtp(face, data))
     hidden = _Look(BEFORE, opacity=0.4, is_visible=False)
@@ -190,8 +179,7 @@ def _add_faces(scene: _Scene, prediction: Prediction) -> None:
 def _add_bones(scene: _Scene, prediction: Prediction) -> None:
     for name, (surface, moved) in prediction.bones.items():
         motion = prediction.scene.plan.get(name)
-        parent = ""
-        shown = surface
+        parent, shown = "", surface
         if isinstance(motion, np.ndarray) and motion.shape == (4, 4):
             if not np.array_equal(motion, np.eye(4)):
                 parent = scene.transform(f"plan {name}", f"plan_{name}", motion)

@@ -164,11 +164,17 @@ def read_slicer_scene(path: str | os.PathLike[str]) -> SlicerScene:
     with named(path):
         if path.stat().st_size > MAX_SCENE:
             raise CaseInputError(f"is larger than {MAX_SCENE} bytes: no scene is that large")
-        elements = _elements(path.read_bytes())
+        elements: list[tuple[str, dict[str, str]]] = []
+        limits = (MAX_ELEMENTS, MAX_DEPTH)
+        walk_xml(path.read_bytes(), limits, lambda name, given: elements.append((name, given)))
+        if elements[0][0] != "MRML":
+            found = elements[0][0][:40]
+            raise CaseInputError(f"begins with {found!r}: a scene of 3D Slicer with MRML")
         storages = {a["id"]: a for name, a in elements if name.endswith("Storage") and "id" in a}
         nodes: dict[str, SceneNode] = {}
         for name, attributes in elements:
-            if name not in KINDS and not _stores(attributes, storages):
+            stores = bool(attributes.get("id")) and _stored(attributes, storages).get("fileName")
+            if name not in KINDS and not stores:
                 continue
             node = _node(name, attributes, storages, path.parent)
             if not node.id or node.id in nodes:
@@ -184,11 +190,6 @@ def _stored(
     references = dict(REFERENCE.findall(attributes.get("references", "")))
     storage = references.get("storage", attributes.get("storageNodeRef", "")).split(" ")[0]
     return storages.get(storage, {})
-
-
-def _stores(attributes: Mapping[str, str], storages: Mapping[str, Mapping[str, str]]) -> bool:
-    """Whether an element has a file of its own."""
-    return bool(attributes.get("id")) and bool(_stored(attributes, storages).get("fileName"))
 
 
 def _node(
@@ -234,15 +235,6 @@ def _file(name: str, folder: Path) -> tuple[Path | None, str]:
     except CaseInputError as error:
         return path, str(error)
     return path, "" if is_file else f"{shown}: the scene refers to this file, but it does not exist"
-
-
-def _elements(text: bytes) -> list[tuple[str, dict[str, str]]]:
-    """Name and attributes of each element of a scene."""
-    found: list[tuple[str, dict[str, str]]] = []
-    walk_xml(text, (MAX_ELEMENTS, MAX_DEPTH), lambda name, given: found.append((name, given)))
-    if found[0][0] != "MRML":
-        raise CaseInputError(f"begins with {found[0][0][:40]!r}: a scene of 3D Slicer with MRML")
-    return found
 
 
 def unpack_bundle(path: Path, folder: Path) -> Path:
