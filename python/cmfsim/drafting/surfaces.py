@@ -168,9 +168,8 @@ def _choose_skin(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None:
         if len(around) == 1:
             unnamed.remove(around[0])
             anatomy.skin = around[0]
-            anatomy.taken.append(
-                Taken(around[0].label, "skin", "it encloses every other surface", "", "")
-            )
+            why = "it encloses every other surface"
+            anatomy.taken.append(Taken(around[0].label, "skin", why))
             return
     if len(named) == 1:
         anatomy.skin = named[0]
@@ -301,13 +300,9 @@ def _choose_units(anatomy: Anatomy) -> None:
     choices = tuple(
         (None, f'"{unit}": then it is {size * UNITS[unit]:.0f} mm long') for unit in fitting
     )
-    anatomy.questions.append(
-        Question(
-            "units",
-            f"{long}, and in mm {low:.0f} to {high:.0f} is usual: which unit is it?",
-            choices or ((None, "none of mm, cm, m, um and inch fits: export the surfaces in mm"),),
-        )
-    )
+    none = ((None, "none of mm, cm, m, um and inch fits: export the surfaces in mm"),)
+    text = f"{long}, and in mm {low:.0f} to {high:.0f} is usual: which unit is it?"
+    anatomy.questions.append(Question("units", text, choices or none))
     if len(fitting) == 1:
         # To go on with: distances and directions are in mm from here on.
         anatomy.units = fitting[0]
@@ -324,16 +319,12 @@ def _choose_frame(anatomy: Anatomy, boxes: Sequence[tuple[str, Floats]]) -> None
     names = ", ".join(find.label for find in silent[:4]) + (", …" if len(silent) > 4 else "")
     frame, why = _shown_frame(anatomy, silent, boxes)
     if frame is None:
-        anatomy.questions.append(
-            Question(
-                "frame",
-                f"{names}: no frame is stated, and {why}. Is x to the left or to the right?",
-                (
-                    (None, '"LPS": x to the left, y to the back (3D Slicer since 2020, ITK)'),
-                    (None, '"RAS": x to the right, y to the front (older Slicer, FreeSurfer)'),
-                ),
-            )
+        text = f"{names}: no frame is stated, and {why}. Is x to the left or to the right?"
+        choices = (
+            (None, '"LPS": x to the left, y to the back (3D Slicer since 2020, ITK)'),
+            (None, '"RAS": x to the right, y to the front (older Slicer, FreeSurfer)'),
         )
+        anatomy.questions.append(Question("frame", text, choices))
         return
     anatomy.frame = None if frame == "LPS" and stated else frame
     anatomy.frame_why = f"{names}: none is stated; {why}"
@@ -364,7 +355,8 @@ def _shown_frame(
     for name in ("mandible", "mandible_body", "maxilla", "chin"):
         jaw = anatomy.bones.get(name)
         if cranium in silent and jaw in silent and cranium is not None and jaw is not None:
-            ahead = unit * float(_middle(jaw)[1] - _middle(cranium)[1])
+            ahead = (jaw.surface.vertices.mean(axis=0) - cranium.surface.vertices.mean(axis=0))[1]
+            ahead = unit * float(ahead)
             if abs(ahead) > IN_FRONT:
                 frame = "LPS" if ahead < 0.0 else "RAS"
                 return frame, (
@@ -372,11 +364,6 @@ def _shown_frame(
                     "middle, and otherwise behind it"
                 )
     return None, "nothing in the files shows it"
-
-
-def _middle(find: SurfaceFind) -> Floats:
-    centre: Floats = find.surface.vertices.mean(axis=0)
-    return centre
 
 
 def _check_sides(anatomy: Anatomy) -> None:
@@ -404,11 +391,7 @@ def _check_sides(anatomy: Anatomy) -> None:
             f"{find.label}: by its name it is the {side} ramus, but it lies {-away:.0f} mm to the "
             f"patient's {other}: are the names exchanged, or is the frame wrong?"
         )
-        choices = [
-            (other_find, "if the names are exchanged")
-            for other_find in rami.values()
-            if other_find is not find
-        ]
+        choices = [(f, "if the names are exchanged") for f in rami.values() if f is not find]
         choices.append((find, "if its name is right: the head is a mirror image, then"))
         anatomy.questions.append(Question(f"bones.{name}", text, tuple(choices)))
         anatomy.taken.append(Taken(find.label, "", text, question=True))
@@ -457,9 +440,8 @@ def _report(anatomy: Anatomy) -> None:
     for part, find in after.items():
         if find is not None:
             why = f"its name contains {find.role.word or 'after'!r}, after the operation"
-            anatomy.taken.append(
-                Taken(find.label, f"{part} after the operation", why, "mm", find.stated or "LPS")
-            )
+            what = f"{part} after the operation"
+            anatomy.taken.append(Taken(find.label, what, why, "mm", find.stated or "LPS"))
 
 
 def _shape(find: SurfaceFind, unit: str = "") -> str:

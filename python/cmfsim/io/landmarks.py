@@ -215,12 +215,12 @@ def write_landmarks(
     path = Path(path)
     if not path.name.endswith(".mrk.json"):
         raise LandmarkInputError(f"{path.name}: landmarks are written as .mrk.json")
-    points = _by_label(
-        [
-            _Point(number, label, as_position(number, list(np.asarray(value, dtype=object).flat)))
-            for number, (label, value) in enumerate(landmarks.items(), start=1)
-        ]
-    )
+    items = enumerate(landmarks.items(), start=1)
+    given = [
+        _Point(number, label, as_position(number, list(np.asarray(value, dtype=object).flat)))
+        for number, (label, value) in items
+    ]
+    points = _by_label(given)
     write_markups(path, [markup_of("Fiducial", points.items(), descriptions)])
 
 
@@ -276,10 +276,8 @@ def _from_fcsv(text: str, path: Path, frame: str | None) -> LandmarkFile:
         if row.get(STATUS, "").strip() in NOT_PLACED:
             unset.append(row["label"].strip() or str(number))
             continue
-        numbers: list[object] = []
-        for name in ("x", "y", "z"):
-            cell = row[name].strip()
-            numbers.append(float(cell) if NUMBER.fullmatch(cell) else cell)
+        words = (row[name].strip() for name in ("x", "y", "z"))
+        numbers = [float(cell) if NUMBER.fullmatch(cell) else cell for cell in words]
         label, place = _label(number, row["label"]), sign * as_position(number, numbers)
         points.append(_Point(number, label, place, row.get("desc", "").strip()))
     chosen = its_frame or frame or UNSTATED[".fcsv"]
@@ -295,30 +293,22 @@ def _landmark_file(
     *,
     stated: bool,
 ) -> LandmarkFile:
-    findings: list[Finding] = []
+    findings, where = list[Finding](), path.name
     if not stated:
         origin = "as the case says" if given else "the rule of this format"
-        findings.append(
-            Finding(
-                "frame-unstated",
-                f"the file does not state its frame: read as {chosen}, {origin}",
-                severity="note" if given else "warning",
-                where=path.name,
-                why="reading RAS as LPS rotates the head by 180° about its long axis",
-                fix='state it: "coordinateSystem": "LPS" (.mrk.json), # CoordinateSystem = LPS '
-                "(.fcsv),"
-                ' or frame = "LPS" under [landmarks]',
-            )
+        severity = "note" if given else "warning"
+        what = f"the file does not state its frame: read as {chosen}, {origin}"
+        why = "reading RAS as LPS rotates the head by 180° about its long axis"
+        fix = (
+            'state it: "coordinateSystem": "LPS" (.mrk.json), # CoordinateSystem = LPS (.fcsv), '
+            'or frame = "LPS" under [landmarks]'
         )
+        code = "frame-unstated"
+        findings.append(Finding(code, what, severity=severity, where=where, why=why, fix=fix))
     if unset:
         names = ", ".join(unset[:5]) + (", …" if len(unset) > 5 else "")
-        findings.append(
-            Finding(
-                "landmark-unset",
-                f"{len(unset)} points were never placed and are skipped: {names}",
-                where=path.name,
-            )
-        )
+        what = f"{len(unset)} points were never placed and are skipped: {names}"
+        findings.append(Finding("landmark-unset", what, where=where))
     placed = MappingProxyType(_by_label(points))
     said = {_label(p.number, p.label): p.description for p in points if p.description}
     return LandmarkFile(placed, chosen, stated, tuple(findings), tuple(unset), said)

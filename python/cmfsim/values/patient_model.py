@@ -56,13 +56,8 @@ class LiftedTissue(Frozen):
     def without(self, others: Indices) -> LiftedTissue:
         """The same without some nodes, (l,) uint32."""
         kept = ~np.isin(self.nodes, others)
-        return replace(
-            self,
-            nodes=self.nodes[kept],
-            piece=self.piece[kept],
-            places=self.places[kept],
-            normals=self.normals[kept],
-        )
+        own = {n: getattr(self, n)[kept] for n in ("nodes", "piece", "places", "normals")}
+        return replace(self, **own)
 
     @property
     def segment(self) -> str | None:
@@ -232,9 +227,8 @@ class PatientModel(Frozen):
     @cached_property
     def skin_end(self) -> SkinEnd:
         """The skin next to the planes on which the tissue ends, and what it is continued from."""
-        kinds = self.kinds
-        on_plane = kinds.nodes("fixed")
-        on_plane = on_plane[np.asarray(kinds.segment)[on_plane] < 0]
+        on_plane = self.kinds.nodes("fixed")
+        on_plane = on_plane[np.asarray(self.kinds.segment)[on_plane] < 0]
         return skin_end(self.skin, np.isin(self.skin_nodes, on_plane))
 
     def skin_field(self, values: Floats) -> Floats:

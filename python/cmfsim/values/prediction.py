@@ -151,9 +151,8 @@ class Prediction(Frozen):
         >>> other = prediction.replan({"maxilla": motion})
         """
         if self.predicted_by is None:
-            raise CaseInputError(
-                "this prediction does not record how it was made: use predict or predict_patient"
-            )
+            why = "this prediction does not record how it was made: use predict or predict_patient"
+            raise CaseInputError(why)
         return self.predicted_by(self.patient.with_plan(plan), self.model)
 
     @property
@@ -170,8 +169,7 @@ class Prediction(Frozen):
     def face(self) -> SurfaceData:
         """The predicted face: the vertices and triangles of `face_before`, carried by the skin."""
         before = self.face_before
-        vertices = before.vertices
-        return SurfaceData(vertices + self.carried(vertices), before.triangles)
+        return SurfaceData(before.vertices + self.carried(before.vertices), before.triangles)
 
     @property
     def bones(self) -> dict[str, tuple[SurfaceData, Floats]]:

@@ -103,7 +103,9 @@ class TimeLeft:
 
     def begin(self, name: str) -> None:
         """Goes on to a stage, or to another step of it."""
-        now, stage = time.perf_counter(), _stage_of(name)
+        plain, now = COUNT.sub("", name), time.perf_counter()
+        # Without what is counted or read in it.
+        stage = next((known for known in BUILDING if plain.startswith(known)), plain)
         if stage != self._stage:
             self._passed += self._typical
             # A second for what nobody expected.
@@ -134,12 +136,6 @@ class TimeLeft:
         share, seconds = self.estimate()
         left = f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
         return f"{100.0 * share:.0f} %, about {left} left: "
-
-
-def _stage_of(name: str) -> str:
-    """The stage that a name belongs to: without what is counted or read in it."""
-    plain = COUNT.sub("", name)
-    return next((stage for stage in BUILDING if plain.startswith(stage)), plain)
 
 
 @contextlib.contextmanager

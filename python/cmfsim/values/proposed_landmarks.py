@@ -142,39 +142,30 @@ class ProposedLandmarks:
         count = len(typical)
         yield from _following(sites)
         if count and count == len(sites):
-            yield Finding(
-                "landmarks-proposed",
+            what = (
                 f"{count} landmarks were found automatically; none was placed by hand; expected "
-                f"error {typical[count // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)",
-                where="landmarks",
+                f"error {typical[count // 2]:.1f} mm (median), {typical[-1]:.1f} mm (largest)"
             )
+            yield Finding("landmarks-proposed", what, where="landmarks")
         if self.doubtful_jaw:
             verdict = "is none" if self.impossible_jaw else "is doubtful"
-            yield Finding(
-                "jaw-doubtful",
-                f"the part taken for the mandible {verdict}: {self.doubtful_jaw}",
-                where="landmarks.skull",
-            )
+            what = f"the part taken for the mandible {verdict}: {self.doubtful_jaw}"
+            yield Finding("jaw-doubtful", what, where="landmarks.skull")
         for kind, own in (("skull", self.skull), ("skin", self.skin)):
             for name, site in own.items():
                 if site.doubt:
-                    x, y, z = site.point
-                    yield Finding(
-                        "landmark-doubtful",
-                        f"{name} ({kind}) at ({x:.1f}, {y:.1f}, {z:.1f}) is doubtful: {site.doubt}",
-                        where=f"landmarks.{kind}",
-                    )
+                    place = ", ".join(f"{x:.1f}" for x in site.point)
+                    what = f"{name} ({kind}) at ({place}) is doubtful: {site.doubt}"
+                    yield Finding("landmark-doubtful", what, where=f"landmarks.{kind}")
+        why = "they are omitted rather than guessed; anything that needs them is refused"
+        fix = "place them by hand if the image shows them"
         for kind, missing in (("skull", self.missing_skull), ("skin", self.missing_skin)):
+            where = f"landmarks.{kind}"
             for reason in dict.fromkeys(missing.values()):
-                names = [name for name, why in missing.items() if why == reason]
-                yield Finding(
-                    "landmark-missing",
-                    f"{len(names)} {kind} landmarks were not found: {', '.join(names)}: {reason}",
-                    severity="warning",
-                    where=f"landmarks.{kind}",
-                    why="they are omitted rather than guessed; anything that needs them is refused",
-                    fix="place them by hand if the image shows them",
-                )
+                names = [name for name, given in missing.items() if given == reason]
+                what = f"{len(names)} {kind} landmarks were not found: {', '.join(names)}: {reason}"
+                code = "landmark-missing"
+                yield Finding(code, what, severity="warning", where=where, why=why, fix=fix)
 
 
 def _following(sites: Mapping[str, ProposedSite]) -> Iterator[Finding]:
@@ -187,9 +178,6 @@ def _following(sites: Mapping[str, ProposedSite]) -> Iterator[Finding]:
         names = [f"{n} ({s.error:.1f} mm)" for n, s in sites.items() if s.origin == origin]
         if names:
             texts.append(f"{len(names)} were {words} (expected error): {', '.join(names)}")
-    yield Finding(
-        "landmarks-filled",
-        f"{len(placed)} landmarks were placed by hand, and others follow them: "
-        + ("; ".join(texts) or "none had to be moved"),
-        where="landmarks",
-    )
+    what = f"{len(placed)} landmarks were placed by hand, and others follow them: "
+    what += "; ".join(texts) or "none had to be moved"
+    yield Finding("landmarks-filled", what, where="landmarks")

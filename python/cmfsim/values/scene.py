@@ -25,7 +25,6 @@ from cmfsim.values.tissue_data import TissueData
 from cmfsim.values.touching import ObstacleData, TouchingData
 
 CONFLICTS = ("error", "resolve")
-
 DEFAULT_OPTIONS = SolverOptions()
 
 
@@ -69,19 +68,16 @@ class SegmentData(checks.Frozen):
         if contact is not None:
             checks.check_instance("contact", contact, SurfaceData)
         object.__setattr__(self, "contact", contact)
-        object.__setattr__(self, "gap", self._checked_gap(gap))
-
-    def _checked_gap(self, gap: ArrayLike | str) -> checks.Floats | str:
         if isinstance(gap, str):
             checks.check_one_of("gap", gap, ("rest",))
-            return gap
-        distances = checks.as_floats("gap", gap)
-        if distances.shape not in {(), (len(self.sliding),)}:
-            raise CaseInputError(
-                f"gap has shape {distances.shape}: one number or {len(self.sliding)} "
-                "(one per sliding node)"
-            )
-        return checks.frozen(distances)
+        else:
+            gap = checks.frozen(checks.as_floats("gap", gap))
+            if gap.shape not in {(), (len(self.sliding),)}:
+                raise CaseInputError(
+                    f"gap has shape {gap.shape}: one number or {len(self.sliding)} "
+                    "(one per sliding node)"
+                )
+        object.__setattr__(self, "gap", gap)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,13 +171,17 @@ class Scene(checks.Frozen):
         keep("segments", MappingProxyType(dict(segments)))
         keep("options", options)
         self._check_parts()
-        keep("loads", self._checked_loads(loads))
+        if loads is not None:
+            loads = checks.as_rows("loads", loads, 3)
+            if len(loads) != self.n_nodes:
+                raise CaseInputError(f"loads has {len(loads)} rows for {self.n_nodes} nodes")
+        keep("loads", loads)
         checks.check_one_of("conflicts", conflicts, CONFLICTS)
         keep("conflicts", conflicts)
         keep("plan", MappingProxyType(self._checked_plan(plan)))
         keep("touching", tuple(touching))
         keep("obstacles", tuple(obstacles))
-        self._check_contact(self.n_nodes)
+        self._check_contact()
 
     def _check_parts(self) -> None:
         """Tissue with a row for each tet, segments of nodes that there are."""
@@ -196,25 +196,17 @@ class Scene(checks.Frozen):
             for kind in ("joined", "sliding"):
                 checks.as_indices(f"segment {name!r} {kind}", getattr(segment, kind), self.n_nodes)
 
-    def _checked_loads(self, loads: ArrayLike | None) -> checks.Floats | None:
-        if loads is None:
-            return None
-        forces = checks.as_rows("loads", loads, 3)
-        if len(forces) != self.n_nodes:
-            raise CaseInputError(f"loads has {len(forces)} rows for {self.n_nodes} nodes")
-        return forces
-
-    def _check_contact(self, n_nodes: int) -> None:
+    def _check_contact(self) -> None:
         """One-sided contact: nodes of the mesh, and segments that there are."""
+        count = self.n_nodes
         for number, touch in enumerate(self.touching):
-            checks.check_instance(f"touching[{number}]", touch, TouchingData)
-            checks.as_indices(f"touching[{number}] nodes", touch.nodes, n_nodes)
-            checks.as_index_rows(
-                f"touching[{number}] triangles", touch.triangles, 3, n_nodes, "nodes"
-            )
+            name = f"touching[{number}]"
+            checks.check_instance(name, touch, TouchingData)
+            checks.as_indices(f"{name} nodes", touch.nodes, count)
+            checks.as_index_rows(f"{name} triangles", touch.triangles, 3, count, "nodes")
         for number, obstacle in enumerate(self.obstacles):
             checks.check_instance(f"obstacles[{number}]", obstacle, ObstacleData)
-            checks.as_indices(f"obstacles[{number}] nodes", obstacle.nodes, n_nodes)
+            checks.as_indices(f"obstacles[{number}] nodes", obstacle.nodes, count)
             if obstacle.segment not in self.segments:
                 known = ", ".join(repr(s) for s in self.segments) or "none"
                 raise CaseInputError(
@@ -256,20 +248,17 @@ class Scene(checks.Frozen):
             f"{name} ({len(s.joined)} joined, {len(s.sliding)} sliding)"
             for name, s in self.segments.items()
         ]
+        uniform = all(len(array) == 1 for array in self.tissue.arrays().values())
         options, law = self.options, self.tissue.preset or self.tissue.kind
         rows = {
             "mesh": f"{self.n_nodes} nodes, {self.n_tets} tets",
-            "tissue": f"{law}, {'one for all tets' if self._is_uniform else 'one for each tet'}",
+            "tissue": f"{law}, {'one for all tets' if uniform else 'one for each tet'}",
             "segments": ", ".join(segments),
             "fixed": f"{len(self.fixed)} nodes",
             "plan": self.plan_text(),
             "solver": f"{options.method}, {options.kinematics}, element {options.element}",
         }
         return checks.listing("Scene", rows)
-
-    @property
-    def _is_uniform(self) -> bool:
-        return all(len(array) == 1 for array in self.tissue.arrays().values())
 
     def plan_text(self) -> str:
         """How far each segment moves at most, in words."""

@@ -125,8 +125,7 @@ class SkinBand(Frozen):
         if not self.calibrated:
             return np.ma.array(self.plain_factor * self.sd, mask=np.zeros(len(self.sd), dtype=bool))
         factor = np.full(len(self.sd), np.nan)
-        order = sorted(self.factors, key=lambda name: name != WHOLE_FACE)
-        for name in order:
+        for name in sorted(self.factors, key=lambda name: name != WHOLE_FACE):
             factor[self.regions[name]] = self.factors[name].factor
         known = np.isfinite(factor)
         return np.ma.array(np.where(known, factor, 0.0) * self.sd, mask=~known)

@@ -67,9 +67,8 @@ def skin_end(skin: SurfaceData, held: ArrayLike) -> SkinEnd:
     on_plane = np.asarray(held, dtype=bool)
     triangles = skin.triangles.astype(np.int64)
     rim = triangles[on_plane[triangles].any(axis=1)]
-    none = np.zeros(0, dtype=np.int64)
     if not len(rim):
-        return SkinEnd(none, np.zeros((0, 2), dtype=np.int64))
+        return SkinEnd(np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64))
     nodes, corners = used_nodes(rim)
     closest, _, _ = Surface(skin.vertices[nodes], corners).closest(skin.vertices)
     reach = max(NEAR_END, NEAR_END_EDGES * _mean_edge(skin.vertices[triangles]))

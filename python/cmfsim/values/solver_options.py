@@ -10,8 +10,6 @@ from cmfsim.values.checks import as_positive, check_one_of
 # Kim et al. 2010, section 3.2: homogeneous or with muscles, without or with sliding at teeth and
 # mucosa.
 MODELS = ("H", "M", "H+S", "M+S")
-
-
 CONTACTS = ("bilateral", "unilateral")
 
 

@@ -87,14 +87,9 @@ class TissueData(Frozen):
     ) -> None:
         check_one_of("tissue kind", kind, tuple(TISSUE_ARRAYS))
         given = {
-            "fibre": fibre,
-            "fraction": fraction,
-            "poisson": poisson,
-            "stiffness": stiffness,
-            "young": young,
-            "young_across": young_across,
-            "young_along": young_along,
-        }
+            "young": young, "poisson": poisson, "young_along": young_along, "fibre": fibre,
+            "young_across": young_across, "stiffness": stiffness, "fraction": fraction,
+        }  # fmt: skip
         object.__setattr__(self, "kind", kind)
         for name, value in given.items():
             object.__setattr__(self, name, self._checked(name, value))

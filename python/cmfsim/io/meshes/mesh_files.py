@@ -115,22 +115,21 @@ def _by_meshio(path: Path) -> PlainMesh:
     except ReaderError as error:
         raise CaseInputError(f"cannot be read as a mesh: {error}") from error
     arrays, values = answer.arrays, answer.values
-    n_points, n_blocks = len(values["point_data"]), len(values["types"])
-    blocks = tuple(
-        Cells(name, _as_indices(arrays[f"cells.{i}"])) for i, name in enumerate(values["types"])
-    )
+    blocks, n_blocks = list[Cells](), len(values["types"])
+    for i, name in enumerate(values["types"]):
+        corners = arrays[f"cells.{i}"]
+        if corners.dtype.kind not in "iu":
+            raise CaseInputError(f"has cells of {corners.dtype}: whole numbers are needed")
+        blocks.append(Cells(name, corners.astype(np.int64)))
     points = np.asarray(arrays["points"], dtype=np.float64)
     if points.ndim == 2 and points.shape[1] == 2:
         points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
-    return PlainMesh(
-        points,
-        blocks,
-        {values["point_data"][i]: arrays[f"point_data.{i}"] for i in range(n_points)},
-        {
-            name: tuple(arrays[f"cell_data.{i}.{k}"] for k in range(n_blocks))
-            for i, name in enumerate(values["cell_data"])
-        },
-    )
+    point_data = {n: arrays[f"point_data.{i}"] for i, n in enumerate(values["point_data"])}
+    cell_data = {
+        name: tuple(arrays[f"cell_data.{i}.{k}"] for k in range(n_blocks))
+        for i, name in enumerate(values["cell_data"])
+    }
+    return PlainMesh(points, tuple(blocks), point_data, cell_data)
 
 
 def meshio_answer(path: str) -> Answer:
@@ -163,12 +162,6 @@ def meshio_answer(path: str) -> Answer:
         "cell_data": [str(name) for name in mesh.cell_data],
     }
     return Answer(texts, arrays)
-
-
-def _as_indices(array: NDArray[Any]) -> NDArray[np.int64]:
-    if array.dtype.kind not in "iu":
-        raise CaseInputError(f"has cells of {array.dtype}: whole numbers are needed")
-    return array.astype(np.int64)
 
 
 def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:

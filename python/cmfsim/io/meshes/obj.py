@@ -63,24 +63,17 @@ def read_obj(data: bytes) -> tuple[Floats, Integers]:
     numbers: list[int] = []
     for number, line in enumerate(lines, start=1):
         head = line[:2]
-        if head == b"v ":
+        if head in {b"vn", b"vt", b"# ", b"\r"} or not line:
+            continue
+        word = head[:1] if head in {b"v ", b"f "} else next(iter(line.split(None, 1)), b"#")
+        if word == b"v":
             vertices.append(line.split())
             numbers.append(number)
-        elif head == b"f ":
+        elif word == b"f":
             faces.append(line)
             places.append((number, len(vertices)))
-        elif line and head not in {b"vn", b"vt", b"# ", b"\r"}:
-            words = line.split(None, 1)
-            if not words or words[0].startswith(b"#"):
-                continue
-            if words[0] == b"v":
-                vertices.append(line.split())
-                numbers.append(number)
-            elif words[0] == b"f":
-                faces.append(line)
-                places.append((number, len(vertices)))
-            elif words[0] not in PASSED_OVER:
-                raise CaseInputError(f"line {number}: {shown(words[0])} is not known in OBJ")
+        elif not word.startswith(b"#") and word not in PASSED_OVER:
+            raise CaseInputError(f"line {number}: {shown(word)} is not known in OBJ")
     points = _points(vertices, numbers)
     triangles = _faces(faces, places, points)
     _check_stated(data, len(points), len(faces))

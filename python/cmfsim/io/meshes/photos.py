@@ -85,14 +85,10 @@ def read_photo(path: Path) -> Photo:
         # VTK forgives damage; these do not.
         data = path.read_bytes()
         vertices = (read_ply(data) if suffix == ".ply" else read_obj(data))[0]
+        limits, task = ReadLimits(SECONDS, MEMORY), f"{__name__}:photo_answer"
         try:
             with utf8_path(path) as plain:
-                answer = read_in_child(
-                    f"{__name__}:photo_answer",
-                    ReadLimits(SECONDS, MEMORY),
-                    path=plain,
-                    material="".join(materials),
-                )
+                answer = read_in_child(task, limits, path=plain, material="".join(materials))
         except ReaderError as error:
             raise CaseInputError(f"cannot be read as a 3D photo: {error}") from error
         photo = Photo(**answer.arrays)
@@ -163,11 +159,8 @@ def _textured(path: str, material: str, numbers: Any) -> Any:
     for _ in range(actors.GetNumberOfItems()):
         actor = actors.GetNextActor()
         data, texture = actor.GetMapper().GetInput(), actor.GetTexture()
-        if (
-            texture is None
-            or data.GetPointData().GetTCoords() is None
-            or not data.GetNumberOfPolys()
-        ):
+        places = data.GetPointData().GetTCoords()
+        if texture is None or places is None or not data.GetNumberOfPolys():
             continue
         texture.GetInputAlgorithm().Update()
         image = texture.GetInput()

@@ -175,15 +175,14 @@ def _understood(
                 f"is an ITK transform, and does not record its direction: state {DIRECTION_CHOICE}"
             )
         frame = "LPS"
-    matrix = rigid_matrix(matrix)
-    assumed = [
-        name for name, value in (("direction", direction), ("frame", frame)) if value is None
-    ]
+        matrix = rigid_matrix(matrix)
+        both = {"direction": direction, "frame": frame}
+        assumed = tuple(name for name, value in both.items() if value is None)
     direction, frame = direction or DEFAULT_DIRECTION, frame or DEFAULT_FRAME
     matrix = motion_in_lps(matrix, frame)
     if direction == "from-parent":
         matrix = _inverse(matrix)
-    return TransformFile(matrix, direction, frame, tuple(assumed))
+    return TransformFile(matrix, direction, frame, assumed)
 
 
 def write_transform(
@@ -331,13 +330,9 @@ def _found(block: Mapping[str, tuple[int, str]]) -> _Found:
     if base != COMPOSITE and "Parameters" not in block:
         raise CaseInputError(f"line {line}: {base} lacks its line 'Parameters: ...'")
     numbers = {name: _floats(*block[name][::-1]) for name in block if name != "Transform"}
-    return _Found(
-        base,
-        numbers.get("Parameters", np.zeros(0)),
-        # Older files have no centre.
-        numbers.get("FixedParameters", np.zeros(0)),
-        where,
-    )
+    # Older files have no centre.
+    own, fixed = (numbers.get(name, np.zeros(0)) for name in ("Parameters", "FixedParameters"))
+    return _Found(base, own, fixed, where)
 
 
 def _unknown_kind(where: str, kind: str) -> CaseInputError:
@@ -439,9 +434,8 @@ def _euler(parameters: Floats, fixed: Floats) -> Floats:
     return turn
 
 
-def _versor(parameters: Floats, fixed: Floats) -> Floats:
+def _versor(parameters: Floats, _: Floats) -> Floats:
     """The rotation of the unit quaternion with vector part v and real part √(1 − |v|²)."""
-    del fixed
     v = parameters[:3]
     square = float(v @ v)
     if square > 1.0 + 1e-9:
@@ -452,21 +446,14 @@ def _versor(parameters: Floats, fixed: Floats) -> Floats:
     return turn
 
 
-def _matrix(parameters: Floats, fixed: Floats) -> Floats:
-    del fixed
-    return parameters[:9].reshape(3, 3)
-
-
-def _no_turn(parameters: Floats, fixed: Floats) -> Floats:
-    del parameters, fixed
-    return np.eye(3)
-
-
 # Number of parameters of each kind, and the rotation that they describe.
 ITK_KINDS: Mapping[str, tuple[int, Callable[[Floats, Floats], Floats]]] = MappingProxyType({
     "Euler3DTransform": (6, _euler), "VersorRigid3DTransform": (6, _versor),
-    "VersorTransform": (3, _versor), "TranslationTransform": (3, _no_turn),
-    "IdentityTransform": (0, _no_turn), "AffineTransform": (12, _matrix),
-    "MatrixOffsetTransformBase": (12, _matrix), "Rigid3DTransform": (12, _matrix),
+    "VersorTransform": (3, _versor), "TranslationTransform": (3, lambda *_: np.eye(3)),
+    "IdentityTransform": (0, lambda *_: np.eye(3)),
+    **dict.fromkeys(
+        ("AffineTransform", "MatrixOffsetTransformBase", "Rigid3DTransform"),
+        (12, lambda parameters, _: parameters[:9].reshape(3, 3)),
+    ),
 })  # fmt: skip
 WITHOUT_SHIFT = ("VersorTransform", "IdentityTransform")
