@@ -5,7 +5,7 @@ Kim et al. (2010), section 2.3; Uesu et al. (2005).
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,19 +27,21 @@ from cmfsim.values.tissue_data import DEFAULT_PRESET, MIXINGS, TissueData
 MODULI_CODES = frozenset({"muscle-moduli", "moduli-unusual"})
 
 
-def mixed_tissue(
-    shares: MuscleShares, names: Sequence[str], moduli: TissueModuli, mixing: str
+def _tissue(
+    shares: MuscleShares, names: Sequence[str], moduli: TissueModuli, preset: str, mixing: str
 ) -> tuple[Tissue, TissueData | None]:
-    """The tissue of every tet, and the arrays that a scene takes for it.
+    """The tissue of every tet, and the arrays that a scene takes for it unless it has others.
 
     With the share p_i of muscle i in the tet and p = Σ p_i: "moduli" mixes
     E = E_fat (1 − p) + Σ p_i E_i along and across the mean fibre, and ν likewise; "stiffness" mixes
     C = C_fat (1 − p) + Σ p_i C_i(a_i). Both are the rules of the presets where all E_i are equal.
 
     names: Of the muscles, in the order of the shares.
-    moduli: Without gaps.
-    Returns: None for "stiffness", whose arrays are those of the tissue.
+    Returns: None for "stiffness", whose arrays are those of the tissue, and for a preset.
     """
+    if moduli.is_preset(preset):
+        return shares.tissue(preset, mixing=mixing), None
+    moduli = moduli.resolved(preset)
     rows = [moduli.muscles.get(name, moduli.muscle) for name in names]
     table = np.array([row.constants() for row in rows], dtype=np.float64).reshape(-1, 3)
     young, poisson = moduli.fat.constants()
@@ -127,7 +129,8 @@ class HasMuscles(Protocol):
 
 
 # What muscles are given as.
-Muscles = HasMuscles | Sequence[MuscleSurface | SurfaceData | Surface]
+Muscle = MuscleSurface | SurfaceData | Surface
+Muscles = HasMuscles | Sequence[Muscle]
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +141,7 @@ class PreparedMuscles:
     ready: Of each, in the same order.
     """
 
-    named: Mapping[str, MuscleSurface | SurfaceData | Surface]
+    named: Mapping[str, Muscle]
     ready: Sequence[tuple[Surface, MuscleFibres]]
 
 
@@ -148,7 +151,10 @@ def prepared_muscles(muscles: Muscles) -> PreparedMuscles:
     muscles: morphed template, or sequence of MuscleSurface, SurfaceData or Surface.
     Raises `MeshError`: As `equivalent_material`.
     """
-    named = _named(muscles)
+    return _prepared(_named(muscles))
+
+
+def _prepared(named: Mapping[str, Muscle]) -> PreparedMuscles:
     with ThreadPoolExecutor() as pool:  # most of the work is the core's, without the GIL
         return PreparedMuscles(named, tuple(pool.map(_ready, named, named.values())))
 
@@ -324,101 +330,61 @@ def equivalent_material(
     given = TissueModuli() if moduli is None else moduli
     check_instance("moduli", given, TissueModuli)
     start = time.perf_counter()
-    if isinstance(muscles, PreparedMuscles):
-        prepared = muscles
-        check_muscle_names(given, list(prepared.named))
-    else:
-        check_muscle_names(given, list(_named(muscles)))
-        prepared = prepared_muscles(muscles)
-    named, ready = prepared.named, prepared.ready
+    named = muscles.named if isinstance(muscles, PreparedMuscles) else _named(muscles)
+    check_muscle_names(given, list(named))
+    ready = (muscles if isinstance(muscles, PreparedMuscles) else _prepared(named)).ready
     surfaces_done = time.perf_counter()
     shares = _core.sample_muscles(mesh, ready, samples=samples, seed=seed, inside=inside)
     tissue_start = time.perf_counter()
-    mixed: TissueData | None = None
-    if given.is_preset(preset):
-        tissue = shares.tissue(preset, mixing=mixing)
-    else:
-        tissue, mixed = mixed_tissue(shares, list(named), given.resolved(preset), mixing)
+    tissue, mixed = _tissue(shares, list(named), given, preset, mixing)
     end = time.perf_counter()
-    volumes = _volumes(shares, named)
-    mixture = Mixture(
+    columns = [shares.volumes[key] for key in ("inside", "shared", "error", "enclosed")]
+    volumes = {name: MuscleVolume(*row) for name, *row in zip(named, *columns, strict=True)}
+    summary = {
+        "preset": preset,
+        "mixing": mixing,
+        "moduli": given.resolved(preset).as_dict(),
+        "inside": inside,
+        "samples_per_crossed_tet": int(samples),
+        "seed": int(seed),
+        "muscles": len(volumes),
+        # Not by BLAS: the last bit of its sums depends on the number of threads.
+        "muscle_volume": float(np.sum(shares.fraction * mesh.volumes)),
+        "muscle_tets": int(np.count_nonzero(shares.fraction)),
+        **shares.counts,
+    }
+    timings = {"surfaces": surfaces_done - start, **shares.timings}
+    timings |= {"tissue": end - tissue_start, "total": end - start}
+    points = shares.counts["points"]
+    _log.info("muscle in %d of %d tets, %d points", summary["muscle_tets"], mesh.n_tets, points)
+    return Mixture(
         fraction=frozen(shares.fraction),
         fibre=frozen(shares.fibre),
         coherence=frozen(shares.coherence),
         error=frozen(shares.error),
         tissue=tissue,
         volumes=MappingProxyType(volumes),
-        samples=shares.counts["points"],
-        findings=(
-            *_findings(volumes, shares.volumes["was_turned"], ready),
-            *moduli_findings(given, preset),
-        ),
-        summary=MappingProxyType(
-            {
-                "preset": preset,
-                "mixing": mixing,
-                "moduli": given.resolved(preset).as_dict(),
-                "inside": inside,
-                "samples_per_crossed_tet": int(samples),
-                "seed": int(seed),
-                "muscles": len(volumes),
-                **_counts(shares, mesh),
-            }
-        ),
-        timings=MappingProxyType(
-            {
-                "surfaces": surfaces_done - start,
-                **shares.timings,
-                "tissue": end - tissue_start,
-                "total": end - start,
-            }
-        ),
+        samples=points,
+        findings=(*_findings(volumes, shares, ready), *moduli_findings(given, preset)),
+        summary=MappingProxyType(summary),
+        timings=MappingProxyType(timings),
         shares=shares,
         mixed=mixed,
     )
-    _report(mixture, mesh)
-    return mixture
 
 
-def _volumes(shares: _core.MuscleShares, names: Iterable[str]) -> dict[str, MuscleVolume]:
-    columns = shares.volumes
-    return {
-        name: MuscleVolume(*(columns[key][i] for key in ("inside", "shared", "error", "enclosed")))
-        for i, name in enumerate(names)
-    }
-
-
-def _counts(shares: _core.MuscleShares, mesh: TetMesh) -> dict[str, float | int]:
-    """Volume and tets of muscle, and the counts of work."""
-    return {
-        # Not by BLAS: the last bit of its sums depends on the number of threads.
-        "muscle_volume": float(np.sum(shares.fraction * mesh.volumes)),
-        "muscle_tets": int(np.count_nonzero(shares.fraction)),
-        **shares.counts,
-    }
-
-
-def _report(mixture: Mixture, mesh: TetMesh) -> None:
-    for finding in mixture.findings:
-        _log.debug("%s: %s", finding.severity, finding.what)
-    held, points = mixture.summary["muscle_tets"], mixture.samples
-    _log.info("muscle in %d of %d tets, %d points", held, mesh.n_tets, points)
-
-
-def _named(muscles: Muscles) -> dict[str, MuscleSurface | SurfaceData | Surface]:
+def _named(muscles: Muscles) -> dict[str, Muscle]:
     """The muscles by their names, which differ."""
-    named: dict[str, MuscleSurface | SurfaceData | Surface] = {}
+    named: dict[str, Muscle] = {}
     listed = getattr(muscles, "muscles", muscles)
-    if isinstance(listed, SurfaceData | Surface | MuscleSurface) or not isinstance(
-        listed, Sequence
-    ):
+    if isinstance(listed, Muscle) or not isinstance(listed, Sequence):
         found = type(muscles).__name__
         raise MeshInputError(
             f"muscles is of type {found}: a Musculature, a morphed template or a sequence of "
             "MuscleSurface, SurfaceData or Surface is needed"
         )
     for i, muscle in enumerate(listed):
-        if not isinstance(muscle, MuscleSurface | SurfaceData | Surface):
+        if not isinstance(muscle, Muscle):
             raise MeshInputError(
                 f"muscles[{i}] is of type {type(muscle).__name__}: a MuscleSurface, SurfaceData or "
                 "Surface is needed"
@@ -430,9 +396,7 @@ def _named(muscles: Muscles) -> dict[str, MuscleSurface | SurfaceData | Surface]
     return named
 
 
-def _ready(
-    name: str, muscle: MuscleSurface | SurfaceData | Surface
-) -> tuple[Surface, MuscleFibres]:
+def _ready(name: str, muscle: Muscle) -> tuple[Surface, MuscleFibres]:
     """The surface and the fibres of a muscle, ready for the core."""
     try:
         if isinstance(muscle, MuscleSurface):
@@ -445,13 +409,13 @@ def _ready(
 
 def _findings(
     volumes: Mapping[str, MuscleVolume],
-    turned: Sequence[bool],
+    shares: MuscleShares,
     ready: Sequence[tuple[Surface, MuscleFibres]],
 ) -> Iterator[Finding]:
     if not volumes:
         yield Finding("muscles-none")
     for (name, volume), was_turned, (surface, fibres) in zip(
-        volumes.items(), turned, ready, strict=True
+        volumes.items(), shares.volumes["was_turned"], ready, strict=True
     ):
         if was_turned:
             yield Finding(

@@ -46,6 +46,7 @@ from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData, used_nodes
 
@@ -119,7 +120,6 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     grid: float = 1.5,
     skin_spacing: float = 2.0,
     options: EquilibriumOptions | None = None,
-    lip_contact: bool = True,
     progress: Progress | None = None,
 ) -> PostoperativeTruth:
     """The face after the operation of a case, computed independently of the models under test.
@@ -138,17 +138,14 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     grid: mm. Spacing of the level images from which the mesh is made.
     skin_spacing: mm, of the marching cubes that make the skin.
     options: By default, `STEPS_WITH_LIPS` steps if the lips are separate.
-    lip_contact: False lets separate lips pass through each other, to show the effect of their
-        contact.
     progress: Called with the name of each stage as it begins.
     Raises `CmfsimError`: Any error of a stage.
     """
     stage = progress or no_progress
-    length = as_positive("edge_length", edge_length)
     separate = patient.separate_lips
     if options is None and separate:
         options = EquilibriumOptions(steps=STEPS_WITH_LIPS)
-    fine = _true_case(case, head, patient.tissue, length, refine=refine or separate)
+    fine = _true_case(case, head, patient.tissue, edge_length, refine=refine or separate)
     stage("drawing the true anatomy")
     drawn = _drawn(head, as_positive("grid", grid), separate_lips=separate)
     model = build_model(fine, progress=progress, check=False, anatomy=drawn.anatomy)
@@ -157,15 +154,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
 
     stage("opening bite and cuts")
     distances = bone_distances(model.scene.nodes, segments)
-    opened = _opened(
-        model.scene.nodes,
-        model.scene.tets,
-        model.kinds,
-        distances,
-        motions,
-        gap=drawn.bite,
-        open_mouth=drawn.slit is not None,
-    )
+    opened = _opened(model, drawn, distances, motions)
     nodes, tets = opened.nodes, opened.tets
 
     stage("placing the true muscles")
@@ -175,17 +164,12 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     stage("moving the bones")
     body = HyperelasticBody(nodes, tets, tissue)
     operation, lips = _operated(opened, drawn.slit, distances, segments, motions)
-    contact: Contact = operation.contact
-    if lips is not None and lip_contact:
-        contact = ContactSum((operation.contact, lips))
-    found = find_equilibrium(body, operation.held, operation.path, contact, options)
+    touching: Contact = operation.contact if lips is None else ContactSum((operation.contact, lips))
+    found = find_equilibrium(body, operation.held, operation.path, touching, options)
 
     stage("moving the skin")
     before = head.surface("skin", skin_spacing)
-    after, landmarks = _moved_skin(
-        patient, head, opened, found.displacements, before=before, segments=segments
-    )
-    on_skin = np.abs(depth) < NEAR_SKIN
+    after, landmarks = _moved_skin(patient, head, opened, found.displacements, before, segments)
     return PostoperativeTruth(
         nodes=nodes,
         tets=tets,
@@ -201,7 +185,7 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
         equilibrium=found,
         operation=operation,
         volume_ratios=body.volume_ratios(found.displacements),
-        last_step=float(np.linalg.norm(found.last_step[on_skin], axis=1).max()),
+        last_step=float(np.linalg.norm(found.last_step[np.abs(depth) < NEAR_SKIN], axis=1).max()),
         lips=lips,
     )
 
@@ -247,7 +231,7 @@ def _true_case(
     return replace(
         case,
         region=replace(case.region, upper=float(head.skull_landmarks["nasion"][2]) + ABOVE_NASION),
-        mesh=replace(case.mesh, edge_length=edge_length, refine=refine),
+        mesh=replace(case.mesh, edge_length=as_positive("edge_length", edge_length), refine=refine),
         # The operation itself strips tissue off the bone, by how far the sides of a cut move apart.
         node_kinds=dict(kinds, lifted=0.0, septum=False),
         muscles=None,
@@ -301,12 +285,11 @@ def _operated(
     return operation, lips
 
 
-def _moved_skin(
+def _moved_skin(  # noqa: PLR0917 (who, and what was done)
     patient: VirtualPatient,
     head: PhantomHead,
     tissue: "_Opened",
     displacements: Floats,
-    *,
     before: SurfaceData,
     segments: Mapping[str, BoneSegment],
 ) -> tuple[Floats, dict[str, Floats]]:
@@ -317,7 +300,9 @@ def _moved_skin(
     moved = points + carried(points, tissue.nodes, tissue.tets, displacements)
     if patient.thickness_change:
         outward = _outward(patient, before, after, segments)
-        after, moved = after + outward, moved + outward[_nearest(points, places)]
+        spatial = third_party("scipy.spatial", "virtual patients are made", "study")
+        nearest = spatial.cKDTree(places).query(points)[1]
+        after, moved = after + outward, moved + outward[nearest]
     return after, dict(zip(names, moved, strict=True))
 
 
@@ -341,13 +326,6 @@ def _departure(patient: VirtualPatient, head: PhantomHead, segment: str) -> Floa
     return rigid_motion(error.translation, error.angle, error.axis, centre)
 
 
-def _nearest(points: Floats, places: Floats) -> NDArray[np.intp]:
-    """Index of the nearest place to each point."""
-    spatial = third_party("scipy.spatial", "virtual patients are made", "study")
-    nearest: NDArray[np.intp] = spatial.cKDTree(places).query(points)[1]
-    return nearest
-
-
 def _outward(
     patient: VirtualPatient, before: SurfaceData, after: Floats, segments: Mapping[str, BoneSegment]
 ) -> Floats:
@@ -369,32 +347,28 @@ class _Opened:
 
 
 def _opened(
-    nodes: Floats,
-    tets: NDArray[Any],
-    kinds: NodeKinds,
+    model: PatientModel,
+    drawn: _Drawn,
     distances: Mapping[str, ImageData],
     motions: Mapping[str, Floats],
-    *,
-    gap: float,
-    open_mouth: bool,
 ) -> _Opened:
     """The largest body that remains without the tissue between tooth rows and separated bones.
 
     If the mouth is open already, nothing is removed from between the jaws.
     """
+    nodes, tets, open_mouth = model.scene.nodes, model.scene.tets, drawn.slit is not None
     upper = next((name for name in ("maxilla", "cranium") if name in distances), None)
     lower = next((name for name in ("mandible_body", "mandible") if name in distances), None)
     jaws = tuple(name for name in (upper, lower) if name is not None)
     kept = without_gaps(nodes, tets, distances, motions, jaws if open_mouth else ())
     if upper is not None and lower is not None and not open_mouth:
-        kept &= without_bite(nodes, tets, distances[upper], distances[lower], gap)
+        kept &= without_bite(nodes, tets, distances[upper], distances[lower], drawn.bite)
     bared = np.zeros(len(nodes), dtype=bool)
     bared[tets[~kept]] = True
     tets = tets[kept]
     used, left = used_nodes(tets[largest_body(tets)])
-    return _Opened(
-        nodes[used], left.astype(np.uint32), kinds.of_nodes(used), np.flatnonzero(bared[used])
-    )
+    kinds = model.kinds.of_nodes(used)
+    return _Opened(nodes[used], left.astype(np.uint32), kinds, np.flatnonzero(bared[used]))
 
 
 def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
