@@ -31,8 +31,6 @@ from cmfsim.values.skin_band import WHOLE_FACE, BandOptions, SkinBand
 
 # Regions of `skin_regions` that a band holds simultaneously, each by itself.
 BAND_REGIONS = (WHOLE_FACE, "nose", "upper lip", "lower lip", "chin", "left cheek", "right cheek")
-
-
 # Noses and necks, which are deeper, do not become thicker as cheeks do, mm.
 THICKEST = 12.0
 

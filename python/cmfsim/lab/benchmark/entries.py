@@ -212,14 +212,8 @@ class Ratio:
 
 
 _UPPER = ("maxilla",)
-
-
 _LOWER = ("mandible_body", "mandible")
-
-
 _CHIN = ("chin", *_LOWER)
-
-
 # Of 32 patients after Le Fort I and sagittal split, scanned in three dimensions (PMC6173856, 2018):
 # pronasale 17 % and labiale superius 21 % of a maxilla advanced, 14 % of one set back; labiale
 # inferius 66 % of the mandible. Of 26 patients after a setback (Angle Orthod 80:896, 2010):
@@ -234,16 +228,10 @@ SKIN_RATIOS = (
     Ratio("labiale_inferius", "infradentale", _LOWER, 0.66, 0.66),
     Ratio("pogonion", "pogonion", _CHIN, 0.93, 0.93),
 )
-
-
 # Landmarks that jaws do not move.
 STILL = ("nasion", "exocanthion_L", "exocanthion_R", "endocanthion_L", "endocanthion_R")
-
-
 # Skin this far from the mouth stays, mm; so many of its points hold the spline.
 FAR, ANCHORS = 80.0, 60
-
-
 # Axis that points backwards.
 BACK = 1
 

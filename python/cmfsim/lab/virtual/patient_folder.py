@@ -35,8 +35,6 @@ from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 
 _log = logging.getLogger(__name__)
-
-
 # Standard deviations, mm: of a landmark along each axis, on the skull for one operator and on the
 # skin for the mean of several; of a surface scanner's noise at a point, and of its waves.
 SKULL_NOISE, SKIN_NOISE = 0.7, 0.3

@@ -173,11 +173,7 @@ class VirtualPatient:
 
 
 _BOTH_JAWS = ("le_fort_1", "bsso")
-
-
 _WITH_CHIN = ("le_fort_1", "bsso", "genioplasty")
-
-
 # People and motions are our own: of the kind and size of the paper's four patients, not its data.
 # Lips are 2 mm apart and teeth 2.5 mm, as in a patient who is scanned at rest.
 # P5 and P6 have lips 2 mm apart too: an open mandible widens `lip_gap`. In P5 the mouth closes and
@@ -258,8 +254,6 @@ _PEOPLE = (
         separate_lips=True,
     ),
 )  # fmt: skip
-
-
 PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType({p.number: p for p in _PEOPLE})
 
 

@@ -60,8 +60,6 @@ ATTRIBUTION = "BodyParts3D, © The Database Center for Life Science"
 # Left and right of one person differ by 1 % in volume in these files; where they differ by more,
 # the broken one of them has lost a part.
 MIRROR_VOLUME_SHARE = 0.05
-
-
 # Measured on these files: 49002 runs forward on its way down, behind and 2.4 mm inside 49005, as
 # the deep part does. Names follow the ids all the same, so that they can be looked up.
 _EXCHANGED_NAMES = Finding(

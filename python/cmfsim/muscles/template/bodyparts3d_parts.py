@@ -211,8 +211,6 @@ HASHES: Mapping[str, str] = MappingProxyType(
         "FMA57143": "7617248a11b170ad3940db35106e50ce43468a6db70c8c1b84d11b0a03963341",
     }
 )
-
-
 # Lines across a muscle, and points along each; a line's points lie a few millimetres apart.
 LINES, POINTS = 9, 25
 # Share of the width at either side that no line runs in: there the muscle is too thin to be met.

@@ -63,16 +63,10 @@ class Moduli:
 # added pressure is so many times that of λ̂ (J − 1), enough that no tet of the truth turns inside
 # out where the corners of the mouth fold.
 CRUSHED = 0.2
-
-
 CRUSHED_PRESSURE = 10.0
-
-
 # Fat of Table 1 of Kim et al. (2010); muscle with the table's moduli exchanged, stiffer along the
 # fibre as passive muscle is. The default preset of the tested models has them as printed.
 FAT = Moduli(0.003, 0.003, 0.46)
-
-
 MUSCLE = Moduli(0.79, 0.5, 0.43)
 
 
