@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 import cmfsim
 from benches.scenes.marked import publish
-from cmfsim.pipeline.face_regions import face_landmarks
+from cmfsim.pipeline.banding import face_landmarks
 
 NAME = "benches/accuracy/skin_roughness.py"
 RADIUS = 8.0

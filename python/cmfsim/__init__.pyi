@@ -177,11 +177,11 @@ from cmfsim.pipeline.building.tissue.muscles import with_muscles as with_muscles
 from cmfsim.pipeline.evaluating import CaseEvaluation as CaseEvaluation
 from cmfsim.pipeline.evaluating import evaluate as evaluate
 from cmfsim.pipeline.outputs.model import build_case as build_case
-from cmfsim.pipeline.outputs.planning_page import write_planning_page as write_planning_page
-from cmfsim.pipeline.outputs.splint import make_splint as make_splint
-from cmfsim.pipeline.outputs.splint import plan_for_bite as plan_for_bite
 from cmfsim.pipeline.planning import PlanningPage as PlanningPage
 from cmfsim.pipeline.planning import make_planning_page as make_planning_page
+from cmfsim.pipeline.planning import make_splint as make_splint
+from cmfsim.pipeline.planning import plan_for_bite as plan_for_bite
+from cmfsim.pipeline.planning import write_planning_page as write_planning_page
 from cmfsim.pipeline.predicting import predict as predict
 from cmfsim.pipeline.predicting import predict_models as predict_models
 from cmfsim.pipeline.proposing import propose_landmarks as propose_landmarks

@@ -23,8 +23,7 @@ from cmfsim.phantom.grid import (
     mixed,
     noisy,
 )
-from cmfsim.phantom.head import HEAD_BOX, skin_shape
-from cmfsim.phantom.landmarks import find_skin_landmarks, find_skull_landmarks
+from cmfsim.phantom.head import HEAD_BOX, find_skin_landmarks, find_skull_landmarks, skin_shape
 from cmfsim.phantom.muscles import Muscle, make_muscles
 from cmfsim.phantom.parameters import FaceWarp, HeadParameters, JawWarp, JawWarped
 from cmfsim.phantom.skull import (

@@ -23,10 +23,10 @@ from cmfsim.evaluation import (
     unmoved_regions,
 )
 from cmfsim.io import Case, CaseOrPath, as_case
+from cmfsim.pipeline.banding import face_landmarks
 from cmfsim.pipeline.building.inputs import case_key
 from cmfsim.pipeline.building.stages import BuildKeywords, build_options
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative, read_postoperative
-from cmfsim.pipeline.face_regions import face_landmarks
 from cmfsim.pipeline.predicting import named_models, predictions_of
 from cmfsim.surfaces.depth import tissue_depth
 from cmfsim.values.checks import Floats

@@ -19,7 +19,7 @@ from cmfsim.cli import main
 from cmfsim.cli.patients.case_commands import case_of
 from cmfsim.io.cases.tables import read_tables
 from cmfsim.pipeline.building.inputs import plan_key
-from cmfsim.pipeline.outputs.planning_page import page_state
+from cmfsim.pipeline.planning import page_state
 from head_case import HeadCase
 
 pytest.importorskip("skimage")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.muscles.fitting.lattice import Lattice
 from cmfsim.muscles.fitting.room import Room, known_part
+from cmfsim.muscles.fitting.solving import Lattice
 from real_heads import anatomy as real_anatomy
 from real_heads import landmarks as real_landmarks
 

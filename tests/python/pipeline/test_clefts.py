@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.pipeline.building.skin.lips import held_part
+from cmfsim.pipeline.building.skin import held_part
 from cmfsim.pipeline.building.tissue.contacts import (
     cleft_tets,
     crushed_tets,

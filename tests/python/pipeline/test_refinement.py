@@ -5,7 +5,7 @@ import pytest
 
 import cmfsim
 from cmfsim.meshing import TissueRegion, tissue_level
-from cmfsim.pipeline.building.tissue.tissue_mesh import (
+from cmfsim.pipeline.building.tissue.nodes import (
     GAP_REFINEMENTS,
     MOUTH_DEPTH,
     MOUTH_LENGTH,

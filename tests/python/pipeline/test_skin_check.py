@@ -7,7 +7,7 @@ import cmfsim
 import real_heads
 from benches.scenes import ct_variants as variants
 from cmfsim import SegmentOptions, segment_head
-from cmfsim.pipeline.building.skin.skin_part import check_skin
+from cmfsim.pipeline.building.skin import check_skin
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")

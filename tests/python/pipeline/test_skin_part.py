@@ -5,7 +5,7 @@ import pytest
 
 import cmfsim
 from benches.scenes import meshes
-from cmfsim.pipeline.building.skin import skin_part
+from cmfsim.pipeline.building import skin as skin_part
 
 RADIUS = 30.0
 

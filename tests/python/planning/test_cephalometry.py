@@ -7,7 +7,7 @@ import pytest
 
 import cmfsim
 import shared_values
-from cmfsim.pipeline.face_regions import face_motion
+from cmfsim.pipeline.banding import face_motion
 from cmfsim.values.landmark_sites import profile_sites
 
 # Sites that synthetic heads do not have, LPS mm: as on a lateral radiograph.

@@ -18,8 +18,7 @@ from cmfsim.cli.terminal import Notices, StageProgress, can_open, escaped, open_
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface, write_plan, write_surface
 from cmfsim.pipeline.building.inputs import check_output, plan_key
-from cmfsim.pipeline.outputs.planning_page import PLAN_FILE
-from cmfsim.pipeline.planning import TARGET_STD, PlanningPage, make_planning_page
+from cmfsim.pipeline.planning import PLAN_FILE, TARGET_STD, PlanningPage, make_planning_page
 from cmfsim.planning.face_planning import FacePlan
 from cmfsim.planning.replanning import USUAL, ExpectedError, PlanCorrection
 from cmfsim.planning.server import open_port, serve_planning
@@ -176,7 +175,7 @@ def splint_case(options: argparse.Namespace) -> int:
     findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     more = {} if options.thickness is None else {"thickness": options.thickness}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        made = import_module("cmfsim.pipeline.outputs.splint").make_splint(
+        made = import_module("cmfsim.pipeline.planning").make_splint(
             case,
             intermediate=options.intermediate,
             opening=options.open,
@@ -216,7 +215,7 @@ def bite_case(options: argparse.Namespace) -> int:
     notices = Notices(quiet=options.quiet)
     findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
-        bite, plan = import_module("cmfsim.pipeline.outputs.splint").plan_for_bite(
+        bite, plan = import_module("cmfsim.pipeline.planning").plan_for_bite(
             case, *scans, progress=progress.stage, check=False, findings=findings, observer=notices
         )
         path.parent.mkdir(parents=True, exist_ok=True)

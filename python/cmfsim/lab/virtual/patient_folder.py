@@ -18,7 +18,6 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cases.cohorts import COHORT_FORMAT
 from cmfsim.io.files.reading_writing import replacing
-from cmfsim.lab.virtual.carried_skin import scanned
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
 from cmfsim.lab.virtual.population import (
     DRAWN,
@@ -28,7 +27,7 @@ from cmfsim.lab.virtual.population import (
     VirtualPatient,
     patient_named,
 )
-from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth
+from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth, scanned
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.values.checks import Floats, as_number, as_positive
 from cmfsim.values.progress import Progress, no_progress

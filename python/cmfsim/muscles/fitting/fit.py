@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface
 from cmfsim.errors import MeshError, MeshInputError
-from cmfsim.muscles.fitting.lattice import Lattice
 from cmfsim.muscles.fitting.room import Room
-from cmfsim.muscles.fitting.solving import Problem, Targets, Volumes
-from cmfsim.muscles.template.morphing import MorphedMusculature
+from cmfsim.muscles.fitting.solving import Lattice, Problem, Targets, Volumes
+from cmfsim.muscles.template.muscle_template import MorphedMusculature
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding

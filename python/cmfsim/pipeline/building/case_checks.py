@@ -16,7 +16,6 @@ from cmfsim.io import Case
 from cmfsim.meshing import TissueRegion
 from cmfsim.meshing.lips import LipSeam
 from cmfsim.meshing.node_kinds import DentalArches
-from cmfsim.pipeline.building.skin.lips import CaseLipContact
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.values.anatomy import Anatomy, BoneSegment
@@ -28,6 +27,7 @@ from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import LiftedTissue
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +78,20 @@ class Tissue:
     arches: DentalArches | None
     seam: LipSeam | None
     contacts: CaseContacts
+
+
+@dataclass(frozen=True, eq=False)
+class CaseLipContact:
+    """The lips of a case, and what they may not enter.
+
+    regions: "upper" and "lower"; none where the lips are not separated.
+    kinds: Of all nodes, those that may lift off the teeth free.
+    """
+
+    regions: Mapping[str, LipRegion]
+    kinds: NodeKinds
+    touching: tuple[TouchingData, ...] = ()
+    obstacles: tuple[ObstacleData, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,14 +48,12 @@ from cmfsim.pipeline.building.landmarks import (
     is_to_be_found,
     landmark_summary,
 )
-from cmfsim.pipeline.building.skin.lips import find_seam, lip_summary
-from cmfsim.pipeline.building.skin.skin_part import check_skin, on_skin
+from cmfsim.pipeline.building.skin import check_skin, find_seam, lip_summary, on_skin, with_photo
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, Stages, build_options
 from cmfsim.pipeline.building.surgery.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative
 from cmfsim.pipeline.building.tissue.contacts import mean_edge
-from cmfsim.pipeline.building.tissue.nodes import made_contacts, nodes_of
-from cmfsim.pipeline.building.tissue.tissue_mesh import region_of, tissue_mesh
+from cmfsim.pipeline.building.tissue.nodes import made_contacts, nodes_of, region_of, tissue_mesh
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -205,9 +203,6 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
     head = _head(case, stages, options)
     stages.add(check_skin(head.anatomy, head.skull))
     if case.photo is not None:
-        # A case without a photo loads nothing of it.
-        from cmfsim.pipeline.building.skin.skin_part import with_photo  # noqa: PLC0415
-
         stages.begin("placing the 3D photo")
         skin, colours, placed = with_photo(head)
         head = replace(head, skin=skin, colours=colours)

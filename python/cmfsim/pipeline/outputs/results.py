@@ -58,11 +58,11 @@ from cmfsim.pictures import (
 from cmfsim.pictures.canvas import Painter
 from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.faces import animate_face
+from cmfsim.pipeline.banding import face_motion
 from cmfsim.pipeline.building.inputs import input_hash
 from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import CaseEvaluation
-from cmfsim.pipeline.face_regions import face_motion
-from cmfsim.pipeline.outputs.planning_page import PAGE_FILE, page_state
+from cmfsim.pipeline.planning import PAGE_FILE, page_state
 from cmfsim.planning.face_measures import clinical_figures
 from cmfsim.planning.face_view import face_view
 from cmfsim.planning.occlusion import ContactMap, planned_contacts

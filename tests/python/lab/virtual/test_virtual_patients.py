@@ -11,11 +11,10 @@ from benches.scenes import meshes
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError
 from cmfsim.lab.virtual import PATIENTS, EquilibriumOptions
-from cmfsim.lab.virtual.carried_skin import carried, scanned
 from cmfsim.lab.virtual.mechanics.muscle_field import muscle_field, skin_share, thickened
 from cmfsim.lab.virtual.operation import bone_distances, screw, without_bite, without_gaps
 from cmfsim.lab.virtual.patient_folder import virtual_patients
-from cmfsim.lab.virtual.truth import largest_body
+from cmfsim.lab.virtual.truth import carried, largest_body, scanned
 
 # A twin that a test can afford: 8.5 mm tets (coarser ones have holes over the nasal bone).
 COARSE = {"edge_length": 8.5, "spacing": 4.0, "grid": 3.0, "skin_spacing": 6.0}

@@ -10,7 +10,7 @@ from build_runs import PICTURES, run
 
 import cmfsim
 import phantom_case
-from cmfsim.pipeline.building.tissue import tissue_mesh
+from cmfsim.pipeline.building.tissue import nodes as tissue_mesh
 from cmfsim.pipeline.outputs import model as model_output
 from shared_values import drawn_levels
 

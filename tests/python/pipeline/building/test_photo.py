@@ -11,7 +11,7 @@ from cmfsim.doctor.surgery.operation import check_photo
 from cmfsim.io import write_landmarks
 from cmfsim.pipeline.building.case_checks import Head
 from cmfsim.pipeline.building.inputs import input_hashes, plan_key
-from cmfsim.pipeline.building.skin.skin_part import GREY, with_photo
+from cmfsim.pipeline.building.skin import GREY, with_photo
 from cmfsim.values.case_parts import CasePhoto
 
 pytest.importorskip("vtkmodules")

@@ -14,7 +14,7 @@ from cmfsim.muscles.equivalent import (
 )
 from cmfsim.muscles.fitting import MuscleFit, fit_muscles
 from cmfsim.muscles.template import MuscleTemplate
-from cmfsim.muscles.template.morphing import MorphedMusculature, too_few, without_lost
+from cmfsim.muscles.template.muscle_template import MorphedMusculature, too_few, without_lost
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.checks import Floats

@@ -1,1 +1,0 @@
-"""The skin of a case: its part of the mesh, its check, its lips."""
