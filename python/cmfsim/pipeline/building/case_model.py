@@ -364,9 +364,8 @@ def _meshed(head: Head) -> MeshedTissue:
     """The tissue of a head, with its mesh where no seam between the lips has to be found first."""
     region = region_of(head.case, head.anatomy, head.skull)
     level, findings = tissue_level(head.anatomy, region)
-    if head.case.lips.contact:
-        return MeshedTissue(region, level, findings)
-    return MeshedTissue(region, level, findings, tissue_mesh(head.case, level, head.anatomy))
+    filled = None if head.case.lips.contact else tissue_mesh(head.case, level, head.anatomy)
+    return MeshedTissue(region, level, findings, filled)
 
 
 def _tissue(

@@ -139,18 +139,9 @@ def segment_options(case: Case) -> SegmentOptions:
 
     if case.image is None:
         return SegmentOptions()
-    given = {
-        name: getattr(case.image, name)
-        for name in (
-            "skin_threshold",
-            "bone_threshold",
-            "metal_threshold",
-            "working_spacing",
-            "rescale",
-        )
-        if getattr(case.image, name) is not None
-    }
-    return SegmentOptions(**given)
+    names = ("skin_threshold", "bone_threshold", "metal_threshold", "working_spacing", "rescale")
+    given = {name: getattr(case.image, name) for name in names}
+    return SegmentOptions(**{name: value for name, value in given.items() if value is not None})
 
 
 def read_motion(
@@ -166,11 +157,13 @@ def read_motion(
         return read_transform(motion.transform, direction=motion.direction, frame=motion.frame)
     if motion.surface is None or motion.moved_surface is None:
         return np.eye(4)
-    units: str = "mm"
-    frame: str | None = None
-    if case.surfaces is not None:
-        units, frame = case.surfaces.units, case.surfaces.frame
-    return read_bone_pair(motion.surface, motion.moved_surface, units=units, frame=frame)
+    return read_bone_pair(motion.surface, motion.moved_surface, **stated_frame(case))
+
+
+def stated_frame(case: Case) -> dict[str, Any]:
+    """Unit and frame in which a case gives its surfaces, as their readers take them."""
+    given = case.surfaces
+    return {} if given is None else {"units": given.units, "frame": given.frame}
 
 
 def motion_source(motion: CaseMotion) -> str:

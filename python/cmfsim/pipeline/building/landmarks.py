@@ -239,9 +239,16 @@ def found_landmarks(
                 "Place infradentale, sub_m2_L and sub_m2_R by hand and name the file under "
                 "[landmarks], or give surfaces of both bones"
             )
-        anatomy = _with_one_bone(anatomy)
+        # Its bones are one skull, as where jaws are not separated.
+        levels = list(anatomy.bones.values())
+        whole = np.maximum.reduce([level.values for level in levels])
+        anatomy = replace(anatomy, bones={"skull": levels[0].with_values(whole)})
         points["skull"] = {n: p for n, p in points["skull"].items() if not is_lower_site(n)}
-        stages.add([_without_mandible(found.impossible_jaw)])
+        what = (
+            "the mandible is not separated from the skull, because the part taken for it is not "
+            f"one: {found.impossible_jaw}; the plan does not need it"
+        )
+        stages.add([Finding("mandible-left-out", what, where="bone")])
         findings = tuple(f for f in findings if f.code != "jaw-doubtful")
     elif anatomy is not read:
         stages.drop({BY_SHAPE})
@@ -298,13 +305,6 @@ def _check_jaw_of_placed(
         )
 
 
-def _with_one_bone(anatomy: Anatomy) -> Anatomy:
-    """The anatomy with its bones as one skull, as where jaws are not separated."""
-    levels = list(anatomy.bones.values())
-    whole = np.maximum.reduce([level.values for level in levels])
-    return replace(anatomy, bones={"skull": levels[0].with_values(whole)})
-
-
 def _not_found(reason: str, count: int) -> Finding:
     if count:
         return Finding(
@@ -317,15 +317,6 @@ def _not_found(reason: str, count: int) -> Finding:
         "landmarks-not-found",
         f"the case names no landmarks, and none were found automatically: {reason}",
         where="landmarks",
-    )
-
-
-def _without_mandible(reason: str) -> Finding:
-    return Finding(
-        "mandible-left-out",
-        f"the mandible is not separated from the skull, because the part taken for it is not one: "
-        f"{reason}; the plan does not need it",
-        where="bone",
     )
 
 

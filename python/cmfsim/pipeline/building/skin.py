@@ -19,6 +19,7 @@ from cmfsim.meshing import separated_mesh
 from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.case_checks import CaseLipContact, Head
+from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.surfaces.barycentric import barycentric
 from cmfsim.surfaces.levels import SurfaceOptions, contact_surface, surface_of_level
@@ -94,11 +95,7 @@ def find_seam(
     seam = case.lips.seam
     file = seam if isinstance(seam, Path) else case.mesh.parting
     if file is not None:
-        units: str = "mm"
-        frame: str | None = None
-        if case.surfaces is not None:
-            units, frame = case.surfaces.units, case.surfaces.frame
-        surface = read_surface(file, units=units, frame=frame)
+        surface = read_surface(file, **stated_frame(case))
         return LipSeam(_upwards(surface), "file", {"source": "file", "file": file.name})
     by_jaw = {} if arches is None else arches.by_jaw
     return lip_seam(anatomy, by_jaw, skin, way=str(seam), depth=case.lips.depth)

@@ -89,6 +89,10 @@ BOXES_CAPTION = (
     "Sizes of the errors by region: quartiles, median, mean (diamond), whiskers to 1.5 boxes, and "
     "beyond them each outlier, with their number above (as the paper's Figure 9)."
 )
+ERROR_CAPTION = (
+    "Model {}: signed distance from the face after the operation, −5 to 5 mm; blue where the "
+    "prediction lies behind it, grey where nothing was evaluated (the paper's Figure 10)."
+)
 
 
 @dataclass(frozen=True)
@@ -326,20 +330,16 @@ def _earlier_evaluation(output: Path, key: str) -> dict[str, Any] | None:
 def _warn_of_removed(output: Path, names: Sequence[str]) -> None:
     if not names:
         return
+    # The files that state what the others are.
+    stated = [name for name in names if name.endswith((".json", ".html"))] or names
     _log.warning(
         "%s: removed %d files that belong to another plan, other inputs or another version: %s",
         output,
         len(names),
-        ", ".join(_statements(names)),
+        ", ".join(stated),
     )
     if EVALUATION_FILE in names:
         _log.warning("the comparison belonged to another plan: run cmfsim evaluate again")
-
-
-def _statements(names: Iterable[str]) -> list[str]:
-    """The files among some that state what the others are."""
-    names = list(names)
-    return [name for name in names if name.endswith((".json", ".html"))] or names
 
 
 def _more_files(
@@ -350,24 +350,15 @@ def _more_files(
     *,
     slicer: bool,
 ) -> list[str]:
-    """The names of the files of a prediction that were asked for beside those of each."""
-    names = []
+    """The names of the files beside those of each prediction: pictures that could be drawn."""
+    names: list[str] = []
     if slicer:
         write_slicer_bundle(folder / SLICER_FILE, prediction)
-        names.append(SLICER_FILE)
-    with clock.timed("waiting for the pictures"):
-        pictures = _drawn(begun)
-    return [*pictures, *names]
-
-
-def _drawn(begun: Mapping[str, "Future[None]"]) -> list[str]:
-    """The names of the pictures that were begun and could be drawn."""
-    names: list[str] = []
-    with optional_pictures():
+    with clock.timed("waiting for the pictures"), optional_pictures():
         for name, picture in begun.items():
             picture.result()
             names.append(name)
-    return names
+    return [*names, SLICER_FILE] if slicer else names
 
 
 def _pictures_of(
@@ -451,26 +442,17 @@ def _report_of(
     order = {model: number for number, model in enumerate(MODELS)}
     entries = sorted(written.predictions, key=lambda entry: order[entry.summary["model"]])
     found = {fresh / entry.place: read_prediction(fresh / entry.place) for entry in entries}
-    links = _links(output, found)
-    if evaluation is None:
-        return write_report_page(fresh, replace(_document(found, None, {}), links=links))
-    new = "sha256" not in evaluation
-    figures = {
-        name: (fresh / name).read_bytes()
-        if new
-        else read_evaluation_picture(output, evaluation, name)
-        for name in evaluation["files"]
-        if name.endswith(".png")
-    }
-    return write_report_page(fresh, replace(_document(found, evaluation, figures), links=links))
-
-
-def _links(folder: Path, found: Mapping[Path, Mapping[str, Any]]) -> dict[str, str]:
-    """The planning page of the folder, if it was made for the head and cuts of the predictions."""
-    state = page_state(folder / PAGE_FILE)
-    # Compared one by one: a file that was changed may hold anything there.
-    fits = state is not None and all(entry.get("plan_key") == state for entry in found.values())
-    return {"Planning page": PAGE_FILE} if fits else {}
+    figures = {}
+    if evaluation is not None:
+        is_new = "sha256" not in evaluation
+        figures = {
+            name: (fresh / name).read_bytes()
+            if is_new
+            else read_evaluation_picture(output, evaluation, name)
+            for name in evaluation["files"]
+            if name.endswith(".png")
+        }
+    return write_report_page(fresh, _document(output, found, evaluation, figures))
 
 
 def write_case_report(folder: Path) -> str | None:
@@ -494,25 +476,28 @@ def write_case_report(folder: Path) -> str | None:
     if evaluation is not None:
         names = [name for name in evaluation["files"] if name.endswith(".png")]
         figures = {name: read_evaluation_picture(folder, evaluation, name) for name in names}
-    document = _document(found, evaluation, figures, left_out)
-    return write_report_page(folder, replace(document, links=_links(folder, found)))
+    return write_report_page(folder, _document(folder, found, evaluation, figures, left_out))
 
 
 def _document(
+    folder: Path,
     found: Mapping[Path, Mapping[str, Any]],
     evaluation: Mapping[str, Any] | None,
     figures: Mapping[str, bytes],
     left_out: str = "",
 ) -> Document:
-    """The report of predictions in their places."""
+    """The report of predictions in their places, with the planning page of the folder.
+
+    That page is named if it was made for the head and cuts of the predictions.
+    """
     place, pictures = _shown(found)
     shown_figures = []
     # The box plot first: it shows all models together.
     for name in sorted(figures, key=lambda name: name != "errors.png"):
         model = name.removeprefix("error-").removesuffix(".png")
-        caption = BOXES_CAPTION if name == "errors.png" else _error_caption(model)
+        caption = BOXES_CAPTION if name == "errors.png" else ERROR_CAPTION.format(model)
         shown_figures.append(Figure(figures[name], caption))
-    return case_document(
+    document = case_document(
         list(found.values()),
         shown=found[place]["model"],
         evaluation=evaluation,
@@ -521,6 +506,10 @@ def _document(
         view=_view(place),
         left_out=left_out,
     )
+    state = page_state(folder / PAGE_FILE)
+    # Compared one by one: a file that was changed may hold anything there.
+    fits = state is not None and all(entry.get("plan_key") == state for entry in found.values())
+    return replace(document, links={"Planning page": PAGE_FILE} if fits else {})
 
 
 def _view(place: Path) -> tuple[str, str] | None:
@@ -608,13 +597,6 @@ def write_animation(folder: Path, path: Path) -> None:
     place, _ = _shown(predictions_of(folder))
     ((before, after),) = read_parts(place, ())["skin"].values()
     animate_face(path, before, after, read_face_colours(place))
-
-
-def _error_caption(model: str) -> str:
-    return (
-        f"Model {model}: signed distance from the face after the operation, −5 to 5 mm; blue where "
-        "the prediction lies behind it, grey where nothing was evaluated (the paper's Figure 10)."
-    )
 
 
 def write_report_page(folder: Path, document: Document) -> str | None:

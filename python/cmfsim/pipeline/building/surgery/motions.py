@@ -28,14 +28,13 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData, joined_surface
 
 if TYPE_CHECKING:
-    from cmfsim.bones.achieved import AchievedMotion
+    from cmfsim.bones.achieved import AchievedMotion, AchievedPlan
+
 # A size that differs by less was segmented otherwise, and is not reported. From the second on it is
 # a warning, as for bones that are followed vertex by vertex.
 NOTED, SCALED = 0.01, 0.03
 # Slip of vertices that is not reported, mm: noise of the scans does as much.
 SLID = 0.5
-if TYPE_CHECKING:
-    from cmfsim.bones.achieved import AchievedMotion, AchievedPlan
 Motions = Mapping[str, Floats | MovedSurface]
 
 
@@ -139,7 +138,7 @@ def _open_finding(name: str, where: str, way: OpenDirection, method: str) -> Fin
     """A motion of the bone that its shape hardly shows."""
     axis = ", ".join(f"{x:+.2f}" for x in way.axis)
     words = (
-        f"a rotation about the axis ({axis})" if way.is_turn else (f"a translation along ({axis})")
+        f"a rotation about the axis ({axis})" if way.is_turn else f"a translation along ({axis})"
     )
     left = (
         "that of the vertices, including their slip along the bone"
@@ -172,7 +171,7 @@ def _removed_finding(name: str, where: str, patch: RemovedBone, severity: str) -
     """A patch of bone that is not there after the operation."""
     at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
     used = (
-        "its vertices are not used" if severity == "warning" else ("it was not used for the motion")
+        "its vertices are not used" if severity == "warning" else "it was not used for the motion"
     )
     return Finding(
         "bone-removed",
@@ -371,7 +370,9 @@ def _achieved_bones(
             searched = [s for s in searched if s.name not in REFERENCES]
     else:
         still, reference = [], None
-    unknown = [n for n in after.bones if n not in names and n not in _sources(case) and n != "bone"]
+    # Bones of the case, as they are called before they are cut.
+    sources = ("cranium", "mandible", "skull") if case.surfaces is None else case.surfaces.bones
+    unknown = [n for n in after.bones if n not in {*names, *sources, "bone"}]
     if unknown:
         raise CaseInputError(
             f"{case.where(f'postoperative.bones.{unknown[0]}')}: there is no bone or segment "
@@ -409,11 +410,6 @@ def _achieved_bones(
     )
 
 
-def _sources(case: Case) -> tuple[str, ...]:
-    """Bones of the case, as they are called before they are cut."""
-    return ("cranium", "mandible", "skull") if case.surfaces is None else tuple(case.surfaces.bones)
-
-
 def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None:
     """The motion of a bone whose surface has the same triangles before and after; else none."""
     given = case.postoperative
@@ -446,7 +442,9 @@ def _parted(
     pieces = torn_pieces(motion)
     if len(pieces) == 1:
         return [(segment, pieces[0])]
-    named = {_numbered(segment.name, n): piece for n, piece in enumerate(pieces)}
+    named = {
+        f"{segment.name}_{n + 1}" if n else segment.name: piece for n, piece in enumerate(pieces)
+    }
     made = part_segment(segment, {name: piece.surface for name, piece in named.items()})
     findings.append(
         Finding(
@@ -459,7 +457,3 @@ def _parted(
         )
     )
     return [(piece, named[piece.name]) for piece in made]
-
-
-def _numbered(name: str, number: int) -> str:
-    return name if number == 0 else f"{name}_{number + 1}"

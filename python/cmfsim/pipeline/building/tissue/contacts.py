@@ -246,11 +246,6 @@ class CaseContacts:
     sheets: Mapping[str, ContactSheet] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
 
-    @property
-    def surfaces(self) -> dict[str, SurfaceData]:
-        """Their surfaces."""
-        return {name: sheet.surface for name, sheet in self.sheets.items()}
-
     def of_scene(self, segments: Sequence[BoneSegment], kinds: NodeKinds) -> dict[str, SurfaceData]:
         """The contact surface of each segment that nodes slide on."""
         return {
@@ -362,14 +357,11 @@ def _whole_bone(
         values = bone.values
         if values.shape != level.shape or not (inside & (values > 0.0)).any():
             continue
-        if not any(_mostly(other, values) for other in theirs):
+        # Unless more than half of a segment of the other arch lies in this bone.
+        mostly = (2 * np.count_nonzero(o & (values > 0.0)) > np.count_nonzero(o) for o in theirs)
+        if not any(mostly):
             level = np.maximum(level, values)
     return mine[0].level.with_values(level)
-
-
-def _mostly(inside: NDArray[np.bool_], bone: NDArray[Any]) -> bool:
-    """Whether more than half of a segment lies in a bone."""
-    return 2 * int(np.count_nonzero(inside & (bone > 0.0))) > int(np.count_nonzero(inside))
 
 
 def _bears_both(name: str) -> Finding:

@@ -35,6 +35,7 @@ from cmfsim.pipeline.building.case_checks import (
     cut_segments,
     untouched,
 )
+from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.skin import held_part, lip_contact, separated_at_seam
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
@@ -147,11 +148,7 @@ def tissue_mesh(
     made = mesh_from_level(level, options, allowed=allowed, needed=needed)
     if case.mesh.parting is None or seam is not None:
         return made.mesh, made.report, made.findings
-    units: str = "mm"
-    frame: str | None = None
-    if case.surfaces is not None:
-        units, frame = case.surfaces.units, case.surfaces.frame
-    parted = part_mesh(made.mesh, read_surface(case.mesh.parting, units=units, frame=frame))
+    parted = part_mesh(made.mesh, read_surface(case.mesh.parting, **stated_frame(case)))
     report = report_of_part(parted, made.report)
     return parted, report, mesh_findings(report)
 
@@ -239,6 +236,8 @@ BORDER_VOXELS = 1.5
 # Cosine from which a triangle faces a border.
 FACING = 0.9
 BORDERS = (("right", "left"), ("front", "back"), ("bottom", "top"))
+# As [node_kinds] has them.
+KIND_BORDERS = (("right", "left"), ("anterior", "posterior"), ("inferior", "superior"))
 
 
 def nodes_of(
@@ -260,7 +259,7 @@ def nodes_of(
         fixed_planes=end_planes(tissue.region),
         options=options,
         arches=tissue.arches,
-        contacts=contacts.surfaces,
+        contacts={name: sheet.surface for name, sheet in contacts.sheets.items()},
     )
     stages.add(classified.findings)
     whole = mesh.n_tets
@@ -441,9 +440,8 @@ def _loose_ends(
     free = (kinds.kind[triangles] == 0).all(axis=1)
     spacing = anatomy.skin.spacing
     for axis, names in enumerate(BORDERS):
-        for name, sign, end in zip(
-            names, (-1.0, 1.0), (anatomy.skin.lowest, anatomy.skin.highest), strict=True
-        ):
+        ends = (anatomy.skin.lowest, anatomy.skin.highest)
+        for side, (name, sign, end) in enumerate(zip(names, (-1.0, 1.0), ends, strict=True)):
             there = np.abs(corners[:, :, axis] - end[axis]).max(axis=1)
             chosen = free & (there <= BORDER_VOXELS * spacing[axis])
             chosen &= sign * normal[:, axis] > FACING * twice
@@ -459,13 +457,7 @@ def _loose_ends(
                 + (
                     ", or bring the posterior plane inside it (posterior_depth in [region])"
                     if name == "back"
-                    else f', or fix it: fixed_borders = ["{_kind_border(axis, sign)}"] in '
+                    else f', or fix it: fixed_borders = ["{KIND_BORDERS[axis][side]}"] in '
                     "[node_kinds]"
                 ),
             )
-
-
-def _kind_border(axis: int, sign: float) -> str:
-    """The border's name as [node_kinds] has it."""
-    names = (("right", "left"), ("anterior", "posterior"), ("inferior", "superior"))
-    return names[axis][int(sign > 0.0)]
