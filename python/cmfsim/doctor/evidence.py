@@ -1,10 +1,11 @@
 """Everything that a case names, as far as it can be read, and a finding for what cannot."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,7 @@ SHIFTS = (
 MAX_SAMPLES = 20_000
 # No head or bone is longer, mm: ten times what the check of sizes lets pass.
 FAR_TOO_LONG = 4200.0
+Read = TypeVar("Read")
 
 
 def place_text(point: Floats) -> str:
@@ -104,6 +106,15 @@ class Body:
         vertices = self.repaired.vertices
         step = -(-len(vertices) // MAX_SAMPLES)
         return vertices[::step]
+
+
+def distances_from(bodies: Iterable[Body], points: Floats) -> Floats:
+    """The distance of each point from the nearest of some surfaces, mm; infinite without any."""
+    nearest = np.full(len(points), np.inf)
+    for body in bodies:
+        closest = body.index.closest(points)[0]
+        nearest = np.minimum(nearest, np.linalg.norm(closest - points, axis=1))
+    return nearest
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +247,9 @@ def _motions(
     motions: dict[str, Floats] = {}
     transforms: dict[str, TransformFile] = {}
     for name, motion in case.plan.items():
-        _check_motion_files(case, name, motion, findings)
+        for key in ("transform", "surface", "moved_surface"):
+            if (path := getattr(motion, key)) is not None:
+                _check_file(case, f"plan.{name}.{key}", path, findings)
         transform = _transform(case, name, motion, findings)
         if transform is not None:
             transforms[name] = transform
@@ -280,6 +293,17 @@ def _check_preset(case: Case, findings: list[Finding]) -> None:
         )
 
 
+def _readable(
+    read: Callable[[], Read], findings: list[Finding], where: str, fix: str, *, why: str = ""
+) -> Read | None:
+    """What a reader gives; None, with a finding, where it cannot read."""
+    try:
+        return read()
+    except (CmfsimError, MemoryError) as error:
+        findings.append(Finding("input-unreadable", str(error), where=where, why=why, fix=fix))
+        return None
+
+
 def _body(
     case: Case,
     given: CaseSurfaces,
@@ -292,45 +316,32 @@ def _body(
     where = f"{case.where(f'surfaces.{key}')} ({path.name})"
     if not _check_file(case, f"surfaces.{key}", path, findings):
         return None
-    try:
-        read = read_surface_file(path, units=given.units, frame=given.frame)
-        findings.extend(read.findings)
-        surface = read.surface
-        body = Body(key.removeprefix("bones."), where, surface)
+
+    def read() -> Body:
+        found = read_surface_file(path, units=given.units, frame=given.frame)
+        findings.extend(found.findings)
+        body = Body(key.removeprefix("bones."), where, found.surface)
         # Triangles that are all without area pass the reader and fail when the surface is repaired.
         # Coordinates in a wrong unit may fail too; the check of sizes reports the unit.
-        if not (is_sized and np.ptp(surface.vertices, axis=0).max() > FAR_TOO_LONG):
+        if not (is_sized and np.ptp(body.surface.vertices, axis=0).max() > FAR_TOO_LONG):
             _ = body.index
-    except CmfsimError as error:
-        findings.append(
-            Finding(
-                "input-unreadable",
-                str(error),
-                where=where,
-                fix="export it again from the program that made it, as STL, PLY, OBJ or VTP",
-            )
-        )
-        return None
-    return body
+        return body
+
+    fix = "export it again from the program that made it, as STL, PLY, OBJ or VTP"
+    return _readable(read, findings, where, fix)
 
 
 def _image(case: Case, findings: list[Finding]) -> ImageData | None:
-    if case.image is None:
+    given = case.image
+    if given is None or not _check_file(case, "image.file", given.file, findings, folder=True):
         return None
-    path = case.image.file
-    if not _check_file(case, "image.file", path, findings, folder=True):
-        return None
-    try:
-        found = read_image_file(path, series=case.image.series)
-    except (CmfsimError, MemoryError) as error:
-        findings.append(
-            Finding(
-                "input-unreadable",
-                str(error),
-                where=f"{case.where('image.file')} ({path.name})",
-                fix="export the CT series again, as DICOM, NRRD or NIfTI",
-            )
-        )
+    found = _readable(
+        lambda: read_image_file(given.file, series=given.series),
+        findings,
+        f"{case.where('image.file')} ({given.file.name})",
+        "export the CT series again, as DICOM, NRRD or NIfTI",
+    )
+    if found is None:
         return None
     findings.extend(found.findings)
     return found.image
@@ -340,21 +351,16 @@ def _transform(
     case: Case, name: str, motion: CaseMotion, findings: list[Finding]
 ) -> TransformFile | None:
     """The transform file of a segment, where there is one that can be read."""
-    if motion.transform is None or not motion.transform.is_file():
+    path = motion.transform
+    if path is None or not path.is_file():
         return None
-    try:
-        return read_transform_file(motion.transform, direction=motion.direction, frame=motion.frame)
-    except CmfsimError as error:
-        findings.append(
-            Finding(
-                "input-unreadable",
-                str(error),
-                where=case.where(f"plan.{name}.transform"),
-                why=f"the motion of {name} is unknown",
-                fix="save it again as one rigid ITK transform (.tfm or .h5), or write a matrix",
-            )
-        )
-        return None
+    return _readable(
+        lambda: read_transform_file(path, direction=motion.direction, frame=motion.frame),
+        findings,
+        case.where(f"plan.{name}.transform"),
+        "save it again as one rigid ITK transform (.tfm or .h5), or write a matrix",
+        why=f"the motion of {name} is unknown",
+    )
 
 
 def _landmarks(
@@ -362,28 +368,17 @@ def _landmarks(
 ) -> Mapping[str, Floats]:
     if path is None or not _check_file(case, key, path, findings):
         return {}
-    try:
-        found = read_landmark_file(path, frame=case.landmarks.frame)
-    except CmfsimError as error:
-        findings.append(
-            Finding(
-                "input-unreadable",
-                str(error),
-                where=case.where(key),
-                why="cuts and muscles are placed from landmarks",
-                fix="correct the file, or save it again from 3D Slicer",
-            )
-        )
+    found = _readable(
+        lambda: read_landmark_file(path, frame=case.landmarks.frame),
+        findings,
+        case.where(key),
+        "correct the file, or save it again from 3D Slicer",
+        why="cuts and muscles are placed from landmarks",
+    )
+    if found is None:
         return {}
     findings.extend(found.findings)
     return {name: place for name, place in found.points.items() if not is_for_measures(name)}
-
-
-def _check_motion_files(case: Case, name: str, motion: CaseMotion, findings: list[Finding]) -> None:
-    for key in ("transform", "surface", "moved_surface"):
-        path = getattr(motion, key)
-        if path is not None:
-            _check_file(case, f"plan.{name}.{key}", path, findings)
 
 
 def _check_file(

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cmfsim.doctor.evidence import Body, Evidence, place_text
-from cmfsim.values.checks import Floats
+from cmfsim.doctor.evidence import Body, Evidence, distances_from, place_text
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 
@@ -42,19 +41,14 @@ def check_image(evidence: Evidence) -> Iterator[Finding]:
 
 def check_surfaces(evidence: Evidence) -> Iterator[Finding]:
     """Findings about each surface separately."""
-    bodies = [evidence.skin] if evidence.skin else []
-    for body in [*bodies, *evidence.bones.values()]:
-        yield from _check_body(body)
-
-
-def _check_body(body: Body) -> Iterator[Finding]:
-    yield from body.walls
-    yield from _check_borders(body)
-    yield from _check_orientation(body)
-    yield from _check_edges(body)
-    yield from _check_crossings(body)
-    yield from _check_pieces(body)
-    yield from _check_triangles(body)
+    checks = (
+        _check_borders, _check_orientation, _check_edges, _check_crossings, _check_pieces,
+        _check_triangles,
+    )  # fmt: skip
+    for body in [*([evidence.skin] if evidence.skin else []), *evidence.bones.values()]:
+        yield from body.walls
+        for check in checks:
+            yield from check(body)
 
 
 def _check_borders(body: Body) -> Iterator[Finding]:
@@ -181,7 +175,7 @@ def check_mesh_size(evidence: Evidence) -> Iterator[Finding]:
     points = skin.samples[evidence.in_region(skin.samples)]
     if not len(points):
         return
-    thickness = _thickness(evidence, points)
+    thickness = distances_from(evidence.bones.values(), points)
     edge = case.mesh.edge_length
     thin = thickness < edge
     if thin.mean() <= THIN_SHARE:
@@ -200,15 +194,6 @@ def check_mesh_size(evidence: Evidence) -> Iterator[Finding]:
         if refined
         else f"set edge_length to {0.5 * edge:g} or below, or refine",
     )
-
-
-def _thickness(evidence: Evidence, points: Floats) -> Floats:
-    """The distance of each point to the nearest bone, mm."""
-    nearest = np.full(len(points), np.inf)
-    for body in evidence.bones.values():
-        closest = body.index.closest(points)[0]
-        nearest = np.minimum(nearest, np.linalg.norm(closest - points, axis=1))
-    return nearest
 
 
 CORNERS = ("cheilion_R", "cheilion_L")

@@ -230,13 +230,13 @@ def _placed(patient: PatientModel, landmarks: FaceLandmarks) -> dict[str, NDArra
 
 
 def _band(prediction: Prediction, rates: SkinRates, options: BandOptions) -> SkinBand:
-    normals = _normals(prediction)
+    skin = prediction.skin
+    normals = Surface(skin.vertices, skin.triangles).vertex_normals
     parts: dict[str, Floats] = {
         name: np.einsum("ka,ka->k", normals, rate) for name, rate in rates.rates.items()
     }
-    depth = tissue_depth(
-        prediction.skin_before.vertices, [s.surface for s in prediction.patient.segments]
-    )
+    bones = [segment.surface for segment in prediction.patient.segments]
+    depth = tissue_depth(prediction.skin_before.vertices, bones)
     depth = np.minimum(depth, THICKEST)
     for source in ADDED:
         scale = depth if source.unit == "share" else np.ones(len(depth))
@@ -264,12 +264,6 @@ def _band(prediction: Prediction, rates: SkinRates, options: BandOptions) -> Ski
             "calibration": _calibration_values(options),
         },
     )
-
-
-def _normals(prediction: Prediction) -> Floats:
-    """The outward unit normals of the predicted skin, (k, 3)."""
-    skin = prediction.skin
-    return Surface(skin.vertices, skin.triangles).vertex_normals
 
 
 def _calibration_values(options: BandOptions) -> dict[str, Any] | None:

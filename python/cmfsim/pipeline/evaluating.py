@@ -288,7 +288,8 @@ def evaluate(
         doubts = check_face_after(case, comparison, unmoved, compared.moved)
         notes = (*landmarks.findings, *why, *refuse_other_face(doubts))
         if predictions[0].patient.landmarks_are_found and postoperative.landmarks:
-            notes = (*notes, _landmarks_unused())
+            unused = Finding("landmarks-after-unused", where="postoperative.landmarks")
+            notes = (*notes, unused)
         thickness = fitted = None
         if fit_thickness:
             if unmoved is None:
@@ -349,23 +350,18 @@ class _Compared:
         before = self.predictions[0].skin_before
         most = np.max([*self.moved.values()], axis=0)
         regions = unmoved_regions(before.vertices, self.landmarks)
+        reason = "the simulated tissue ends below the forehead"
         try:
             found = compare_unmoved(before, self.after, regions, most)
         except RegistrationError as error:
-            return None, (_not_shown(str(error)),)
-        if found is None:
-            return None, (_not_shown("the simulated tissue ends below the forehead"),)
-        return found, ()
+            found, reason = None, str(error)
+        return found, () if found is not None else (_not_shown(reason),)
 
     def depth(self) -> Floats:
         """Depth of the soft tissue under each vertex of the skin before, mm."""
         first = self.predictions[0]
         bones = [segment.surface for segment in first.patient.segments]
         return tissue_depth(first.skin_before.vertices, bones)
-
-
-def _landmarks_unused() -> Finding:
-    return Finding("landmarks-after-unused", where="postoperative.landmarks")
 
 
 def _not_shown(reason: str) -> Finding:

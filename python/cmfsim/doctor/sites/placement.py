@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.doctor.evidence import Body, Evidence, place_text
+from cmfsim.doctor.evidence import Body, Evidence, distances_from, place_text
 from cmfsim.doctor.sites.landmarks import (
     Nearest,
     check_landmarks,
@@ -76,29 +76,24 @@ def check_placement(evidence: Evidence) -> list[Finding]:
     if any(finding.severity == "error" for finding in findings):
         return findings
     turned = False
-    for key, landmarks in _landmark_sets(evidence).items():
-        wrong = list(_check_landmark_fit(evidence, key, landmarks))
-        if not wrong:
-            wrong = list(_check_within_image(evidence, key, landmarks))
-        if not wrong:
-            wrong = list(_check_directions(evidence, key, landmarks))
-            turned |= any(f.code == "frame-turned" and f.severity == "error" for f in wrong)
-        if not wrong:
-            wrong = list(_check_sides(evidence, key, landmarks))
-            if not wrong:
-                where = evidence.case.where(f"landmarks.{key}")
-                nearest = _nearest_point(evidence, key, landmarks)
-                wrong = check_landmarks(key, landmarks, where, nearest)
+    for key, landmarks in (("skull", evidence.skull_landmarks), ("skin", evidence.skin_landmarks)):
+        if not landmarks:
+            continue
+        for check in (_check_landmark_fit, _check_within_image, _check_directions, _check_sides):
+            wrong = list(check(evidence, key, landmarks))
+            if wrong:
+                break
+        else:
+            nearest = _nearest_point(evidence, key, landmarks)
+            wrong = check_landmarks(
+                key, landmarks, evidence.case.where(f"landmarks.{key}"), nearest
+            )
+        turned |= any(f.code == "frame-turned" and f.severity == "error" for f in wrong)
         findings += wrong
     if not turned:
         findings += _check_bone_directions(evidence)
     findings += _check_bone_overlap(evidence)
     return findings
-
-
-def _landmark_sets(evidence: Evidence) -> dict[str, Mapping[str, Floats]]:
-    sets = {"skull": evidence.skull_landmarks, "skin": evidence.skin_landmarks}
-    return {key: landmarks for key, landmarks in sets.items() if landmarks}
 
 
 def _extent(points: Floats) -> float:
@@ -170,14 +165,6 @@ def _check_bone_sizes(evidence: Evidence) -> Iterator[Finding]:
         )
 
 
-def _nearest(bodies: Sequence[Body], points: Floats) -> Floats:
-    nearest = np.full(len(points), np.inf)
-    for body in bodies:
-        closest = body.index.closest(points)[0]
-        nearest = np.minimum(nearest, np.linalg.norm(closest - points, axis=1))
-    return nearest
-
-
 def _bodies(evidence: Evidence, key: str) -> list[Body]:
     if key == "skull":
         # With a bone missing, its landmarks would seem to lie far from the others.
@@ -193,7 +180,7 @@ def _check_landmark_fit(
     if not bodies:
         return
     points = np.stack(list(landmarks.values()))
-    nearest = np.sort(_nearest(bodies, points))
+    nearest = np.sort(distances_from(bodies, points))
     median = float(np.median(nearest))
     if median <= LANDMARK_ERROR:
         return
@@ -211,7 +198,7 @@ def _check_landmark_fit(
         "inch": (np.full(3, 25.4), "read as inches"),
     }
     for name, (factors, done) in tries.items():
-        fitted = float(np.median(_nearest(bodies, points * factors)))
+        fitted = float(np.median(distances_from(bodies, points * factors)))
         if fitted <= LANDMARK_WARNING:
             is_frame = name == "frame"
             yield Finding(
@@ -380,7 +367,7 @@ def _is_part(bodies: Sequence[Body], points: Floats) -> bool:
     """Whether the landmarks belong to a whole skull, of which a single bone is given."""
     if len(bodies) != 1:
         return False
-    nearest = _nearest(bodies, points)
+    nearest = distances_from(bodies, points)
     return int((nearest <= LANDMARK_WARNING).sum()) >= OF_ONE_BONE and bool(
         np.quantile(nearest, 1.0 - OF_OTHERS) > LANDMARK_ERROR
     )
@@ -459,22 +446,13 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
 
 def _shell_thickness(skin: Body, bone: Body) -> float | None:
     """The mean thickness of a skin that is a shell around a bone, mm; None if it is none."""
-    low, high = (f(skin.repaired.vertices) for f in (_lowest, _highest))
-    is_around = (_lowest(bone.samples) >= low).all() and (_highest(bone.samples) <= high).all()
+    outer, inner = skin.repaired.vertices, bone.samples
+    is_above = (inner.min(axis=0) >= outer.min(axis=0)).all()
+    is_around = is_above and (inner.max(axis=0) <= outer.max(axis=0)).all()
     # A shell has two walls, and the area of both.
     report = check_surface(skin.repaired, crossings=False)
     thickness = 2.0 * report.volume / report.area
     return thickness if is_around and 0.0 < thickness < SHELL_THICKNESS else None
-
-
-def _lowest(points: Floats) -> Floats:
-    lowest: Floats = points.min(axis=0)
-    return lowest
-
-
-def _highest(points: Floats) -> Floats:
-    highest: Floats = points.max(axis=0)
-    return highest
 
 
 # Depth below its surface at which a bone is tested for being inside another, mm: surfaces that

@@ -213,11 +213,6 @@ def _owners(evidence: Evidence, bone: str, points: Floats) -> NDArray[np.object_
     return names
 
 
-def _segments_of(evidence: Evidence, bone: str) -> list[str]:
-    """The names of the segments that a bone is cut into, itself among them if it is left."""
-    return list(dict.fromkeys(_owners(evidence, bone, evidence.bones[bone].samples)))
-
-
 def _piece(evidence: Evidence, name: str) -> Floats | None:
     """Points on the surface of a bone or segment, (k, 3) mm, with the unit normals, (k, 6) in all.
 
@@ -251,7 +246,8 @@ def _parts(evidence: Evidence) -> list[BonePart]:
         jaw = jaw_of(bone)
         if jaw is None:
             continue
-        for name in _segments_of(evidence, bone):
+        # A bone itself is among the segments that it is cut into if it is left.
+        for name in dict.fromkeys(_owners(evidence, bone, body.samples)):
             moved = evidence.moved.get(name)
             motion = evidence.motions.get(name, np.eye(4))
             where = evidence.case.where(f"plan.{name}")

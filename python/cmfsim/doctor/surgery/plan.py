@@ -64,16 +64,22 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
     far = float(np.linalg.norm(points @ rotation.T + shift - points, axis=1).max())
     angle = decompose_motion(motion.matrix).angle
     if far > FAR:
-        about_origin = angle > 0.0 and motion.typed and not motion.has_centre
         remedy = "check translation (mm), sign and frame (LPS: forwards is −P)"
-        if about_origin:
+        if angle > 0.0 and motion.typed and not motion.has_centre:
             remedy = (
                 "give the centre of the rotation: without one, the segment rotates about the "
                 "origin of the coordinates"
             )
         elif not motion.typed:
             remedy = "check the unit (mm), frame (LPS or RAS) and direction of the transform"
-        yield _too_far(motion, far, remedy)
+        yield Finding(
+            "plan-far",
+            f"{motion.name} moves by up to {far:.1f} mm",
+            severity="error" if far > TOO_FAR else "warning",
+            where=motion.where,
+            fix=remedy,
+            facts={"most": FAR},
+        )
     elif angle > TINY_TURN[0] and motion.typed and not motion.has_centre:
         yield Finding(
             "plan-no-centre",
@@ -84,17 +90,6 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
     yield from check_turn(motion.name, motion.where, angle)
     reach = 0.0 if motion.points is not None else REACH * math.radians(angle)
     yield from check_tiny(motion.name, motion.where, far + reach, angle)
-
-
-def _too_far(motion: SizedMotion, far: float, remedy: str) -> Finding:
-    return Finding(
-        "plan-far",
-        f"{motion.name} moves by up to {far:.1f} mm",
-        severity="error" if far > TOO_FAR else "warning",
-        where=motion.where,
-        fix=remedy,
-        facts={"most": FAR},
-    )
 
 
 def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
