@@ -34,7 +34,6 @@ from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient
 from cmfsim.surfaces.barycentric import at_closest
 from cmfsim.values.checks import Floats
-from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 
 # Fewer patients than this teach nothing: one is left out at a time to choose the components.
@@ -128,7 +127,7 @@ class LearnedFace:
     def predict(self, patient: BenchmarkPatient) -> Floats:
         """The displacement of each vertex of a patient's skin, (v, 3) mm."""
         places = patient.skin[_partners(patient, self.landmarks, self.points)]
-        moves = self.map(_features(patient)[None]).reshape(-1, 3)
+        moves = self.map(patient.planned_moves(FEATURES)[None]).reshape(-1, 3)
         away, near = _tree(places).query(patient.skin, k=NEAREST)
         weights = 1.0 / np.maximum(away, 1e-3)
         weights /= weights.sum(axis=1, keepdims=True)
@@ -152,7 +151,7 @@ def learn_face(patients: Sequence[BenchmarkPatient]) -> LearnedFace:
     near = _tree(skin[first.regions["face"]]).query(skin)[0] < AROUND
     each = max(1, round(AREA * len(skin) / first.surface.area))
     points = skin[near][::each]
-    x = np.array([_features(patient) for patient in patients])
+    x = np.array([patient.planned_moves(FEATURES) for patient in patients])
     y = np.array([p.truth[_partners(p, landmarks, points)].ravel() for p in patients])
     components = _components(x, y)
     return LearnedFace(landmarks, points, PartialLeastSquares.fit(x, y, components), components)
@@ -168,16 +167,6 @@ def _components(x: Floats, y: Floats) -> int:
             found = PartialLeastSquares.fit(x[rest], y[rest], count)(x[out : out + 1])
             errors[count - 1] += float(((found - y[out]) ** 2).sum())
     return int(errors.argmin()) + 1
-
-
-def _features(patient: BenchmarkPatient) -> Floats:
-    """The plan in numbers, mm."""
-    moves = []
-    for name, segments in FEATURES.items():
-        place = patient.skull_landmarks[name]
-        matrix = patient.planned_motion(*segments)
-        moves.append(matrix[:3, :3] @ place + matrix[:3, 3] - place)
-    return np.concatenate(moves)
 
 
 def _landmarks(patient: BenchmarkPatient) -> Floats:
@@ -244,19 +233,14 @@ def predict_by_ratios(patient: BenchmarkPatient) -> Floats:
     anchors = skin[far][:: max(1, int(far.sum()) // ANCHORS)]
     moved = np.array([landmarks[ratio.skin] for ratio in SKIN_RATIOS])
     still = np.vstack([[landmarks[name] for name in STILL], anchors])
-    moves = np.array([_move(patient, ratio) for ratio in SKIN_RATIOS])
+    moves = np.array([patient.planned_moves({r.bone: r.segments}) for r in SKIN_RATIOS])
+    pairs = zip(SKIN_RATIOS, moves, strict=True)
+    shares = [r.backwards if move[BACK] > 0.0 else r.forwards for r, move in pairs]
+    moves = np.array(shares)[:, None] * moves
     spline = ThinPlateSpline(np.vstack([moved, still]), np.vstack([moved + moves, still]))
     displacement = spline(skin) - skin
     displacement[far] = 0.0
     return displacement
-
-
-def _move(patient: BenchmarkPatient, ratio: Ratio) -> Floats:
-    """How a landmark of the skin moves, mm."""
-    place = patient.skull_landmarks[ratio.bone]
-    matrix = patient.planned_motion(*ratio.segments)
-    move = matrix[:3, :3] @ place + matrix[:3, 3] - place
-    return (ratio.backwards if move[BACK] > 0.0 else ratio.forwards) * move
 
 
 @dataclass(frozen=True)
@@ -375,7 +359,9 @@ def _by_models(
         begun = time.perf_counter()
         try:
             if model == HYPERELASTIC:
-                prediction = predict_patient(_hyperelastic(built), HYPERELASTIC_MODEL)
+                options = replace(built.scene.options, kinematics="hyperelastic")
+                strained = replace(built, scene=replace(built.scene, options=options))
+                prediction = predict_patient(strained, HYPERELASTIC_MODEL)
             elif model in banded:
                 prediction = predict_with_band(built, model)
             else:
@@ -385,12 +371,6 @@ def _by_models(
             continue
         place.put(model, patient, _entered(patient, prediction, made_from))
         place.took(model, patient.name, building + time.perf_counter() - begun)
-
-
-def _hyperelastic(patient: PatientModel) -> PatientModel:
-    """The patient, to be solved with finite strain."""
-    options = replace(patient.scene.options, kinematics="hyperelastic")
-    return replace(patient, scene=replace(patient.scene, options=options))
 
 
 def _entered(patient: BenchmarkPatient, prediction: Prediction, made_from: str) -> SkinPrediction:

@@ -292,6 +292,17 @@ class BenchmarkPatient:
                 return motion.matrix
         return np.eye(4)
 
+    def planned_moves(self, carriers: Mapping[str, Sequence[str]]) -> Floats:
+        """How far the plan moves skull landmarks, by the first that it moves of what carries each.
+
+        Returns: (3 k,), mm, landmark by landmark.
+        """
+        moves = []
+        for name, segments in carriers.items():
+            place, matrix = self.skull_landmarks[name], self.planned_motion(*segments)
+            moves.append(matrix[:3, :3] @ place + matrix[:3, 3] - place)
+        return np.concatenate(moves)
+
     def digest(self, *, truth: bool = False) -> str:
         """SHA-256 of this version and the files that a method may read; with the truth, or not."""
         found = hashlib.sha256(__version__.encode())

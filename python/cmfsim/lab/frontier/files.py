@@ -1,7 +1,7 @@
 """The files of a sweep: its page of tables, and its picture of error against time (matplotlib)."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -31,33 +31,33 @@ SUMMARY, TABLE, PAGE, PICTURE = "frontier.json", "frontier.csv", "frontier.md", 
 def frontier_page(found: Frontier) -> str:
     """The tables of a frontier in Markdown: grid, each factor by itself, regions, failures."""
     base, reference = found.base, found.reference
-    grid = [row for row in found.rows if _kind(row, base.choice) == "grid"]
-    factors: dict[str, list[FrontierRow]] = {}
+    kinds: dict[str, list[FrontierRow]] = {"grid": []}
     for row in found.rows:
-        kind = _kind(row, base.choice)
-        if kind not in {"grid", ""}:
-            factors.setdefault(kind, []).append(row)
+        if not row.is_reference:
+            kinds.setdefault(_kind(row.choice.changes(base.choice)), []).append(row)
     parts = [
         f"# Error against run time: {found.case}",
         _head(found),
         "## Edge length, element, kinematics",
         _table(
             ("edge mm", "element", "kinematics", "tets"),
-            grid,
+            kinds.pop("grid"),
             lambda row: (
                 f"{row.choice.edge_length:g}",
                 row.choice.element,
                 row.choice.kinematics,
-                _whole(row.n_tets),
+                DASH if row.n_tets is None else str(row.n_tets),
             ),
         ),
         "## One factor at a time",
         f"From the base: {row_label(base.choice)}. A tolerance is that of `pcg`.",
     ]
-    parts += [
-        _table(("choice",), [base, *rows], lambda row: (_changed(row, base.choice),))
-        for rows in factors.values()
-    ]
+
+    def changed(row: FrontierRow) -> tuple[str]:
+        named = [f"{name} {value}" for name, value in row.choice.changes(base.choice).items()]
+        return ("base" if row.is_base else ", ".join(named),)
+
+    parts += [_table(("choice",), [base, *rows], changed) for rows in kinds.values()]
     solved_in = _spread(reference.solve_wall)
     parts += [
         "## Where the error lies",
@@ -107,22 +107,12 @@ def _head(found: Frontier) -> str:
     )
 
 
-def _kind(row: FrontierRow, base: Choice) -> str:
-    """Which table a row belongs to: the grid, that of a factor, or none for the reference."""
-    if row.is_reference:
-        return ""
-    changed = row.choice.changes(base)
+def _kind(changed: Mapping[str, Any]) -> str:
+    """Which table a row belongs to by what it changes: the grid, or that of a factor."""
     if not set(changed) - set(GRID):
         return "grid"
     # A tolerance is that of an iterative method, which comes with it.
     return "tolerance" if "tolerance" in changed else " and ".join(changed)
-
-
-def _changed(row: FrontierRow, base: Choice) -> str:
-    if row.is_base:
-        return "base"
-    named = (f"{name} {value}" for name, value in row.choice.changes(base).items())
-    return ", ".join(named)
 
 
 def _table(
@@ -179,10 +169,6 @@ def _spread(spread: Spread | None) -> str:
     return f"{spread.median:.3g} ({spread.low:.3g}–{spread.high:.3g})"
 
 
-def _whole(value: int | None) -> str:
-    return DASH if value is None else str(value)
-
-
 def write_frontier(folder: Path, found: Frontier) -> list[str]:
     """The names of the files written: table, page, picture and, last, all figures as JSON.
 
@@ -234,8 +220,12 @@ def _panel(axes: Any, found: Frontier, seconds: dict[FrontierRow, float]) -> Non
     base = found.base
     axes.set_xscale("log")
     axes.set_yscale("log")
+    ticker = import_module("matplotlib.ticker")
     for axis in (axes.xaxis, axes.yaxis):
-        _plain_numbers(axis)
+        # Figures such as 0.2 and 30 at the ticks, with as many as a short range needs.
+        axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(ticker.NullFormatter())
     axes.axhline(TARGET, color="#999999", linewidth=0.9, linestyle=(0, (4, 3)), zorder=0)
     axes.annotate(
         f"{TARGET:g} mm",
@@ -280,14 +270,6 @@ def _panel(axes: Any, found: Frontier, seconds: dict[FrontierRow, float]) -> Non
     axes.grid(visible=True, which="major", color="#e6e6e6", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _plain_numbers(axis: Any) -> None:
-    """Figures such as 0.2 and 30 at the ticks, with as many as a short range needs."""
-    ticker = import_module("matplotlib.ticker")
-    axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(ticker.NullFormatter())
 
 
 def _marks(found: Frontier) -> list[Any]:

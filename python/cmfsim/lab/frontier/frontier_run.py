@@ -186,7 +186,9 @@ class _Jobs:
             "error" not in answer
             and not (self.points.exists() and all((folder / n).exists() for n in names))
         ):
-            self.say(f"building at {choice.edge_length:g} mm{_sampling(choice)}")
+            sampling = f"{choice.samples} samples, {choice.mixing}"
+            muscles = sampling if choice.model.startswith("M") else "no muscles"
+            self.say(f"building at {choice.edge_length:g} mm, {muscles}")
             answer = run_job(
                 {
                     "task": "build",
@@ -247,7 +249,7 @@ def _frontier(
     case: Case, base: Choice, choices: Sequence[Choice], reference: Choice, jobs: _Jobs
 ) -> Frontier:
     """The rows of what was built and solved."""
-    _, regions = read_points(jobs.points)
+    regions = read_points(jobs.points)[1]
     exact = _moved(jobs, reference)
     paces = jobs.answers.get(base, [])
     rows = []
@@ -324,9 +326,3 @@ def _label(choice: Choice, base: Choice | None = None) -> str:
     rest = [f"{n} {v}" for n, v in choice.changes(usual).items() if n not in main]
     first = f"{choice.model} {choice.element} {choice.kinematics} at {choice.edge_length:g} mm"
     return ", ".join([first, *(part for part in rest if not part.startswith("model "))])
-
-
-def _sampling(choice: Choice) -> str:
-    if not choice.model.startswith("M"):
-        return ", no muscles"
-    return f", {choice.samples} samples, {choice.mixing}"

@@ -48,7 +48,8 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
         )
     vertices = face.vertices
     landmarks = patient.landmarks.get("skin", {})
-    on_tissue = _on_tissue(patient, vertices)
+    skin = Surface(patient.skin.vertices, patient.skin.triangles)
+    on_tissue = np.linalg.norm(skin.closest(vertices)[0] - vertices, axis=1) <= ON_TISSUE
     regions = {WHOLE: on_tissue}
     if set(SKIN_LANDMARKS) <= set(landmarks):
         regions = skin_regions(vertices, landmarks)
@@ -61,13 +62,6 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
     chosen = np.flatnonzero(regions[SKIN])
     chosen = chosen[:: -(-len(chosen) // MOST_POINTS)]
     return vertices[chosen], {name: inside[chosen] for name, inside in regions.items()}
-
-
-def _on_tissue(patient: PatientModel, vertices: Floats) -> NDArray[np.bool_]:
-    skin = patient.skin
-    closest, _, _ = Surface(skin.vertices, skin.triangles).closest(vertices)
-    near: NDArray[np.bool_] = np.linalg.norm(closest - vertices, axis=1) <= ON_TISSUE
-    return near
 
 
 def skin_errors(
@@ -97,16 +91,21 @@ def write_points(path: Path, points: Floats, regions: Mapping[str, NDArray[np.bo
 def read_points(path: Path) -> tuple[Floats, Regions]:
     """The points and regions that `write_points` wrote."""
     _, arrays = read_archive(path, POINTS_FORMAT, "points_of")
-    regions = {
-        name.removeprefix("region."): array
-        for name, array in arrays.items()
-        if name.startswith("region.")
-    }
+    regions = {n.removeprefix("region."): a for n, a in arrays.items() if n.startswith("region.")}
     return member_of(arrays, "points"), regions
 
 
 # Errors are told apart in steps of this, mm: two methods that solve the same system differ by less.
 ERROR_STEP = 1e-3
+
+
+# Of the CSV file, round the means of the regions.
+ERROR_COLUMNS = ("role", "on_front", "mean_mm", "p95_mm", "max_mm")
+COST_COLUMNS = (
+    "total_wall_s", "build_wall_s", "build_cpu_s", "solve_wall_s", "solve_wall_low_s",
+    "solve_wall_high_s", "solve_cpu_s", "repeats", "ratio", "ratio_low", "ratio_high",
+    "build_peak_mb", "solve_peak_mb", "n_tets", "n_unknowns", "failure",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -194,9 +193,9 @@ class FrontierRow:
             "total_wall_s": self.total_wall,
             "build_wall_s": self.build_wall,
             "build_cpu_s": self.build_cpu,
-            "solve_wall_s": _plain(self.solve_wall),
-            "solve_cpu_s": _plain(self.solve_cpu),
-            "solve_ratio": _plain(self.ratio),
+            "solve_wall_s": self.solve_wall and asdict(self.solve_wall),
+            "solve_cpu_s": self.solve_cpu and asdict(self.solve_cpu),
+            "solve_ratio": self.ratio and asdict(self.ratio),
             "build_peak_mb": self.build_peak,
             "solve_peak_mb": self.solve_peak,
             "n_tets": self.n_tets,
@@ -259,31 +258,8 @@ class Frontier:
         """One line for each row; an error column for each region's mean, mm."""
         regions = list(dict.fromkeys(name for row in self.rows for name in row.error))
         names = list(asdict(self.base.choice))
-        titles = [
-            *names,
-            "role",
-            "on_front",
-            "mean_mm",
-            "p95_mm",
-            "max_mm",
-            *(f"{name} mean_mm" for name in regions if name != WHOLE),
-            "total_wall_s",
-            "build_wall_s",
-            "build_cpu_s",
-            "solve_wall_s",
-            "solve_wall_low_s",
-            "solve_wall_high_s",
-            "solve_cpu_s",
-            "repeats",
-            "ratio",
-            "ratio_low",
-            "ratio_high",
-            "build_peak_mb",
-            "solve_peak_mb",
-            "n_tets",
-            "n_unknowns",
-            "failure",
-        ]
+        means = [f"{name} mean_mm" for name in regions if name != WHOLE]
+        titles = [*names, *ERROR_COLUMNS, *means, *COST_COLUMNS]
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(titles)
@@ -324,10 +300,6 @@ def with_front(rows: Sequence[FrontierRow]) -> tuple[FrontierRow, ...]:
 def unbeaten(seconds: Sequence[float], errors: Sequence[float]) -> list[bool]:
     """Which rows no other one beats in time and in error, as far as errors are worth telling."""
     return [bool(on) for on in pareto_front(seconds, np.round(np.array(errors) / ERROR_STEP))]
-
-
-def _plain(spread: Spread | None) -> dict[str, Any] | None:
-    return None if spread is None else asdict(spread)
 
 
 def _three(spread: Spread | None) -> tuple[float | str, ...]:

@@ -185,12 +185,10 @@ def run_job(job: Mapping[str, Any], *, threads: int | None, time_limit: float) -
         except WorkerFailedError as failed:
             answer = {"error": failed.trace[-LAST_WORDS:].strip()}
         except WorkerEndedError as ended:
-            answer = {"error": f"exit code {ended.code}"}
+            error = f"exit code {ended.code}"
             if ended.code < 0:
-                signal = f"killed by signal {-ended.code}"
-                answer = {"error": f"{signal}; 9 is most often lack of memory"}
-            if ended.late:
-                answer = {"error": f"{STOPPED} of {time_limit:g} s"}
+                error = f"killed by signal {-ended.code}; 9 is most often lack of memory"
+            answer = {"error": f"{STOPPED} of {time_limit:g} s" if ended.late else error}
     with replacing(path) as file:
         file.write(json.dumps(answer).encode())
     return answer

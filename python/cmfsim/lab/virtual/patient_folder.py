@@ -7,7 +7,7 @@ import platform
 import shutil
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,7 @@ from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cases.cohorts import COHORT_FORMAT
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
-from cmfsim.lab.virtual.population import (
-    DRAWN,
-    PATIENTS,
-    Relocation,
-    TrueTissue,
-    VirtualPatient,
-    patient_named,
-)
+from cmfsim.lab.virtual.population import DRAWN, PATIENTS, VirtualPatient, patient_named
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth, scanned
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.values.checks import Floats, as_number, as_positive
@@ -53,6 +46,33 @@ COHORT = "cohort.toml"
 # The case with the operation as it was carried out, where it departs from the plan; and the cohort
 # of these.
 EXECUTED = "executed.toml"
+CASE_BEGIN = """\
+# Virtual patient {name} ({label}), in silico: no patient.
+{what}
+format = "cmfsim-case"
+version = 1
+name = "{name}-in-silico"
+
+[image]
+file = "{place}ct.nrrd"
+
+[landmarks]
+skull = "{place}skull.mrk.json"
+skin = "{place}skin.mrk.json\""""
+CASE_END = """
+
+[mesh]
+edge_length = {edge_length:g}
+
+[muscles]
+
+[postoperative]
+skin = "{truth}skin.ply"
+landmarks = "{truth}skin.mrk.json"
+
+[output]
+folder = "out"
+"""
 
 
 def virtual_patients(
@@ -97,38 +117,30 @@ def virtual_patients(
     >>> cases = cmfsim.virtual_patients("insilico", [1, 2])  # doctest: +SKIP
     """
     patients = [patient_named(number) for number in numbers]
-    paths = []
     for patient in patients:
         place = Path(folder) / patient.name
-        settings = patient_settings(patient, seed, edge_length, spacing)
-        if is_made(place, settings):
+        if is_made(place, patient_settings(patient, seed, edge_length, spacing)):
             _log.info("%s already exists", patient.name)
-            paths.append(place / "case.toml")
             continue
 
         def stage(name: str, of: VirtualPatient = patient) -> None:
             if progress is not None:
                 progress(f"{of.name}: {name}")
 
-        paths.append(
-            write_virtual_patient(
-                place,
-                patient.number,
-                seed=seed,
-                edge_length=edge_length,
-                spacing=spacing,
-                progress=stage,
-            )
+        write_virtual_patient(
+            place,
+            patient.number,
+            seed=seed,
+            edge_length=edge_length,
+            spacing=spacing,
+            progress=stage,
         )
-    _write_cohort(Path(folder))
-    return paths
-
-
-def _write_cohort(folder: Path) -> None:
-    """The study of every patient who is complete in the folder."""
-    names = [p.name for p in PATIENTS.values() if (folder / p.name / TRUTH / RECORD).exists()]
-    with replacing(folder / COHORT) as file:
-        file.write(cohort_text("virtual patients", names).encode())
+    complete = [
+        p.name for p in PATIENTS.values() if (Path(folder) / p.name / TRUTH / RECORD).exists()
+    ]
+    with replacing(Path(folder) / COHORT) as file:
+        file.write(cohort_text("virtual patients", complete).encode())
+    return [Path(folder) / patient.name / "case.toml" for patient in patients]
 
 
 def cohort_text(name: str, patients: Iterable[str], *, executed: bool = False) -> str:
@@ -230,7 +242,7 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     write_surface(folder / SKIN, truth.skin_before)
     fresh = folder / f".{TRUTH}.new"
     shutil.rmtree(fresh, ignore_errors=True)
-    _write_truth(fresh, truth, _scan(truth, patient, seed), _landmarks_after(truth, patient, seed))
+    _write_truth(fresh, truth, patient, seed)
     if patient.departures:
         text = case_text(patient, {}, COARSER * edge_length, executed=truth.motions)
         (fresh / EXECUTED).write_text(text, encoding="utf-8")
@@ -254,7 +266,8 @@ def _write_case(
     edge_length: float,
 ) -> Case:
     """The case before the operation, read back from the files written: CT, landmarks, case file."""
-    ct = head.ct((spacing, spacing, spacing), seed=_draw(seed, patient, CT_DRAW))
+    draw = np.random.SeedSequence([seed, patient.number, CT_DRAW]).generate_state(1)[0]
+    ct = head.ct((spacing, spacing, spacing), seed=int(draw))
     write_image(ct, folder / "ct.nrrd")
     skull = _placed(head.skull_landmarks, SKULL_NOISE, [seed, patient.number, SKULL_DRAW])
     write_landmarks(folder / "skull.mrk.json", skull)
@@ -263,18 +276,6 @@ def _write_case(
     with replacing(folder / "case.toml") as file:
         file.write(case_text(patient, skull, COARSER * edge_length).encode())
     return Case.load(folder / "case.toml")
-
-
-def _scan(truth: PostoperativeTruth, patient: VirtualPatient, seed: int) -> SurfaceData:
-    """The true skin after the operation as a surface scanner measures it."""
-    draw = [seed, patient.number, SCAN_DRAW]
-    return scanned(truth.skin, white=SCAN_WHITE, smooth=SCAN_SMOOTH, seed=draw)
-
-
-def _landmarks_after(
-    truth: PostoperativeTruth, patient: VirtualPatient, seed: int
-) -> dict[str, Floats]:
-    return _placed(truth.skin_landmarks, SKIN_NOISE, [seed, patient.number, AFTER_DRAW])
 
 
 def _record(
@@ -300,11 +301,6 @@ def _record(
 def _write_json(path: Path, values: Mapping[str, Any]) -> None:
     with replacing(path) as file:
         file.write(json.dumps(values, indent=1, allow_nan=False).encode())
-
-
-def _draw(seed: int, patient: VirtualPatient, draw: int) -> int:
-    """The seed of one draw for one patient."""
-    return int(np.random.SeedSequence([seed, patient.number, draw]).generate_state(1)[0])
 
 
 def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> dict[str, Floats]:
@@ -335,57 +331,20 @@ def case_text(
         if executed is None
         else "# Its plan is what the operation did: errors are those of the tissue alone."
     )
-    lines = [
-        f"# Virtual patient {patient.name} ({patient.label}), in silico: no patient.",
-        what,
-        'format = "cmfsim-case"',
-        "version = 1",
-        f'name = "{patient.name}-in-silico"',
-        "",
-        "[image]",
-        f'file = "{place}ct.nrrd"',
-        "",
-        "[landmarks]",
-        f'skull = "{place}skull.mrk.json"',
-        f'skin = "{place}skin.mrk.json"',
-    ]
+    lines = [CASE_BEGIN.format(name=patient.name, label=patient.label, what=what, place=place)]
     for procedure in patient.osteotomies:
         lines += ["", "[[osteotomies]]", f'procedure = "{procedure}"']
     for segment, move in patient.plan.items():
-        motion = (
-            _motion_lines(move, skull)
-            if executed is None
-            else [f"matrix = {executed[segment].tolist()}"]
-        )
-        lines += ["", f"[plan.{segment}]", *motion]
-    lines += [
-        "",
-        "[mesh]",
-        f"edge_length = {edge_length:g}",
-        "",
-        "[muscles]",
-        "",
-        "[postoperative]",
-        f'skin = "{truth}skin.ply"',
-        f'landmarks = "{truth}skin.mrk.json"',
-        "",
-        "[output]",
-        'folder = "out"',
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _motion_lines(move: Relocation, skull: Mapping[str, Floats]) -> list[str]:
-    lines = [f"translation = {list(move.translation)}"]
-    if move.angle:
-        centre = [round(float(x), 3) for x in skull[move.centre]]
-        lines += [
-            f"angle = {move.angle}",
-            f"axis = {list(move.axis)}",
-            f"centre = {centre}   # {move.centre}",
-        ]
-    return lines
+        lines += ["", f"[plan.{segment}]"]
+        if executed is not None:
+            lines.append(f"matrix = {executed[segment].tolist()}")
+            continue
+        lines.append(f"translation = {list(move.translation)}")
+        if move.angle:
+            centre = [round(float(x), 3) for x in skull[move.centre]]
+            lines += [f"angle = {move.angle}", f"axis = {list(move.axis)}"]
+            lines.append(f"centre = {centre}   # {move.centre}")
+    return "\n".join(lines) + CASE_END.format(edge_length=edge_length, truth=truth)
 
 
 def patient_settings(
@@ -417,12 +376,8 @@ def _described(patient: VirtualPatient) -> dict[str, Any]:
         "plan": {name: asdict(move) for name, move in patient.plan.items()},
         "departures": {name: asdict(move) for name, move in patient.departures.items()},
         "thickness_change": patient.thickness_change,
-        "tissue": {f.name: _plain(getattr(patient.tissue, f.name)) for f in fields(TrueTissue)},
+        "tissue": {**vars(patient.tissue), "offsets": dict(patient.tissue.offsets)},
     }
-
-
-def _plain(value: Any) -> Any:
-    return dict(value) if isinstance(value, Mapping) else value
 
 
 def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
@@ -455,9 +410,13 @@ def _measured(truth: PostoperativeTruth) -> dict[str, Any]:
 
 
 def _write_truth(
-    folder: Path, truth: PostoperativeTruth, scan: SurfaceData, placed: Mapping[str, Floats]
+    folder: Path, truth: PostoperativeTruth, patient: VirtualPatient, seed: int
 ) -> None:
+    """Writes the truth, and its skin and landmarks as they are measured after the operation."""
     folder.mkdir()
+    draw = [seed, patient.number, SCAN_DRAW]
+    scan = scanned(truth.skin, white=SCAN_WHITE, smooth=SCAN_SMOOTH, seed=draw)
+    placed = _placed(truth.skin_landmarks, SKIN_NOISE, [seed, patient.number, AFTER_DRAW])
     write_surface(folder / "skin.ply", scan)
     write_surface(folder / "skin_exact.ply", truth.skin)
     write_surface(folder / "skin_before.ply", truth.skin_before)
