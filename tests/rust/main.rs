@@ -10,7 +10,12 @@ mod algebra {
     mod elastic_box;
     mod error_bound;
     mod krylov;
+    #[cfg(target_os = "linux")]
+    mod memory;
     mod ordering;
+    mod pool;
+    mod precision;
+    mod simd;
 }
 mod contact {
     mod creases;
@@ -37,6 +42,7 @@ mod mechanics {
     mod part;
     mod patch;
     mod polar;
+    mod series;
     mod squeezed;
 }
 mod meshing {

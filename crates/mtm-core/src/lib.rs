@@ -87,7 +87,11 @@ pub mod internals {
     pub use crate::algebra::constraints::{Constraint, projected};
     pub use crate::algebra::error_bound::tridiagonal_extremes;
     pub use crate::algebra::krylov::Operator;
+    #[cfg(target_os = "linux")]
+    pub use crate::algebra::memory::kept;
+    pub use crate::algebra::multigrid::precision::Stored;
     pub use crate::algebra::ordering::postorder;
+    pub use crate::algebra::simd;
     pub use crate::contact::Spring;
     pub use crate::contact::field::{Field, FieldValue};
     pub use crate::contact::links::Link;
@@ -95,7 +99,7 @@ pub mod internals {
     pub use crate::mechanics::density::{Density, volumetric, without_negative};
     pub use crate::mechanics::hyperelastic::{PointResponse, PointTangent, Tangent, barrier};
     pub use crate::mechanics::polar::Polar;
-    pub use crate::mechanics::strain_energy::Part;
+    pub use crate::mechanics::strain_energy::{LAG, Part, PointTangents};
     pub use crate::meshing::stuffing::distance::thin_parts;
     pub use crate::meshing::stuffing::lattice::{Octree, neighbours};
     pub use crate::muscles::equivalent::aligned_box::AlignedBox;

@@ -86,20 +86,20 @@ unsafe impl GlobalAlloc for HugePages {
 
 /// Large buffers: where they come from, and those that are kept.
 #[cfg(target_os = "linux")]
-mod kept {
+pub mod kept {
     use std::alloc::Layout;
     use std::sync::Mutex;
     use std::sync::atomic::AtomicUsize;
     pub(super) use std::sync::atomic::Ordering::Relaxed;
 
-    use super::{KEPT_BYTES, KEPT_SHARE};
+    pub use super::{KEPT_BYTES, KEPT_SHARE};
 
     /// Size of a huge page on x86-64 and most arm64 systems, bytes.
     const HUGE_PAGE: usize = 2 << 20;
     /// Buffers of at least this size get their own pages, bytes.
     const LARGE: usize = HUGE_PAGE;
     /// Number of freed buffers that are kept at most.
-    const KEPT_COUNT: usize = 16;
+    pub const KEPT_COUNT: usize = 16;
 
     pub(super) fn is_large(layout: Layout) -> bool {
         layout.size() >= LARGE && layout.align() <= HUGE_PAGE
@@ -112,8 +112,9 @@ mod kept {
 
     /// A freed buffer in whole huge pages.
     #[derive(Clone, Copy)]
-    pub(super) struct Buffer {
-        pub start: *mut u8,
+    pub struct Buffer {
+        pub(super) start: *mut u8,
+        /// Bytes.
         pub length: usize,
     }
 
@@ -146,7 +147,7 @@ mod kept {
     }
 
     /// Freed buffers that are kept now at most, bytes.
-    fn most_kept() -> usize {
+    pub fn most_kept() -> usize {
         KEPT_BYTES.max((KEPT_SHARE * LIVE.load(Relaxed) as f64) as usize)
     }
 
@@ -154,7 +155,7 @@ mod kept {
     static KEPT: Mutex<[Buffer; KEPT_COUNT]> = Mutex::new([Buffer::NONE; KEPT_COUNT]);
 
     /// What `work` makes of the kept buffers; none while another thread uses them.
-    fn with_kept<T>(work: impl FnOnce(&mut [Buffer; KEPT_COUNT]) -> T) -> Option<T> {
+    pub fn with_kept<T>(work: impl FnOnce(&mut [Buffer; KEPT_COUNT]) -> T) -> Option<T> {
         KEPT.try_lock().ok().map(|mut kept| work(&mut kept))
     }
 
@@ -230,73 +231,6 @@ mod kept {
             // If the kernel refuses, ordinary pages are used, which are only slower.
             libc::madvise(pointer.cast(), length, libc::MADV_HUGEPAGE);
             pointer
-        }
-    }
-
-    #[cfg(test)]
-    mod tests {
-        use super::*;
-        use crate::algebra::memory::HugePages;
-        use std::alloc::GlobalAlloc;
-
-        const MB: usize = 1 << 20;
-
-        fn layout(size: usize) -> Layout {
-            Layout::from_size_align(size, 8).expect("a valid layout")
-        }
-
-        /// Other tests of this process use the system's allocator, so that the kept buffers are those of this one.
-        #[test]
-        #[allow(unsafe_code)]
-        fn freed_buffers_are_used_again_and_cleared() {
-            let total = || {
-                with_kept(|kept| kept.iter().map(|b| b.length).sum::<usize>())
-                    .expect("no other user")
-            };
-            unsafe {
-                let first = HugePages.alloc(layout(9 * MB));
-                first.write_bytes(7, 9 * MB);
-                HugePages.dealloc(first, layout(9 * MB));
-                assert_eq!(total(), 10 * MB);
-                let second = HugePages.alloc_zeroed(layout(5 * MB));
-                assert_eq!(second, first);
-                assert_eq!(total(), 0, "the rest is returned");
-                assert!(std::slice::from_raw_parts(second, 5 * MB).iter().all(|&byte| byte == 0));
-                HugePages.dealloc(second, layout(5 * MB));
-
-                // Neither more bytes nor more buffers than the limits; the newest stay.
-                let many: Vec<_> =
-                    (0..3 * KEPT_COUNT).map(|_| HugePages.alloc(layout(8 * MB))).collect();
-                for &buffer in &many {
-                    buffer.write_bytes(1, 8 * MB);
-                    HugePages.dealloc(buffer, layout(8 * MB));
-                    assert!(total() <= most_kept());
-                }
-                assert_eq!(total(), KEPT_BYTES);
-                let again = HugePages.alloc(layout(8 * MB));
-                assert!(many[many.len() - 8..].contains(&again));
-                HugePages.dealloc(again, layout(8 * MB));
-                let small: Vec<_> =
-                    (0..3 * KEPT_COUNT).map(|_| HugePages.alloc(layout(2 * MB))).collect();
-                for buffer in small {
-                    HugePages.dealloc(buffer, layout(2 * MB));
-                }
-                assert_eq!(total(), 2 * MB * KEPT_COUNT);
-
-                let large = HugePages.alloc(layout(KEPT_BYTES + 1));
-                HugePages.dealloc(large, layout(KEPT_BYTES + 1));
-                assert_eq!(total(), 2 * MB * KEPT_COUNT);
-
-                // A share of what is in use.
-                let used = HugePages.alloc(layout(8 * KEPT_BYTES));
-                let large = HugePages.alloc(layout(2 * KEPT_BYTES));
-                HugePages.dealloc(large, layout(2 * KEPT_BYTES));
-                assert_eq!(HugePages.alloc(layout(2 * KEPT_BYTES)), large);
-                HugePages.dealloc(large, layout(2 * KEPT_BYTES));
-                HugePages.dealloc(used, layout(8 * KEPT_BYTES));
-                HugePages.dealloc(HugePages.alloc(layout(2 * MB)), layout(2 * MB));
-                assert!(total() <= KEPT_BYTES);
-            }
         }
     }
 }

@@ -12,4 +12,4 @@ pub mod ordering;
 pub mod pool;
 pub mod relaxation;
 pub(crate) mod row_sums;
-pub(crate) mod simd;
+pub mod simd;

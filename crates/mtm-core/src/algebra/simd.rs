@@ -9,10 +9,10 @@ use std::hint::black_box;
 use pulp::{Arch, Simd, WithSimd};
 
 /// Number of doubles that the kernels here add at once.
-pub(crate) const LANES: usize = 4;
+pub const LANES: usize = 4;
 
 /// A loop over many rows. `run`, and everything it calls in the loop, must be `#[inline(always)]`.
-pub(crate) trait Kernel {
+pub trait Kernel {
     /// Result of the loop.
     type Output;
     /// The loop.
@@ -20,7 +20,7 @@ pub(crate) trait Kernel {
 }
 
 /// Runs `kernel` with the widest vectors that this processor and [`LANES`] allow.
-pub(crate) fn widest<K: Kernel>(kernel: K) -> K::Output {
+pub fn widest<K: Kernel>(kernel: K) -> K::Output {
     struct Chosen<K>(K);
     impl<K: Kernel> WithSimd for Chosen<K> {
         type Output = K::Output;
@@ -40,36 +40,8 @@ pub(crate) fn whole_lanes<T>(sums: T) -> T {
 
 /// `sum += a b`, lane by lane.
 #[inline(always)]
-pub(crate) fn add_products(sum: &mut [f64; LANES], a: [f64; LANES], b: [f64; LANES]) {
+pub fn add_products(sum: &mut [f64; LANES], a: [f64; LANES], b: [f64; LANES]) {
     for lane in 0..LANES {
         sum[lane] += a[lane] * b[lane];
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    struct Sum<'a>(&'a [[f64; LANES]], f64);
-
-    impl Kernel for Sum<'_> {
-        type Output = [f64; LANES];
-        #[inline(always)]
-        fn run(self) -> [f64; LANES] {
-            let mut sum = [0.0; LANES];
-            for &row in self.0 {
-                add_products(&mut sum, row, [self.1; LANES]);
-                add_products(&mut sum, row, row);
-            }
-            sum
-        }
-    }
-
-    #[test]
-    fn wide_vectors_give_the_bits_of_plain_ones() {
-        let rows: Vec<[f64; LANES]> =
-            (0..1001).map(|i| [0.1, 0.7, 1.3, 1e9].map(|v| (v * f64::from(i)).sin())).collect();
-        let plain = Sum(&rows, 1.0 / 3.0).run();
-        assert_eq!(plain.map(f64::to_bits), widest(Sum(&rows, 1.0 / 3.0)).map(f64::to_bits));
     }
 }

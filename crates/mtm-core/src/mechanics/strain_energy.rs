@@ -26,7 +26,7 @@ pub use part::Part;
 const NODES_PER_TASK: usize = 256;
 /// Change of any entry of F up to which a definite tangent may be kept. Such a tangent is not that of the energy
 /// anyway, and after a few steps most tissue hardly moves.
-pub(crate) const LAG: f64 = 1e-3;
+pub const LAG: f64 = 1e-3;
 
 /// Which tangent stiffness is computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,7 +67,7 @@ struct TetValues {
 
 /// Tangents of a series of states of one body, each near the one before.
 #[derive(Debug, Default)]
-pub(crate) struct PointTangents {
+pub struct PointTangents {
     /// Change of any entry of F up to which a definite tangent is kept.
     lag: f64,
     /// Tangent of each quadrature point times its volume, N mm.
@@ -246,7 +246,8 @@ impl StrainEnergy {
     /// Begins a series of states, in the memory of an earlier one. What it finds does not depend on other series.
     ///
     /// `lag`: the change of any entry of F up to which a definite tangent is kept.
-    pub(crate) fn begin(&self, lag: f64) -> PointTangents {
+    #[doc(hidden)]
+    pub fn begin(&self, lag: f64) -> PointTangents {
         let mut tangents = std::mem::take(&mut *locked(&self.memory.tangents));
         tangents.at.clear();
         tangents.lag = lag;
@@ -254,7 +255,8 @@ impl StrainEnergy {
     }
 
     /// Ends a series, whose memory the next one uses.
-    pub(crate) fn end(&self, tangents: PointTangents) {
+    #[doc(hidden)]
+    pub fn end(&self, tangents: PointTangents) {
         *locked(&self.memory.tangents) = tangents;
     }
 
@@ -272,7 +274,8 @@ impl StrainEnergy {
     }
 
     /// The result of `read` for the tangent stiffness under displacements of all nodes, the next of a series.
-    pub(crate) fn with_stiffness<T>(
+    #[doc(hidden)]
+    pub fn with_stiffness<T>(
         &self,
         u: &[[f64; 3]],
         kind: TangentKind,
@@ -448,47 +451,5 @@ fn left_contracted(tangent: &Tangent, g: [f64; 3]) -> [Block; 3] {
 fn add_contracted(block: &mut Block, left: &[Block; 3], g: [f64; 3]) {
     for (i, entry) in block.iter_mut().enumerate() {
         *entry += left[0][i] * g[0] + left[1][i] * g[1] + left[2][i] * g[2];
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::mechanics::material::Elastic;
-    use crate::mechanics::tissue::Tissue;
-    use crate::mesh::TetMesh;
-
-    fn values(body: &StrainEnergy, u: &[[f64; 3]], series: &mut PointTangents) -> Vec<Block> {
-        let read = |matrix: &BlockMatrix| {
-            (0..matrix.n_rows()).flat_map(|row| matrix.row(row).1.to_vec()).collect()
-        };
-        body.with_stiffness(u, TangentKind::Definite, series, read).expect("four nodes")
-    }
-
-    #[test]
-    fn definite_tangents_of_a_series_are_kept_only_where_the_tet_hardly_moves() {
-        let nodes = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-        let mesh = Arc::new(TetMesh::new(nodes, vec![[0, 1, 2, 3]]).expect("one tet"));
-        let tissue = Tissue::isotropic(&[Elastic { young: 1.0, poisson: 0.46 }]).expect("tissue");
-        let tensors = Arc::new(MassTensors::new(mesh, Arc::new(tissue)).expect("tensors"));
-        let body = StrainEnergy::new(tensors, Kinematics::NEO_HOOKEAN);
-        let at = |x: f64| vec![[0.0; 3], [x, 0.1, 0.0], [0.0; 3], [0.0, 0.0, -0.2]];
-        let fresh = |x: f64| values(&body, &at(x), &mut PointTangents::default());
-
-        let mut series = body.begin(LAG);
-        assert_eq!(values(&body, &at(0.1), &mut series), fresh(0.1));
-        let near = values(&body, &at(0.1 + 0.5 * LAG), &mut series);
-        assert_eq!(near, fresh(0.1), "kept");
-        // Steps add up: the tangent is that of a place within the lag, not of the last state.
-        let moved = values(&body, &at(0.1 + 1.5 * LAG), &mut series);
-        assert_eq!(moved, fresh(0.1 + 1.5 * LAG));
-        assert_ne!(moved, near);
-        // Exact tangents are never kept, and none of another series is.
-        let exact = body.with_stiffness(&at(0.1), TangentKind::Exact, &mut series, |_| ());
-        exact.expect("four nodes");
-        let after = values(&body, &at(0.1 + 0.5 * LAG), &mut series);
-        assert_eq!(after, fresh(0.1 + 0.5 * LAG));
-        body.end(series);
-        assert_eq!(values(&body, &at(0.1), &mut body.begin(LAG)), fresh(0.1));
     }
 }

@@ -16,7 +16,7 @@ mod coarsest;
 mod galerkin;
 mod hierarchy;
 mod options;
-mod precision;
+pub(crate) mod precision;
 mod prolongator;
 mod rigid_modes;
 mod scaled_matrix;

@@ -14,7 +14,7 @@ pub enum CyclePrecision {
 }
 
 /// Numbers of the vectors and sums.
-pub(super) trait Real:
+pub trait Real:
     Copy
     + Debug
     + Default
@@ -75,7 +75,7 @@ impl Real for f32 {
 }
 
 /// Numbers of the stored blocks, which count in units of 1/[`ONE`](Self::ONE).
-pub(super) trait Stored: Copy + Debug + Default + Send + Sync {
+pub trait Stored: Copy + Debug + Default + Send + Sync {
     /// What 1 is stored as.
     const ONE: f64;
     /// Whether no number above 1 can be stored.
@@ -138,19 +138,4 @@ pub(super) struct Single;
 impl Precision for Single {
     type Stored = i16;
     type Real = f32;
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sixteen_bits_are_the_nearest_ones() {
-        for k in -32_767_i16..=32_767 {
-            for shift in [-0.49, 0.0, 0.49] {
-                assert_eq!(i16::nearest((f64::from(k) + shift) / i16::ONE), k);
-            }
-        }
-        assert_eq!([1.5, -1.5].map(i16::nearest), [32_767, -32_767]);
-    }
 }

@@ -8,7 +8,7 @@ use crate::mechanics::strain_energy::TangentKind::{self, Exact};
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::newton::descent::StepRule;
-use crate::statics::newton::step::{BoundaryMotion, NewtonStep, by_tangent};
+use crate::statics::newton::step::{NewtonStep, by_tangent};
 use crate::statics::newton::{Equilibrium, Iterate, Target, along_slope, moved_by};
 use crate::statics::options::Interrupt;
 use crate::vector::{add, dot, scaled, sub};
@@ -24,8 +24,8 @@ struct UnderConditions<'a, 'i> {
 
 impl StepRule for UnderConditions<'_, '_> {
     fn next(&mut self, pose: &Iterate, how: (TangentKind, f64)) -> Result<NewtonStep> {
-        let moves = BoundaryMotion { constraints: &self.still.constraints, change: None };
-        let rows = self.equilibrium.step(pose, self.target, &moves, how, self.interrupted)?;
+        let moves = (&self.still.constraints[..], None);
+        let rows = self.equilibrium.step(pose, self.target, moves, how, self.interrupted)?;
         Ok(NewtonStep { slope: along_slope(&rows, pose), slack: 0.0, rows })
     }
 
@@ -63,8 +63,8 @@ impl Equilibrium {
         let allowed = self.allowed(&start, target, f64::INFINITY);
         let interrupted = solve.interrupted;
         let (rows, _) = by_tangent(Exact, |kind| {
-            let moves = BoundaryMotion { constraints: &constraints, change: Some(&change) };
-            self.step(&start, target, &moves, (kind, allowed), interrupted)
+            let moves = (&constraints[..], Some(&change[..]));
+            self.step(&start, target, moves, (kind, allowed), interrupted)
         })?;
         target.hierarchy.leave_rest(&self.at_rest);
         let mut ahead = start.u;

@@ -33,25 +33,15 @@ pub(crate) struct SlidingBody<'a> {
     pub held: Support,
 }
 
-/// Input of every step of a body in contact.
-struct Wanted<'a> {
-    target: &'a Target<'a>,
-    slide: &'a SlidingBody<'a>,
-}
-
-/// Starting state of a step.
-#[derive(Default)]
-struct Start<'a> {
-    /// Displacements of the nodes that are not unknowns; none if they do not move.
-    change: Option<&'a [[f64; 3]]>,
-    /// Previous contact state.
-    contact: Option<&'a ContactState>,
-}
+/// Starting state of a step: displacements of the nodes that are not unknowns, none if they do not move, and the
+/// previous contact state.
+type Start<'a> = (Option<&'a [[f64; 3]]>, Option<&'a ContactState>);
 
 /// Steps of a body in contact.
 struct InContact<'a, 'i> {
     equilibrium: &'a Equilibrium,
-    wanted: &'a Wanted<'a>,
+    target: &'a Target<'a>,
+    slide: &'a SlidingBody<'a>,
     /// State after the last step.
     contact: ContactState,
     /// Error allowed in the last step, and that which keeps contact within its required accuracy, mm.
@@ -62,9 +52,8 @@ struct InContact<'a, 'i> {
 
 impl StepRule for InContact<'_, '_> {
     fn next(&mut self, pose: &Iterate, how: (TangentKind, f64)) -> Result<NewtonStep> {
-        let start = Start { contact: Some(&self.contact), ..Start::default() };
-        let (rows, state) =
-            self.equilibrium.settled(pose, self.wanted, &start, how, self.interrupted)?;
+        let (body, start) = ((self.target, self.slide), (None, Some(&self.contact)));
+        let (rows, state) = self.equilibrium.settled(pose, body, start, how, self.interrupted)?;
         let iterations = self.contact.iterations + state.iterations;
         self.contact = ContactState { iterations, ..state };
         // Walls do no work along themselves, and their work across gaps does not enter the energy of the body.
@@ -75,12 +64,12 @@ impl StepRule for InContact<'_, '_> {
     }
 
     fn conditions(&self) -> Cow<'_, RowConditions> {
-        Cow::Owned(RowConditions::of_state(self.wanted.slide.sliding, &self.contact))
+        Cow::Owned(RowConditions::of_state(self.slide.sliding, &self.contact))
     }
 
     fn resume(&mut self, pose: &Iterate) {
         let ContactState { displacements, reactions, .. } = &mut self.contact;
-        let nodes = self.wanted.slide.sliding.nodes();
+        let nodes = self.slide.sliding.nodes();
         for ((node, u), force) in nodes.iter().zip(displacements).zip(reactions) {
             (*u, *force) = (pose.u[node.node as usize], pose.slope[node.row as usize]);
         }
@@ -99,7 +88,6 @@ impl Equilibrium {
         solve: &mut PlanSolve<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState)> {
         let interrupted = solve.interrupted;
-        let wanted = Wanted { target, slide };
         let rest = self.pose(vec![[0.0; 3]; target.prescribed.len()], target)?;
         let mut change = target.prescribed.to_vec();
         for &j in &self.reduction.unknowns {
@@ -109,8 +97,8 @@ impl Equilibrium {
         let far = slide.sliding.farthest(slide.motions).max(reach(&rest, target));
         let first = far * STEP_SHARE.max(STEP_TOLERANCE * self.options.tolerance);
         let ((rows, contact), _) = by_tangent(Exact, |kind| {
-            let start = Start { change: Some(&change), ..Start::default() };
-            self.settled(&rest, &wanted, &start, (kind, first), interrupted)
+            let start = (Some(&change[..]), None);
+            self.settled(&rest, (target, slide), start, (kind, first), interrupted)
         })?;
         target.hierarchy.leave_rest(&self.at_rest);
         solve.effort.iterations += 1;
@@ -119,9 +107,9 @@ impl Equilibrium {
         // Error of a step that keeps contact within its required accuracy, mm.
         let fine = slide.sliding.gap_limit(&self.options.contact);
         let on_walls: Vec<u32> = slide.sliding.nodes().iter().map(|n| n.row).collect();
-        let wanted = &wanted;
+        let (equilibrium, before) = (self, first);
         let mut steps =
-            InContact { equilibrium: self, wanted, contact, before: first, fine, interrupted };
+            InContact { equilibrium, target, slide, contact, before, fine, interrupted };
         let u = self.descend(pose, target, (fine, &on_walls), &mut steps, solve)?;
         if !self.energy.is_at_barrier(&u) {
             return Ok((u, steps.contact));
@@ -129,8 +117,7 @@ impl Equilibrium {
         let target =
             &Target { energy: &self.energy, conditions: RowConditions::default(), ..*target };
         target.tangents.borrow_mut().forget();
-        let wanted = &Wanted { target, slide };
-        let mut steps = InContact { wanted, ..steps };
+        let mut steps = InContact { target, ..steps };
         let pose = self.pose(u, target)?;
         let (pose, has_moved) = self.eased(pose, target, &steps.conditions())?;
         if has_moved {
@@ -146,12 +133,11 @@ impl Equilibrium {
     fn settled(
         &self,
         pose: &Iterate,
-        wanted: &Wanted<'_>,
-        start: &Start<'_>,
+        (target, slide): (&Target<'_>, &SlidingBody<'_>),
+        (change, contact): Start<'_>,
         (kind, allowed): (TangentKind, f64),
         interrupted: Interrupt<'_>,
     ) -> Result<(Vec<[f64; 3]>, ContactState)> {
-        let &Wanted { target, slide } = wanted;
         let here = self.reduction.rows(&pose.u);
         // Closest points cannot converge further than the solves do.
         let far = reach(pose, target);
@@ -160,7 +146,7 @@ impl Equilibrium {
         options.contact.allowed = allowed;
         let positions = self.reduction.rows(self.tensors.element_nodes().positions());
         target.hierarchy.serve(kind == Definite, |multigrid| {
-            let (matrix, mut b) = self.tangent((pose, target), kind, start.change)?;
+            let (matrix, mut b) = self.tangent((pose, target), kind, change)?;
             // K (x − u) = −slope: the contact conditions apply to x, the whole displacement.
             for (b, f) in b.iter_mut().zip(matrix.multiply(&here)) {
                 *b = add(*b, f);
@@ -174,7 +160,7 @@ impl Equilibrium {
                 multigrid,
             };
             let (system, _) = System::new(matrix, &body, &options, &mut Clock::new(), interrupted)?;
-            let contact = start.contact.map(|state| slide.sliding.start_of(state));
+            let contact = contact.map(|state| slide.sliding.start_of(state));
             let settle = ContactSolve {
                 sliding: slide.sliding,
                 motions: slide.motions,
@@ -188,7 +174,7 @@ impl Equilibrium {
             let step = rows.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
             // Under contact only the hierarchy at rest is kept, for other plans: iterations with that of an earlier
             // tangent cost more than a new one.
-            let multigrid = start.change.and_then(|_| system.multigrid().cloned());
+            let multigrid = change.and_then(|_| system.multigrid().cloned());
             let iterations = solve.effort.iterations;
             Ok(HierarchyResult { value: (step, contact), multigrid, iterations })
         })

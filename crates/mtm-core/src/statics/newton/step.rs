@@ -21,13 +21,9 @@ impl NewtonStep {
     }
 }
 
-/// How the boundary moves in a step.
-pub(super) struct BoundaryMotion<'a> {
-    /// Displacement of each constrained row along its normal.
-    pub constraints: &'a [Constraint],
-    /// Displacements of the nodes that are not unknowns; none if they do not move.
-    pub change: Option<&'a [[f64; 3]]>,
-}
+/// How the boundary moves in a step: displacement of each constrained row along its normal, and displacements of the
+/// nodes that are not unknowns; none if they do not move.
+pub(super) type BoundaryMotion<'a> = (&'a [Constraint], Option<&'a [[f64; 3]]>);
 
 /// The result of `solve` with the tangent `first`, or with the definite one if the exact one is not positive
 /// definite; and the tangent used.

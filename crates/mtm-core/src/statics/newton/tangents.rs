@@ -43,11 +43,10 @@ impl Equilibrium {
         &self,
         pose: &Iterate,
         target: &Target<'_>,
-        moves: &BoundaryMotion<'_>,
+        (constraints, change): BoundaryMotion<'_>,
         (kind, allowed): (TangentKind, f64),
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<[f64; 3]>> {
-        let &BoundaryMotion { constraints, change } = moves;
         target.hierarchy.serve(kind == Definite, |kept| {
             let (mut matrix, b) = self.tangent((pose, target), kind, change)?;
             for (row, spring) in &target.conditions.springs {
