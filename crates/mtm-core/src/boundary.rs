@@ -140,10 +140,8 @@ impl Boundary {
             liftable: (Vec::new(), None),
         };
         boundary.check_segments()?;
-        let mut taken: HashMap<u32, String> = HashMap::new();
-        for &node in &boundary.fixed {
-            taken.insert(node, "fixed".into());
-        }
+        let fixed = boundary.fixed.iter();
+        let mut taken: HashMap<u32, String> = fixed.map(|&node| (node, "fixed".into())).collect();
         let mut lost = 0;
         let mut claim = |nodes: &mut Vec<u32>, role: String| -> Result<Vec<usize>> {
             let (mut kept, mut rows) = (Vec::new(), Vec::new());
@@ -158,8 +156,8 @@ impl Boundary {
                     Some(owner) => {
                         let rival = owner.starts_with("joined") && role.starts_with("joined");
                         if conflicts == Conflicts::Refuse || rival {
-                            let (node, first, second) =
-                                (node as usize, owner.clone(), role.clone());
+                            let (first, second) = (owner.clone(), role);
+                            let node = node as usize;
                             return Err(MtmError::NodeOfTwoKinds { node, first, second });
                         }
                         lost += 1;
@@ -430,10 +428,6 @@ impl Boundary {
     /// A segment that the plan lacks or lists twice, a name that is not a segment, displacements of the wrong
     /// number or not finite, displacements for a segment with sliding nodes.
     pub fn motions<'a>(&self, plan: &'a Plan) -> Result<Vec<&'a Motion>> {
-        let fail = |segment: &str, problem: String| MtmError::Plan {
-            segment: segment.to_owned(),
-            problem,
-        };
         let names: Vec<&str> = self.segments.iter().map(|s| s.name.as_str()).collect();
         let motions = matched(plan, &names)?;
         self.segments
@@ -448,7 +442,7 @@ impl Boundary {
                             rows.len(),
                             given.len()
                         );
-                        return Err(fail(&segment.name, problem));
+                        return Err(misplanned(&segment.name, problem));
                     }
                     let what = format!("plan[\"{}\"]", segment.name);
                     check_coordinates(&what, rows, ErrorKind::Boundary)?;
@@ -456,7 +450,7 @@ impl Boundary {
                         matches!(&pair.against, Against::Bone { segment: Some(s), .. } if *s == segment.name)
                     };
                     if !segment.sliding.is_empty() || self.touching.iter().any(faced) {
-                        return Err(fail(
+                        return Err(misplanned(
                             &segment.name,
                             "displacements of joined nodes do not say how its contact surface moves; \
                              give a rigid 4×4 matrix or a SurfaceMotion"
@@ -492,7 +486,7 @@ impl Boundary {
             {
                 let problem =
                     format!("row {row} moves node {node} by {u:?}, an earlier row by {before:?}");
-                return Err(MtmError::Plan { segment: segment.name.clone(), problem });
+                return Err(misplanned(&segment.name, problem));
             }
         }
         let own = |j: &u32| match self.inherited.get(j) {
@@ -508,24 +502,20 @@ impl Boundary {
 /// # Errors
 /// A segment that the plan lacks or lists twice, a name that is not a segment.
 pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a Motion>> {
-    let fail =
-        |segment: &str, problem: String| MtmError::Plan { segment: segment.to_owned(), problem };
     for (i, (name, _)) in plan.iter().enumerate() {
         if !segments.contains(&name.as_str()) {
             let known: Vec<String> = segments.iter().map(|s| format!("\"{s}\"")).collect();
-            return Err(fail(
-                name,
-                format!("no such segment; the boundary has {}", known.join(", ")),
-            ));
+            let known = known.join(", ");
+            return Err(misplanned(name, format!("no such segment; the boundary has {known}")));
         }
         if plan[..i].iter().any(|(other, _)| other == name) {
-            return Err(fail(name, "it is named twice".into()));
+            return Err(misplanned(name, "it is named twice".into()));
         }
     }
     segments
         .iter()
         .map(|&segment| match plan.iter().find(|(name, _)| name == segment) {
-            Some((_, Motion::Rigid(rigid))) if is_far(rigid) => Err(fail(
+            Some((_, Motion::Rigid(rigid))) if is_far(rigid) => Err(misplanned(
                 segment,
                 format!(
                     "its translation {:?} mm is out of range: allowed is -1e7 to 1e7 mm; check the \
@@ -534,12 +524,16 @@ pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a M
                 ),
             )),
             Some((_, motion)) => Ok(motion),
-            None => Err(fail(
+            None => Err(misplanned(
                 segment,
                 "it is missing; a plan names every segment (identity matrix: no motion)".into(),
             )),
         })
         .collect()
+}
+
+fn misplanned(segment: &str, problem: String) -> MtmError {
+    MtmError::Plan { segment: segment.to_owned(), problem }
 }
 
 /// Whether a gap, mm, is within the range that contact can maintain.

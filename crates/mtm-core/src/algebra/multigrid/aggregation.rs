@@ -50,9 +50,9 @@ impl Aggregates {
     fn from_weights(row_start: &[usize], columns: &[u32], weights: &[f32]) -> Self {
         let graph = StrongGraph { row_start, columns, weights };
         let mut of_row = vec![UNASSIGNED; row_start.len() - 1];
-        let founded = graph.found(&mut of_row);
+        let founded = graph.found(&mut of_row, 0, true);
         graph.join(&mut of_row);
-        let count = graph.found_by_the_rest(&mut of_row, founded) as usize;
+        let count = graph.found(&mut of_row, founded, false) as usize;
         let mut sizes = vec![0; count];
         for &aggregate in &of_row {
             if aggregate != UNASSIGNED {
@@ -94,16 +94,19 @@ impl StrongGraph<'_> {
             .map(|(j, w)| (*j as usize, *w))
     }
 
-    /// Aggregates of rows whose neighbours are all free; their number.
-    fn found(&self, of_row: &mut [u32]) -> u32 {
-        let mut count = 0;
+    /// Aggregates, after the first `count`, of free rows with their free neighbours, if `all_free` only where all
+    /// neighbours are; the number of all aggregates.
+    fn found(&self, of_row: &mut [u32], mut count: u32, all_free: bool) -> u32 {
         for i in 0..self.n_rows() {
-            if of_row[i] != UNASSIGNED || self.strong(i).any(|(j, _)| of_row[j] != UNASSIGNED) {
+            let is_taken = |j: usize| of_row[j] != UNASSIGNED;
+            if is_taken(i) || (all_free && self.strong(i).any(|(j, _)| is_taken(j))) {
                 continue;
             }
             let mut founded = false;
             for (j, _) in self.strong(i) {
-                of_row[j] = count;
+                if of_row[j] == UNASSIGNED {
+                    of_row[j] = count;
+                }
                 founded = true;
             }
             if founded {
@@ -129,26 +132,5 @@ impl StrongGraph<'_> {
             }
             of_row[i] = best.1;
         }
-    }
-
-    /// Aggregates of the rows still free, after the first `count`; the number of all.
-    fn found_by_the_rest(&self, of_row: &mut [u32], mut count: u32) -> u32 {
-        for i in 0..self.n_rows() {
-            if of_row[i] != UNASSIGNED {
-                continue;
-            }
-            let mut founded = false;
-            for (j, _) in self.strong(i) {
-                if of_row[j] == UNASSIGNED {
-                    of_row[j] = count;
-                }
-                founded = true;
-            }
-            if founded {
-                of_row[i] = count;
-                count += 1;
-            }
-        }
-        count
     }
 }

@@ -6,11 +6,11 @@ use rayon::prelude::*;
 
 use crate::algebra::blocks::BlockMatrix;
 
+use super::MultigridOptions;
 use super::aggregation::Aggregates;
 use super::block_rows::SystemRows;
 use super::coarsest::DenseCholesky;
 use super::galerkin::{CoarseMatrix, galerkin};
-use super::options::MultigridOptions;
 use super::precision::{Precision, Real};
 use super::prolongator::Prolongator;
 use super::rigid_modes::{MODES, ModeBlock, orthonormalise};

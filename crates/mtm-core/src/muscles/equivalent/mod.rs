@@ -10,7 +10,6 @@ mod sampling;
 pub(crate) mod sequence;
 pub(crate) mod shape;
 mod shares;
-mod stiffness;
 pub(crate) mod tet_tree;
 
 use std::sync::atomic::{AtomicBool, Ordering};

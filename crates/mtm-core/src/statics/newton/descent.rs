@@ -2,17 +2,17 @@
 
 use std::borrow::Cow;
 
+use crate::algebra::constraints::Constraint;
 use crate::algebra::line_search::{Descent, first_of_halves};
 use crate::error::{MtmError, Result};
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::row_conditions::RowConditions;
-use crate::statics::newton::step::{NewtonStep, by_tangent};
 use crate::statics::newton::{
     Equilibrium, Iterate, MAX_STEPS, STIFF_PARTS, TangentSolver, Target, along_slope, lost,
     moved_by, reach,
 };
-use crate::vector::{add, dot};
+use crate::vector::{add, dot, norm};
 
 /// Shortest step of the line search relative to the full one.
 const SHORTEST: f64 = 1.0 / 1024.0;
@@ -38,6 +38,19 @@ const QUADRATIC: f64 = 1e-3;
 /// Error relative to the reach below which a state is near enough to its equilibrium for tissue to resist being
 /// squeezed flat: more exact, its equilibrium without that energy is of no use.
 const NEAR_ENOUGH: f64 = 1e-3;
+
+/// A step of Newton's method.
+pub(super) struct NewtonStep {
+    pub rows: Vec<[f64; 3]>,
+    /// Slope of the merit along it.
+    pub slope: f64,
+    /// Increase of the merit that is accepted, N mm.
+    pub slack: f64,
+}
+
+/// How the boundary moves in a step: displacement of each constrained row along its normal, and displacements of the
+/// nodes that are not unknowns; none if they do not move.
+pub(super) type BoundaryMotion<'a> = (&'a [Constraint], Option<&'a [[f64; 3]]>);
 
 /// Newton's steps under the conditions at the boundary.
 pub(super) trait StepRule {
@@ -212,6 +225,11 @@ impl Equilibrium {
 }
 
 impl NewtonStep {
+    /// Largest displacement, mm.
+    pub(super) fn length(&self) -> f64 {
+        self.rows.iter().fold(0.0, |m, v| m.max(norm(*v)))
+    }
+
     /// Whether `end`, at `share` of the step from `pose`, lies downhill, up to the slack of the step.
     fn descends(&self, pose: &Iterate, end: &Iterate, share: f64) -> bool {
         let descent = Descent { slope: self.slope, slack: self.slack + rounding(pose, end) };
@@ -255,4 +273,20 @@ fn still_falls(rows: &[[f64; 3]], pose: &Iterate, on_walls: &[u32]) -> bool {
 /// Rounding error of the difference in energy of two states, N mm.
 fn rounding(one: &Iterate, other: &Iterate) -> f64 {
     ENERGY_ROUNDING * one.size.max(other.size)
+}
+
+/// The result of `solve` with the tangent `first`, or with the definite one if the exact one is not positive
+/// definite; and the tangent used.
+pub(super) fn by_tangent<T>(
+    first: TangentKind,
+    mut solve: impl FnMut(TangentKind) -> Result<T>,
+) -> Result<(T, TangentKind)> {
+    match solve(first) {
+        Err(MtmError::NotPositiveDefinite { .. } | MtmError::NotConverged { .. })
+            if first == Exact =>
+        {
+            Ok((solve(Definite)?, Definite))
+        }
+        other => Ok((other?, first)),
+    }
 }

@@ -9,7 +9,6 @@ mod descent;
 mod hierarchy;
 mod local;
 mod sliding;
-mod step;
 mod tangents;
 
 use std::cell::RefCell;

@@ -11,9 +11,8 @@ use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::linear::system::{BodyRows, System};
-use crate::statics::newton::descent::StepRule;
+use crate::statics::newton::descent::{NewtonStep, StepRule, by_tangent};
 use crate::statics::newton::hierarchy::HierarchyResult;
-use crate::statics::newton::step::{NewtonStep, by_tangent};
 use crate::statics::newton::{
     Equilibrium, Iterate, STEP_SHARE, STEP_TOLERANCE, TangentSolver, Target, along_slope, moved_by,
     reach,
