@@ -11,6 +11,14 @@ pub(crate) fn of_each<T: Send>(points: &[[f64; 3]], f: impl Fn([f64; 3]) -> T + 
     points.par_iter().with_min_len(POINTS_PER_TASK).map(|&point| f(point)).collect()
 }
 
+/// The distinct ones of `values`, ascending.
+pub(crate) fn distinct<T: Ord>(values: impl IntoIterator<Item = T>) -> Vec<T> {
+    let mut found: Vec<T> = values.into_iter().collect();
+    found.sort_unstable();
+    found.dedup();
+    found
+}
+
 /// A point or direction, mm or dimensionless.
 pub type Vec3 = Vector3<f64>;
 

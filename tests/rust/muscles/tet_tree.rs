@@ -18,8 +18,7 @@ fn cubes(n: usize) -> Vec<AlignedBox> {
 fn every_tet_lies_in_one_leaf_and_in_the_boxes_above_it() {
     for n in [0, 1, LEAF_TETS, LEAF_TETS + 1, 100, 2 * PARALLEL_TETS] {
         let boxes = cubes(n);
-        let tets: Vec<u32> = (0..n as u32).collect();
-        let tree = TetTree::new(&tets, &boxes);
+        let tree = TetTree::new((0..).zip(boxes.iter().copied()).collect());
         let (mut seen, mut open) = (vec![0; n], vec![0]);
         while let Some(at) = open.pop() {
             let Some(branch) = tree.branch(at) else { continue };

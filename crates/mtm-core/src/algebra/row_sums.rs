@@ -14,12 +14,13 @@ pub(crate) fn in_pool<R: Send>(f: impl FnOnce() -> R + Send) -> R {
 
 /// `xᵀy`, summed in fixed chunks.
 pub(crate) fn dot<const N: usize>(x: &[[f64; N]], y: &[[f64; N]]) -> f64 {
-    let partial: Vec<f64> = x
-        .par_chunks(ROWS_PER_SUM)
-        .zip(y.par_chunks(ROWS_PER_SUM))
-        .map(|(x, y)| chunk_dot(x, y))
-        .collect();
-    partial.iter().sum()
+    let chunks = x.par_chunks(ROWS_PER_SUM).zip(y.par_chunks(ROWS_PER_SUM));
+    in_order(chunks.map(|(x, y)| chunk_dot(x, y)))
+}
+
+/// The sum of `parts`, added in their order.
+fn in_order(parts: impl IndexedParallelIterator<Item = f64>) -> f64 {
+    parts.collect::<Vec<f64>>().iter().sum()
 }
 
 fn chunk_dot<const N: usize>(x: &[[f64; N]], y: &[[f64; N]]) -> f64 {
@@ -68,16 +69,11 @@ pub(crate) fn farthest(x: &[[f64; 3]], y: &[[f64; 3]]) -> f64 {
 
 /// `q = A p` and `pᵀq` in one sweep.
 pub(crate) fn multiply_and_dot(a: &BlockMatrix, p: &[[f64; 3]], q: &mut [[f64; 3]]) -> f64 {
-    let partial: Vec<f64> = q
-        .par_chunks_mut(ROWS_PER_SUM)
-        .enumerate()
-        .map(|(chunk, q)| {
-            let first = chunk * ROWS_PER_SUM;
-            a.multiply_rows(first, p, q);
-            chunk_dot(&p[first..first + q.len()], q)
-        })
-        .collect();
-    partial.iter().sum()
+    in_order(q.par_chunks_mut(ROWS_PER_SUM).enumerate().map(|(chunk, q)| {
+        let first = chunk * ROWS_PER_SUM;
+        a.multiply_rows(first, p, q);
+        chunk_dot(&p[first..first + q.len()], q)
+    }))
 }
 
 /// `x += α p`, `r −= α q`; returns `rᵀr`.
@@ -88,19 +84,15 @@ pub(crate) fn advance(
     x: &mut [[f64; 3]],
     r: &mut [[f64; 3]],
 ) -> f64 {
-    let partial: Vec<f64> = x
-        .par_chunks_mut(ROWS_PER_SUM)
-        .zip(r.par_chunks_mut(ROWS_PER_SUM))
-        .zip(p.par_chunks(ROWS_PER_SUM).zip(q.par_chunks(ROWS_PER_SUM)))
-        .map(|((x, r), (p, q))| {
-            for (((x, r), p), q) in x.iter_mut().zip(r.iter_mut()).zip(p).zip(q) {
-                for i in 0..3 {
-                    x[i] += alpha * p[i];
-                    r[i] -= alpha * q[i];
-                }
+    let directions = p.par_chunks(ROWS_PER_SUM).zip(q.par_chunks(ROWS_PER_SUM));
+    let rows = x.par_chunks_mut(ROWS_PER_SUM).zip(r.par_chunks_mut(ROWS_PER_SUM));
+    in_order(rows.zip(directions).map(|((x, r), (p, q))| {
+        for (((x, r), p), q) in x.iter_mut().zip(r.iter_mut()).zip(p).zip(q) {
+            for i in 0..3 {
+                x[i] += alpha * p[i];
+                r[i] -= alpha * q[i];
             }
-            chunk_dot(r, r)
-        })
-        .collect();
-    partial.iter().sum()
+        }
+        chunk_dot(r, r)
+    }))
 }

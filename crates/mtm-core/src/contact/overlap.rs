@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use rayon::prelude::*;
 
 use crate::mesh::TetMesh;
-use crate::vector::{add, cross, dot, norm, sub};
+use crate::vector::{add, cross, distinct, dot, norm, sub};
 
 /// Nodes that should not lie in any tet of another part.
 #[derive(Debug)]
@@ -20,10 +20,8 @@ pub struct Overlap {
 
 impl Overlap {
     /// The members of `nodes` that lie in no tet of another part at rest.
-    pub fn new(mesh: &TetMesh, mut nodes: Vec<u32>) -> Self {
-        nodes.retain(|&j| (j as usize) < mesh.n_nodes());
-        nodes.sort_unstable();
-        nodes.dedup();
+    pub fn new(mesh: &TetMesh, nodes: Vec<u32>) -> Self {
+        let nodes = distinct(nodes.into_iter().filter(|&j| (j as usize) < mesh.n_nodes()));
         let edges = mesh.tets().iter().map(|t| {
             let [a, b] = [t[0], t[1]].map(|j| mesh.nodes()[j as usize]);
             norm(sub(b, a))
@@ -46,11 +44,8 @@ impl Overlap {
     /// Whether each of `asked` is known to lie in no tet of another part under displacements `u` of all nodes;
     /// not for nodes that lie in one at rest.
     pub fn are_outside(&self, mesh: &TetMesh, u: &[[f64; 3]], asked: &[u32]) -> Vec<bool> {
-        let mut nodes: Vec<u32> = asked.to_vec();
-        nodes.sort_unstable();
-        nodes.dedup();
-        nodes.retain(|node| self.nodes.binary_search(node).is_ok());
-        let some = Self { nodes, cell: self.cell };
+        let known = asked.iter().copied().filter(|node| self.nodes.binary_search(node).is_ok());
+        let some = Self { nodes: distinct(known), cell: self.cell };
         let depths = some.depths(mesh, u);
         let depth = |node: &u32| some.nodes.binary_search(node).ok().map(|i| depths[i]);
         asked.iter().map(|node| depth(node) == Some(0.0)).collect()

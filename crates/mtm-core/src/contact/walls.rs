@@ -7,6 +7,7 @@ use crate::error::{MtmError, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::geometry::surface::Surface;
 use crate::mesh::TetMesh;
+use crate::vector::distinct;
 
 /// A surface that nodes may not enter.
 #[derive(Debug)]
@@ -27,9 +28,7 @@ impl Wall {
 
     /// The wall made of `triangles` of nodes, with vertices numbered in ascending order of node.
     pub fn of_tissue(places: &[[f64; 3]], triangles: &[[u32; 3]]) -> Result<Self> {
-        let mut nodes: Vec<u32> = triangles.iter().flatten().copied().collect();
-        nodes.sort_unstable();
-        nodes.dedup();
+        let nodes = distinct(triangles.iter().flatten().copied());
         let number = |j: u32| nodes.partition_point(|&n| n < j) as u32;
         let rows = triangles.iter().map(|t| t.map(number)).collect();
         let vertices = nodes.iter().map(|&j| places[j as usize]).collect();

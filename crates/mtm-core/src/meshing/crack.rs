@@ -11,6 +11,7 @@ mod snapping;
 use std::collections::HashMap;
 
 use crate::error::{ErrorKind, Result};
+use crate::geometry::forest::Forest;
 use crate::geometry::surface::Surface;
 use crate::mesh::TetMesh;
 use crate::vector::{add, dot, norm, scaled, sub};
@@ -121,25 +122,16 @@ fn double(
         }
         // The parts of the star that are connected by faces which the crack does not cross.
         let place: HashMap<u32, usize> = star.iter().enumerate().map(|(i, &t)| (t, i)).collect();
-        let mut part = vec![usize::MAX; star.len()];
-        let mut parts = 0;
-        for first in 0..star.len() {
-            if part[first] != usize::MAX {
-                continue;
-            }
-            part[first] = parts;
-            let mut pending = vec![first];
-            while let Some(i) = pending.pop() {
-                for other in mesh.face_neighbours(star[i] as usize) {
-                    let Some(&j) = place.get(&other) else { continue };
-                    if part[j] == usize::MAX && !cracked(star[i], other) {
-                        part[j] = parts;
-                        pending.push(j);
-                    }
+        let mut forest = Forest::new(star.len());
+        for (i, &t) in star.iter().enumerate() {
+            for other in mesh.face_neighbours(t as usize).filter(|&other| !cracked(t, other)) {
+                if let Some(&j) = place.get(&other) {
+                    forest.join(i, j);
                 }
             }
-            parts += 1;
         }
+        let part = forest.numbered();
+        let parts = part.iter().max().map_or(0, |&last| last + 1);
         // If the star was already disconnected, at a hinge of the mesh, those parts stay as they were.
         for p in 1..parts {
             let copy = (mesh.n_nodes() + copied.len()) as u32;

@@ -5,7 +5,7 @@
 //! motion of the pairs themselves, which never does. Both have the same fixed points: Σ (x − c) = 0 and Σ x ×
 //! (x − c) = 0 over the pairs of a point x and its closest point c.
 
-use nalgebra::{Matrix4, Matrix6, UnitQuaternion, Vector6};
+use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector6};
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, MtmError, Result, check_finite_rows};
@@ -334,9 +334,8 @@ fn largest_motion(from: &Pose, to: &Pose, radius: f64) -> f64 {
 
 fn initial_pose(moving: &[[f64; 3]], initial: &[[f64; 4]; 4]) -> Pose {
     let centre = centroid(moving);
-    let matrix = Matrix4::from_fn(|i, k| initial[i][k]);
-    let linear = matrix.fixed_view::<3, 3>(0, 0).into_owned();
-    let image = linear * centre + matrix.fixed_view::<3, 1>(0, 3);
+    let linear = Matrix3::from_fn(|i, k| initial[i][k]);
+    let image = linear * centre + Vec3::from_fn(|i, _| initial[i][3]);
     Pose { rotation: UnitQuaternion::from_matrix(&linear), scale: 1.0, centre, image }
 }
 

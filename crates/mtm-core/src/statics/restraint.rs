@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, Matrix6, SMatrix, SymmetricEigen, Vector3, Vector6};
 use crate::error::{MtmError, Result};
 use crate::geometry::forest::Forest;
 use crate::mesh::TetMesh;
-use crate::vector::{cross, dot, norm, scaled, sub};
+use crate::vector::{cross, distinct, dot, norm, scaled, sub};
 
 /// Eigenvalue of a part's restraint, relative to the largest, below which a rigid mode counts as free.
 const FREE_MODE: f64 = 1e-10;
@@ -88,9 +88,7 @@ fn parts(mesh: &TetMesh, grounded: &[bool]) -> Vec<RigidPart> {
     order.sort_by_key(|&t| numbers[t]);
     let mut parts = Vec::new();
     for tets in order.chunk_by(|&s, &t| numbers[s] == numbers[t]) {
-        let mut nodes: Vec<u32> = tets.iter().flat_map(|&t| mesh.tets()[t]).collect();
-        nodes.sort_unstable();
-        nodes.dedup();
+        let nodes = distinct(tets.iter().flat_map(|&t| mesh.tets()[t]));
         let count = nodes.len() as f64;
         let mut centre = [0.0; 3];
         for &j in &nodes {

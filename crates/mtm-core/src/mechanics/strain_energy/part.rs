@@ -10,7 +10,7 @@ use crate::mechanics::hyperelastic::Tangent;
 use crate::mechanics::strain_energy::{
     EnergyState, StrainEnergy, TangentKind, add_contracted, left_contracted,
 };
-use crate::vector::add;
+use crate::vector::{add, distinct};
 
 /// Row of a node that stays.
 const STAYS: u32 = u32::MAX;
@@ -38,10 +38,8 @@ impl<'a> Part<'a> {
             return None;
         }
         let elements = body.nodes();
-        let mut around: Vec<u32> =
-            nodes.iter().flat_map(|&j| elements.tets_of_node(j as usize).iter().copied()).collect();
-        around.sort_unstable();
-        around.dedup();
+        let around =
+            distinct(nodes.iter().flat_map(|&j| elements.tets_of_node(j as usize)).copied());
         let row_of = |j: &u32| nodes.binary_search(j).map_or(STAYS, |row| row as u32);
         let tets: Vec<PartTet> = around
             .iter()
@@ -134,9 +132,6 @@ fn pattern(tets: &[PartTet], n_rows: usize) -> BlockMatrix {
             neighbours[row].extend(tet.rows().flatten().map(|column| column as u32));
         }
     }
-    for row in &mut neighbours {
-        row.sort_unstable();
-        row.dedup();
-    }
+    let neighbours: Vec<Vec<u32>> = neighbours.into_iter().map(distinct).collect();
     BlockMatrix::from_pattern(running_sum(neighbours.iter().map(Vec::len)), neighbours.concat())
 }

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::geometry::surface::Surface;
 use crate::mesh::{TetMesh, ascending};
 use crate::meshing::stuffing::cut::{pairs, shape};
-use crate::vector::{norm, of_each, sub, towards};
+use crate::vector::{distinct, norm, of_each, sub, towards};
 
 use super::height;
 
@@ -116,9 +116,5 @@ fn forget_around_rim(mesh: &TetMesh, heights: &mut [Option<f64>]) {
 /// The nodes that share an edge with a node, ascending.
 fn neighbours(mesh: &TetMesh, node: usize) -> Vec<u32> {
     let star = mesh.tets_of_node(node).iter();
-    let mut found: Vec<u32> = star.flat_map(|&t| mesh.tets()[t as usize]).collect();
-    found.sort_unstable();
-    found.dedup();
-    found.retain(|&k| k as usize != node);
-    found
+    distinct(star.flat_map(|&t| mesh.tets()[t as usize]).filter(|&k| k as usize != node))
 }

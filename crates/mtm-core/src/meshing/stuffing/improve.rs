@@ -6,7 +6,7 @@
 //! conforming, and the surface moves by less than the height of that tet.
 
 use crate::mesh::Incidence;
-use crate::vector::{add, dot, norm, scaled, sub};
+use crate::vector::{add, distinct, dot, norm, scaled, sub};
 
 use super::cut::{Cut, shape};
 use super::level::LevelImage;
@@ -40,17 +40,13 @@ fn smooth(cut: &mut Cut, level: &LevelImage) -> f64 {
     let mut poor: Vec<u32> =
         (0..cut.tets.len() as u32).filter(|&t| shape_of(cut, t) < GOAL).collect();
     for _ in 0..ROUNDS {
-        let mut nodes: Vec<u32> = poor.iter().flat_map(|&t| cut.tets[t as usize]).collect();
-        nodes.sort_unstable();
-        nodes.dedup();
+        let nodes = distinct(poor.iter().flat_map(|&t| cut.tets[t as usize]));
         let mut moved = false;
         for &node in &nodes {
             moved |= move_node(cut, level, stars.of(node as usize), node);
         }
         // Moves may have made other tets poor, but never poorer than the worst adjacent one was.
-        poor = nodes.iter().flat_map(|&v| stars.of(v as usize).iter().copied()).collect();
-        poor.sort_unstable();
-        poor.dedup();
+        poor = distinct(nodes.iter().flat_map(|&v| stars.of(v as usize)).copied());
         poor.retain(|&t| shape_of(cut, t) < GOAL);
         if !moved {
             break;

@@ -137,10 +137,7 @@ impl Octree {
             pending = split
                 .iter()
                 .flat_map(|parent| {
-                    let size = parent.size / 2;
-                    (0..8).map(move |octant| {
-                        [0, 1, 2].map(|a| parent.origin[a] + (octant >> a & 1) * size)
-                    })
+                    (0..8).map(|octant| octant_of(parent.origin, parent.size / 2, octant))
                 })
                 .filter_map(|place| self.leaf_at(place))
                 .collect();
@@ -171,7 +168,7 @@ impl Octree {
         }
         let size = cube.size / 2;
         for octant in 0..8 {
-            let origin = [0, 1, 2].map(|a| cube.origin[a] + (octant >> a & 1) * size);
+            let origin = octant_of(cube.origin, size, octant);
             self.collect(Leaf { origin, size, index: first + octant as u32 }, leaves);
         }
     }
@@ -276,12 +273,15 @@ fn tets_of(
     }
 }
 
+/// Lowest corner of an octant of cubes of this size around `origin`.
+fn octant_of(origin: Place, size: i32, octant: i32) -> Place {
+    [0, 1, 2].map(|a| origin[a] + (octant >> a & 1) * size)
+}
+
 /// Corners and centre of a leaf.
 fn vertices_of(leaf: &Leaf) -> impl Iterator<Item = Place> + use<> {
     let Leaf { origin, size, .. } = *leaf;
-    (0..8)
-        .map(move |corner| [0, 1, 2].map(|a| origin[a] + (corner >> a & 1) * size))
-        .chain([origin.map(|o| o + size / 2)])
+    (0..8).map(move |corner| octant_of(origin, size, corner)).chain([origin.map(|o| o + size / 2)])
 }
 
 fn sixfold_volume(tet: [Place; 4]) -> i64 {

@@ -108,9 +108,7 @@ fn tets_near(mesh: &TetMesh, shapes: &[MuscleShape<'_>]) -> (Vec<AlignedBox>, Te
         .map(|tet| AlignedBox::of(&tet.map(|v| Vec3::from(mesh.nodes()[v as usize]))))
         .collect();
     let all = shapes.iter().fold(AlignedBox::EMPTY, |all, shape| all.joined(&shape.bounds));
-    let near: Vec<u32> =
-        (0..mesh.n_tets() as u32).filter(|&t| boxes[t as usize].meets(&all)).collect();
-    let near_boxes: Vec<AlignedBox> = near.iter().map(|&t| boxes[t as usize]).collect();
-    let tree = TetTree::new(&near, &near_boxes);
+    let near = (0..).zip(boxes.iter().copied()).filter(|(_, one)| one.meets(&all));
+    let tree = TetTree::new(near.collect());
     (boxes, tree)
 }

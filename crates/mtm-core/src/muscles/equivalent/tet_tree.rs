@@ -28,10 +28,8 @@ pub struct Branch {
 }
 
 impl TetTree {
-    /// Tree over `tets`, with `boxes` one for each of them in the same order.
-    pub fn new(tets: &[u32], boxes: &[AlignedBox]) -> Self {
-        let mut items: Vec<(u32, AlignedBox)> =
-            tets.iter().copied().zip(boxes.iter().copied()).collect();
+    /// Tree over tets with their boxes.
+    pub fn new(mut items: Vec<(u32, AlignedBox)>) -> Self {
         let empty = Branch { bounds: AlignedBox::EMPTY, start: 0, end: 0, second: 0 };
         let mut branches = vec![empty; if items.is_empty() { 0 } else { n_branches(items.len()) }];
         if !items.is_empty() {

@@ -17,7 +17,7 @@ use crate::mechanics::strain_energy::{EnergyState, Part};
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::newton::{Equilibrium, Iterate, Target, reach};
 use crate::statics::reduction::NO_ROW;
-use crate::vector::{add, dot, norm, scaled, sub};
+use crate::vector::{add, distinct, dot, norm, scaled, sub};
 
 /// Largest number of nodes that move, and the same relative to all: more are no small part of the body. Neighbours
 /// of the last one may be added.
@@ -132,15 +132,12 @@ impl Equilibrium {
         let pattern = self.tensors.matrix();
         let mut found = vec![row];
         for _ in 0..RINGS {
-            let mut next: Vec<u32> = found
+            let next = found
                 .iter()
                 .flat_map(|&row| pattern.row(self.reduction.unknowns[row as usize] as usize).0)
                 .map(|&node| self.reduction.row_of[node as usize])
-                .filter(|&row| row != NO_ROW)
-                .collect();
-            next.sort_unstable();
-            next.dedup();
-            found = next;
+                .filter(|&row| row != NO_ROW);
+            found = distinct(next);
         }
         found
     }
