@@ -92,7 +92,8 @@ pub mod kept {
     use std::sync::atomic::AtomicUsize;
     pub(super) use std::sync::atomic::Ordering::Relaxed;
 
-    pub use super::{KEPT_BYTES, KEPT_SHARE};
+    pub use super::KEPT_BYTES;
+    pub use super::KEPT_SHARE;
 
     /// Size of a huge page on x86-64 and most arm64 systems, bytes.
     const HUGE_PAGE: usize = 2 << 20;

@@ -6,12 +6,11 @@ use rayon::prelude::*;
 
 use crate::algebra::blocks::BlockMatrix;
 
-use super::MultigridOptions;
 use super::aggregation::Aggregates;
 use super::block_rows::SystemRows;
 use super::coarsest::DenseCholesky;
 use super::galerkin::{CoarseMatrix, galerkin};
-use super::precision::{Precision, Real};
+use super::precision::{CyclePrecision, Precision, Real};
 use super::prolongator::Prolongator;
 use super::rigid_modes::{MODES, ModeBlock, orthonormalise};
 use super::scaled_matrix::ScaledMatrix;
@@ -33,6 +32,23 @@ const DAMPING: f64 = 1.4;
 const MOST_LEVELS: usize = 12;
 /// Vectors that a pass of the smoother reads or writes: d, r twice, the next d, x twice.
 const VECTORS_PER_PASS: usize = 6;
+
+/// How the hierarchy is built and the cycle is run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MultigridOptions {
+    /// Degree of the Chebyshev smoother, before and after each coarse correction.
+    pub smoother_degree: usize,
+    /// Number of block rows at which a level is solved directly.
+    pub coarsest_rows: usize,
+    /// Numbers of the cycle.
+    pub precision: CyclePrecision,
+}
+
+impl Default for MultigridOptions {
+    fn default() -> Self {
+        Self { smoother_degree: 2, coarsest_rows: 64, precision: CyclePrecision::Double }
+    }
+}
 
 /// The levels, whose numbers are those of `P`.
 #[derive(Debug)]

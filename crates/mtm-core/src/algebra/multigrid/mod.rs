@@ -30,27 +30,11 @@ use crate::algebra::row_sums::in_pool;
 use crate::error::{ErrorKind, MtmError, Result};
 
 use hierarchy::Hierarchy;
+pub use hierarchy::MultigridOptions;
 pub use precision::CyclePrecision;
 use precision::{Double, Single};
 use rigid_modes::rigid_modes;
 use scaling::Scaling;
-
-/// How the hierarchy is built and the cycle is run.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MultigridOptions {
-    /// Degree of the Chebyshev smoother, before and after each coarse correction.
-    pub smoother_degree: usize,
-    /// Number of block rows at which a level is solved directly.
-    pub coarsest_rows: usize,
-    /// Numbers of the cycle.
-    pub precision: CyclePrecision,
-}
-
-impl Default for MultigridOptions {
-    fn default() -> Self {
-        Self { smoother_degree: 2, coarsest_rows: 64, precision: CyclePrecision::Double }
-    }
-}
 
 /// A symmetric positive definite multigrid cycle for one [`BlockMatrix`].
 ///

@@ -23,9 +23,8 @@ use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart, method_for_touching};
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Support};
-use crate::statics::solution::{Clock, Solution, Timings};
+use crate::statics::solution::{Clock, Solution, Timings, TouchResult};
 use crate::vector::{add, norm, scaled};
-use touching::{TouchingParts, TouchingPlan};
 
 /// Multiple of the correction of a solution by factorisation that is taken as the error of the corrected one.
 const CORRECTION_SAFETY: f64 = 2.0;
@@ -305,7 +304,7 @@ impl StaticSolver {
 
         let mut solve = PlanSolve::new(scale, interrupted);
         let posed = PosedPlan { b: &b, u: &u, loads, motions: &motions, start };
-        let (SolvedRows { rows, contact, contact_seconds }, touch) =
+        let (SolvedRows { rows, contact, contact_seconds }, touching, pushes) =
             self.solve_rows(&posed, &mut solve)?;
         clock.lap("solve", true);
         u = self.filled(&u, &rows);
@@ -314,7 +313,7 @@ impl StaticSolver {
             self.refine(&mut u, &forces, loads, &mut solve)?;
             forces = self.forces(&u)?;
         }
-        let residual = self.residual(&forces, loads, (contact.as_ref(), &touch.forces), &b);
+        let residual = self.residual(&forces, loads, (contact.as_ref(), &pushes), &b);
         let effort = solve.effort;
         if !(residual.is_finite() && effort.error_estimate.is_finite()) {
             let why = "the plan or the moduli are too large for f64";
@@ -332,7 +331,7 @@ impl StaticSolver {
             iterations: effort.iterations,
             residual_history: effort.history,
             contact: self.contact_result(contact, &motions),
-            touching: touch.result,
+            touching,
             contact_iterations,
             timings,
         })
@@ -441,25 +440,11 @@ impl StaticSolver {
         &self,
         posed: &PosedPlan<'_>,
         solve: &mut PlanSolve<'_>,
-    ) -> Result<(SolvedRows, TouchingParts)> {
+    ) -> Result<(SolvedRows, TouchResult, Vec<[f64; 3]>)> {
         let &PosedPlan { b, u, loads, motions, start } = posed;
         if let (Mechanics::Linear(system), Some(pairs)) = (&self.mechanics, &self.pairs) {
-            let path = TouchingPlan {
-                body: self,
-                rows: BodyRows {
-                    positions: &self.reduction.rows(self.tensors.element_nodes().positions()),
-                    sliding: self.sliding.as_deref(),
-                    held: self.held,
-                    liftable: (&[], &[]),
-                    tissue: Extremes::of(self.tensors.tissue()),
-                    multigrid: None,
-                },
-                system,
-                pairs,
-                motions,
-                loads,
-            };
-            return path.solve(solve).map_err(|e| by_node(e, &self.reduction.unknowns));
+            let found = self.solve_touching((system, pairs), motions, loads, solve);
+            return found.map_err(|e| by_node(e, &self.reduction.unknowns));
         }
         let found = match (&self.mechanics, &self.sliding) {
             (Mechanics::LargeRotation(body), sliding) => {
@@ -483,7 +468,7 @@ impl StaticSolver {
             }
         };
         let found = found.map_err(|e| by_node(e, &self.reduction.unknowns))?;
-        Ok((found, TouchingParts::default()))
+        Ok((found, TouchResult::default(), Vec::new()))
     }
 
     /// Contact at equilibrium for `plan`: the state about which the linear operator of re-planning is frozen.

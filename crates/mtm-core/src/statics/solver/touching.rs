@@ -17,6 +17,7 @@ use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
 use crate::mesh::TetMesh;
 use crate::statics::linear::effort::PlanSolve;
+use crate::statics::linear::iterative::Extremes;
 use crate::statics::linear::system::{BodyRows, SolvedRows, System};
 use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart};
 use crate::statics::solution::{Clock, TouchResult};
@@ -79,24 +80,16 @@ struct PartialState {
     touching: Touching,
 }
 
-/// What touches.
-#[derive(Default)]
-pub(super) struct TouchingParts {
-    pub result: TouchResult,
-    /// Contact force on each row, N; empty if nothing may touch.
-    pub forces: Vec<[f64; 3]>,
-}
-
 /// A plan on a body whose parts may touch.
-pub(super) struct TouchingPlan<'a> {
-    pub body: &'a StaticSolver,
-    pub rows: BodyRows<'a>,
-    pub system: &'a System,
-    pub pairs: &'a Pairs,
+struct TouchingPlan<'a> {
+    body: &'a StaticSolver,
+    rows: BodyRows<'a>,
+    system: &'a System,
+    pairs: &'a Pairs,
     /// One motion per segment.
-    pub motions: &'a [&'a Motion],
+    motions: &'a [&'a Motion],
     /// Load on every node, N.
-    pub loads: Option<&'a [[f64; 3]]>,
+    loads: Option<&'a [[f64; 3]]>,
 }
 
 /// The target of a step of the plan.
@@ -119,13 +112,35 @@ struct Done {
     converged: bool,
 }
 
+impl StaticSolver {
+    /// The body at the end of a plan of one motion per segment, what touches, and the contact force on each
+    /// row, N.
+    pub(super) fn solve_touching(
+        &self,
+        (system, pairs): (&System, &Pairs),
+        motions: &[&Motion],
+        loads: Option<&[[f64; 3]]>,
+        solve: &mut PlanSolve<'_>,
+    ) -> Result<(SolvedRows, TouchResult, Vec<[f64; 3]>)> {
+        let rows = BodyRows {
+            positions: &self.reduction.rows(self.tensors.element_nodes().positions()),
+            sliding: self.sliding.as_deref(),
+            held: self.held,
+            liftable: (&[], &[]),
+            tissue: Extremes::of(self.tensors.tissue()),
+            multigrid: None,
+        };
+        TouchingPlan { body: self, rows, system, pairs, motions, loads }.solve(solve)
+    }
+}
+
 impl TouchingPlan<'_> {
     /// The body at the end of the plan.
     ///
     /// # Errors
     /// `ContactNotConverged` if the rounds run out with a gap or penetration that would be visible on a face,
     /// or if a step penetrates however short it is; those of the solves.
-    pub fn solve(&self, solve: &mut PlanSolve<'_>) -> Result<(SolvedRows, TouchingParts)> {
+    fn solve(&self, solve: &mut PlanSolve<'_>) -> Result<(SolvedRows, TouchResult, Vec<[f64; 3]>)> {
         let clock = Clock::new();
         let sliding = self.rows.sliding;
         let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(solve.scale);
@@ -143,9 +158,9 @@ impl TouchingPlan<'_> {
             match next {
                 Some((next, done)) if there == 1.0 => {
                     rounds += done.rounds;
-                    let (mut solved, touch) = self.end(next, &done, rounds, solve)?;
+                    let (mut solved, touching, pushes) = self.end(next, &done, rounds, solve)?;
                     solved.contact_seconds = clock.total();
-                    return Ok((solved, touch));
+                    return Ok((solved, touching, pushes));
                 }
                 Some((next, done)) => {
                     rounds += done.rounds;
@@ -396,7 +411,7 @@ impl TouchingPlan<'_> {
         done: &Done,
         rounds: usize,
         solve: &mut PlanSolve<'_>,
-    ) -> Result<(SolvedRows, TouchingParts)> {
+    ) -> Result<(SolvedRows, TouchResult, Vec<[f64; 3]>)> {
         let inside = self.pairs.overlap.inside(self.mesh(), &pose.u);
         let overlap = inside.iter().fold(0.0, |m: f64, (_, depth)| m.max(*depth));
         let open = done.left.beside_tissue().max(overlap);
@@ -427,7 +442,7 @@ impl TouchingPlan<'_> {
             converged,
         };
         let PartialState { rows, contact, .. } = pose;
-        Ok((SolvedRows { rows, contact, contact_seconds: 0.0 }, TouchingParts { result, forces }))
+        Ok((SolvedRows { rows, contact, contact_seconds: 0.0 }, result, forces))
     }
 
     /// The error for touching parts without equilibrium, with the nodes that carry the largest forces.
