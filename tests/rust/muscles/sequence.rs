@@ -9,7 +9,7 @@ const BITS: u32 = 52;
 #[test]
 fn points_are_uniform_in_volume() {
     let sequence = Sequence::new(4096);
-    let n = sequence.len() as f64;
+    let n = sequence.count() as f64;
     let (mut first, mut second) = ([0.0; 3], [[0.0; 3]; 3]);
     for w in sequence.in_tet(7, 3) {
         assert!(w.iter().all(|&x| x >= 0.0) && w.iter().sum::<f64>() <= 1.0 + 1e-15);

@@ -47,8 +47,7 @@ impl Grid {
                 return Err(kind.out_of_range("spacing", axis, spacing[axis], allowed));
             }
             if !origin[axis].is_finite() {
-                let (what, value) = ("origin".into(), origin[axis]);
-                return Err(kind.not_finite(what, axis, value));
+                return Err(kind.not_finite("origin", axis, origin[axis]));
             }
         }
         Ok(Self { shape, spacing, origin })

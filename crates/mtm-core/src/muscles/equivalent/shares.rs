@@ -158,7 +158,7 @@ struct TetBuffers {
 impl Sampler<'_> {
     /// Result of each touched tet, ascending; incomplete once `stop` returns true.
     pub fn shares(&self, touched: &TetTouches) -> Vec<TetMuscle> {
-        let n = self.sequence.len();
+        let n = self.sequence.count();
         let scratch = || TetBuffers {
             packet: Packet::new(n),
             inside: Vec::new(),
@@ -208,7 +208,7 @@ impl Sampler<'_> {
     /// A tet that at least one surface may cross.
     fn sampled(&self, muscles: &[(u32, Touch)], scratch: &mut TetBuffers) -> TetMuscle {
         let TetBuffers { packet, inside, depth, near } = scratch;
-        let (tet, n) = (muscles[0].1.tet, self.sequence.len());
+        let (tet, n) = (muscles[0].1.tet, self.sequence.count());
         packet.fill(&self.sequence, self.seed, tet, self.corners(tet));
         inside.clear();
         inside.resize(n * muscles.len(), true);
