@@ -22,6 +22,7 @@ from cmfsim.errors import CaseInputError, CmfsimError, LandmarkError
 from cmfsim.io import Case, replacing
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import proposed_head
+from cmfsim.values.checks import AnyPath
 from cmfsim.values.proposed_landmarks import ProposedSite
 
 __all__ = ["CASE_FILE", "CaseDraft", "Taken", "init_case", "read_moves"]
@@ -30,7 +31,7 @@ SCENES = (".mrml", ".mrb")
 
 
 def init_case(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     *,
     force: bool = False,
     cuts: Sequence[str] = (),

@@ -6,7 +6,6 @@ and a finding says so.
 
 import csv
 import logging
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,7 @@ from cmfsim.io.slicer.markups import (
     markups_of,
     write_markups,
 )
-from cmfsim.values.checks import Floats, check_one_of
+from cmfsim.values.checks import AnyPath, Floats, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key, named_site
 
@@ -75,7 +74,7 @@ class _Point:
     description: str = ""
 
 
-def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) -> dict[str, Floats]:
+def read_landmarks(path: AnyPath, *, frame: str | None = None) -> dict[str, Floats]:
     """The landmarks of a `.mrk.json` or `.fcsv` file by label, LPS mm.
 
     Parameters
@@ -112,7 +111,7 @@ def read_landmarks(path: str | os.PathLike[str], *, frame: str | None = None) ->
 
 
 def read_landmark_file(
-    path: str | os.PathLike[str], *, frame: str | None = None, kind: str | None = None
+    path: AnyPath, *, frame: str | None = None, kind: str | None = None
 ) -> LandmarkFile:
     """The landmarks of a file with its frame and findings; see `read_landmarks`.
 
@@ -165,7 +164,7 @@ def _known_labels(
     return labels, [finding]
 
 
-def _read(path: str | os.PathLike[str], frame: str | None) -> LandmarkFile:
+def _read(path: AnyPath, frame: str | None) -> LandmarkFile:
     path = Path(path)
     if frame is not None:
         check_one_of("frame", frame, ("LPS", "RAS"))
@@ -181,7 +180,7 @@ def _read(path: str | os.PathLike[str], frame: str | None) -> LandmarkFile:
 
 
 def write_landmarks(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     landmarks: Mapping[str, ArrayLike],
     *,
     descriptions: Mapping[str, str] | None = None,

@@ -2,7 +2,6 @@
 
 import colorsys
 import itertools
-import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, Shown, View, bounds, draw, polydata
 from cmfsim.values.anatomy import BoneSegment
-from cmfsim.values.checks import Floats, as_index_rows, as_rows
+from cmfsim.values.checks import AnyPath, Floats, as_index_rows, as_rows
 from cmfsim.values.musculature import MuscleSurface, Musculature
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData
@@ -37,7 +36,7 @@ OTHER_COLOURS = ("#76b7b2", "#b6992d", "#d37295", "#79706e", "#86bcb6", "#9d7660
 
 
 def picture_segments(
-    path: str | os.PathLike[str], segments: Sequence[BoneSegment], *, size: tuple[int, int] = SIZE
+    path: AnyPath, segments: Sequence[BoneSegment], *, size: tuple[int, int] = SIZE
 ) -> None:
     """Writes a picture of bone segments in colours: from the front, the left front and the left.
 
@@ -64,7 +63,7 @@ def picture_segments(
 
 
 def picture_anatomy(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     skin: SurfaceData,
     segments: Sequence[BoneSegment],
     *,
@@ -95,7 +94,7 @@ def picture_anatomy(
 
 
 def picture_node_kinds(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     nodes: ArrayLike,
     boundary_triangles: ArrayLike,
     kinds: NodeKinds,
@@ -209,7 +208,7 @@ STROKES = 60
 
 
 def picture_muscles(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     musculature: Musculature,
     skull: SurfaceData | None = None,
     *,
@@ -245,7 +244,7 @@ def picture_muscles(
     views = tuple(View(name, name) for name in ("front", "left front", "left"))
     shown = Shown()
 
-    names = dict.fromkeys(_without_side(muscle.name) for muscle in musculature)
+    names = dict.fromkeys(without_side(muscle.name) for muscle in musculature)
     colours = {n: MUSCLE_COLOUR if fibres else _hue(k) for k, n in enumerate(names)}
     length = STROKE * float(np.linalg.norm(corners[1] - corners[0]))
     lines = [_lines(muscle, length) if fibres else None for muscle in musculature]
@@ -254,7 +253,7 @@ def picture_muscles(
         if skull is not None:
             shown.add(plotter, "skull", partial(add_bones, plotter, skull))
         for muscle, drawn in zip(musculature, lines, strict=True):
-            make = partial(add_muscle, plotter, muscle, colours[_without_side(muscle.name)])
+            make = partial(add_muscle, plotter, muscle, colours[without_side(muscle.name)])
             shown.add(plotter, f"muscle {muscle.name}", make)
             if drawn is not None:
                 strokes, edges, colour = drawn
@@ -307,7 +306,8 @@ def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:
     return strokes, np.array(edges), colour
 
 
-def _without_side(name: str) -> str:
+def without_side(name: str) -> str:
+    """The name of a muscle as both sides have it."""
     return name.removesuffix("_L").removesuffix("_R")
 
 

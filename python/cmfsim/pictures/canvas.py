@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseError, CaseInputError
 from cmfsim.processes.worker import SILENT, Worker, WorkerEndedError
-from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.checks import AnyPath, Floats, as_positive
 
 # What draws a picture at a path: a function of this package with all else that it takes, which can
 # be pickled.
@@ -78,7 +78,7 @@ class View:
 
 
 def draw(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     views: Sequence[View],
     corners: Floats,
     size: tuple[int, int],

@@ -1,7 +1,6 @@
 """Box plots of errors, as Kim et al. (2010) show them in Figure 9. Needs matplotlib."""
 
 import io
-import os
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import write_whole
-from cmfsim.values.checks import as_floats
+from cmfsim.values.checks import AnyPath, as_floats
 
 # By model, in the order of the paper; told apart in grey too.
 MODEL_COLOURS = {
@@ -27,7 +26,7 @@ GROUP = 0.8
 
 
 def chart_errors(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     errors: Mapping[str, Mapping[str, ArrayLike]],
     *,
     width: float = 8.0,

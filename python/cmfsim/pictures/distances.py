@@ -1,6 +1,5 @@
 """Errors (as in Figure 10 of Kim et al. 2010), the band of a prediction, and contacts of teeth."""
 
-import os
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, Picture, View, add_scale_bar, bounds, draw, polydata
 from cmfsim.pictures.faces import SkinEnds, skin_ends, trimmed
-from cmfsim.values.checks import Floats, as_floats, as_positive
+from cmfsim.values.checks import AnyPath, Floats, as_floats, as_positive
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import SkinBand
 from cmfsim.values.surface_data import SurfaceData
@@ -46,7 +45,7 @@ Gaps = np.ma.MaskedArray[Any, np.dtype[np.float64]]
 
 
 def picture_distances(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     skin: SurfaceData,
     distances: ArrayLike,
     *,
@@ -103,7 +102,7 @@ def picture_distances(
 
 
 def picture_distance_grid(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     faces: Mapping[str, Mapping[str, tuple[SurfaceData, ArrayLike]]],
     *,
     limit: float = DISTANCE_LIMIT,
@@ -221,9 +220,7 @@ def _values(distances: ArrayLike, count: int) -> tuple[Floats, NDArray[np.bool_]
     return as_floats("distances", np.ma.filled(np.ma.asarray(distances, dtype=float), 0.0)), shown
 
 
-def picture_band(
-    path: str | os.PathLike[str], prediction: Prediction, *, size: tuple[int, int] = SIZE
-) -> None:
+def picture_band(path: AnyPath, prediction: Prediction, *, size: tuple[int, int] = SIZE) -> None:
     """Writes a picture of half the width of a band: from the right, the front and the left.
 
     Where no calibration case has data, the skin is grey. Without a calibration, each view states
@@ -250,7 +247,7 @@ def band_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> Pic
 
 
 def picture_half_width(
-    path: str | os.PathLike[str], *, skin: SurfaceData, band: SkinBand, size: tuple[int, int]
+    path: AnyPath, *, skin: SurfaceData, band: SkinBand, size: tuple[int, int]
 ) -> None:
     """Writes a picture of half the width of a band; see `picture_band`."""
     half = band.half_width
@@ -295,10 +292,7 @@ def contacts_picture(upper: tuple[SurfaceData, Gaps], lower: tuple[SurfaceData, 
 
 
 def picture_contacts(
-    path: str | os.PathLike[str],
-    *,
-    upper: tuple[SurfaceData, Gaps],
-    lower: tuple[SurfaceData, Gaps],
+    path: AnyPath, *, upper: tuple[SurfaceData, Gaps], lower: tuple[SurfaceData, Gaps]
 ) -> None:
     """Writes a picture of the contacts: the upper row from below, the lower row from above."""
     corners = bounds([upper[0].vertices, lower[0].vertices])

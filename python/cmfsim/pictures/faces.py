@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,7 @@ from cmfsim.errors import CaseInputError, third_party
 from cmfsim.pictures import canvas
 from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
 from cmfsim.processes.worker import run_program
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import AnyPath, Floats
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
@@ -94,7 +93,7 @@ def add_skin(plotter: Any, shape: Any, colours: NDArray[np.uint8] | None) -> Non
 
 
 def picture_prediction(
-    path: str | os.PathLike[str], prediction: Prediction, *, size: tuple[int, int] = TWO_ROWS
+    path: AnyPath, prediction: Prediction, *, size: tuple[int, int] = TWO_ROWS
 ) -> None:
     """Writes a picture of a face before and after, and how far each point of it moves.
 
@@ -127,7 +126,7 @@ def prediction_picture(
 
 
 def picture_faces(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     *,
     before: SurfaceData,
     after: SurfaceData,
@@ -182,7 +181,7 @@ def prediction_html(prediction: Prediction) -> str:
 
 
 def picture_plan(
-    path: str | os.PathLike[str], prediction: Prediction, *, size: tuple[int, int] = canvas.SIZE
+    path: AnyPath, prediction: Prediction, *, size: tuple[int, int] = canvas.SIZE
 ) -> None:
     """Writes a picture of a plan: bone segments where they go, and behind them where they were.
 
@@ -225,7 +224,7 @@ def plan_picture(
 
 
 def picture_motions(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     *,
     before: Mapping[str, SurfaceData],
     after: Mapping[str, SurfaceData],
@@ -263,10 +262,7 @@ ENDINGS = (".gif", ".mp4")
 
 
 def animate_face(
-    path: str | os.PathLike[str],
-    before: SurfaceData,
-    after: Floats,
-    colours: NDArray[np.uint8] | None = None,
+    path: AnyPath, before: SurfaceData, after: Floats, colours: NDArray[np.uint8] | None = None
 ) -> None:
     """Writes an animation of a face, from the front and the left: before, after, and back.
 

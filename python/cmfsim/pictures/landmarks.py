@@ -1,6 +1,5 @@
 """A picture of the landmarks of skull and skin, with their names in columns at its sides."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures import canvas
 from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
-from cmfsim.values.checks import Floats, check_one_of
+from cmfsim.values.checks import AnyPath, Floats, check_one_of
 from cmfsim.values.surface_data import SurfaceData
 
 # PyVista draws text of this size with letters twice as high, pixels.
@@ -173,7 +172,7 @@ def add_labels(plotter: Any, toward: Floats, labels: Sequence[Label]) -> None:
 
 
 def picture_landmarks(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     bones: Mapping[str, SurfaceData],
     skin: SurfaceData | None,
     landmarks: Mapping[str, Mapping[str, ArrayLike]],

@@ -13,7 +13,7 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures import canvas
 from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
-from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.checks import AnyPath, Floats, as_positive
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
@@ -89,7 +89,7 @@ def view_parts(
     *,
     title: str = "cmfsim",
     unit: str = "mm",
-    screenshot: str | os.PathLike[str] | None = None,
+    screenshot: AnyPath | None = None,
     size: tuple[int, int] = WINDOW,
 ) -> None:
     """Opens a window with surfaces that can be turned, shown and hidden, or writes a picture of it.

@@ -7,6 +7,7 @@ are for process pools and `copy.deepcopy` alone: no file is ever read by unpickl
 
 import copyreg
 import difflib
+import os
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, cast
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 
+AnyPath = str | os.PathLike[str]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.uint32]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, Frozen, check_one_of, listing
+from cmfsim.values.checks import AnyPath, Floats, Frozen, check_one_of, listing
 from cmfsim.values.finding import Finding, counted_findings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import no_progress
@@ -187,7 +186,7 @@ class Prediction(Frozen):
             found["muscles"] = {m.name: (m.surface, m.surface.vertices) for m in muscles}
         return found
 
-    def save(self, folder: str | os.PathLike[str]) -> list[str]:
+    def save(self, folder: AnyPath) -> list[str]:
         """The names of the files that `cmfsim predict` writes, written to a folder.
 
         Those of `write_prediction`, with pictures and `report.html`. The folder is created if
@@ -202,7 +201,7 @@ class Prediction(Frozen):
         written = write(Path(folder), [self], [self.model], stage=no_progress)
         return [*written.predictions[0].files, *filter(None, [written.report])]
 
-    def plot(self, screenshot: str | os.PathLike[str] | None = None) -> None:
+    def plot(self, screenshot: AnyPath | None = None) -> None:
         """Opens a window with skin, bones and muscles, as `cmfsim view` does, or writes a picture.
 
         Parameters
@@ -218,7 +217,7 @@ class Prediction(Frozen):
         window, title = _above("pictures.window"), f"{self.name}, {self.model} - cmfsim"
         window.view_parts(window.prediction_parts(self.parts), title=title, screenshot=screenshot)
 
-    def animate(self, path: str | os.PathLike[str]) -> None:
+    def animate(self, path: AnyPath) -> None:
         """Writes an animation of the face, from the front and the left: before, after, and back.
 
         Parameters

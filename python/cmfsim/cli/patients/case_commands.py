@@ -9,7 +9,7 @@ import re
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
@@ -51,11 +51,22 @@ MADE_FOR = re.compile(r"^# made for: ([0-9a-f]{64})\s*$", re.MULTILINE)
 
 def build_text(summary: Mapping[str, Any], *, width: int = WIDTH) -> str:
     """The summary of a `PatientModel` that was written: nodes, mesh, time per stage, files."""
+    timings, margin = summary["timings"], " " * INDENT
+    times = [f"time          {sum(timings.values()):.1f} s"]
+    times += [f"  {seconds:8.2f} s  {escaped(name)}" for name, seconds in timings.items()]
+    files = textwrap.wrap(
+        ", ".join(escaped(name) for name in summary["files"]),
+        max(width, 40),
+        initial_indent=margin,
+        subsequent_indent=margin,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
     parts = [
         [f"case          {escaped(summary['case'])}", *_nodes(summary)],
         MeshReport(**summary["mesh"]).as_text().splitlines(),
-        _times(summary["timings"]),
-        _files(summary, width),
+        times,
+        [f"written       {escaped(summary['output'])}", *files],
     ]
     return "\n\n".join("\n".join(part) for part in parts)
 
@@ -73,24 +84,6 @@ def _nodes(summary: Mapping[str, Any]) -> list[str]:
         caption = "contact       departure from bone, mm"
         tables.append(Table(("segment", *AWAY, "surface"), rows, caption))
     return [escaped(line) for table in tables for line in table.text.split("\n")]
-
-
-def _times(timings: Mapping[str, float]) -> list[str]:
-    lines = [f"time          {sum(timings.values()):.1f} s"]
-    return lines + [f"  {seconds:8.2f} s  {escaped(name)}" for name, seconds in timings.items()]
-
-
-def _files(summary: Mapping[str, Any], width: int) -> list[str]:
-    names = ", ".join(escaped(name) for name in summary["files"])
-    wrapped = textwrap.wrap(
-        names,
-        max(width, 40),
-        initial_indent=" " * INDENT,
-        subsequent_indent=" " * INDENT,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return [f"written       {escaped(summary['output'])}", *wrapped]
 
 
 def init(options: argparse.Namespace) -> int:
@@ -134,14 +127,8 @@ def doctor(options: argparse.Namespace) -> int:
     if options.json:
         counts = {f"{s}s": sum(f.severity == s for f in findings) for s in SEVERITIES}
         entries = [dataclasses.asdict(finding) for finding in findings]
-        report = {
-            "case": case.name,
-            "file": str(case.file),
-            **counts,
-            "plan": plan,
-            "findings": entries,
-        }
-        print(json.dumps(report, allow_nan=False))
+        report = {"case": case.name, "file": str(case.file), **counts, "plan": plan}
+        print(json.dumps({**report, "findings": entries}, allow_nan=False))
     else:
         for line in plan_lines(plan):
             print(f"plan: {escaped(line)}")
@@ -153,9 +140,8 @@ def build(options: argparse.Namespace) -> int:
     """Builds a case, unless the doctor finds an error in it."""
     case = case_of(options)
     prepare(case, is_model_file)
-    notices = Notices(quiet=options.quiet)
     begun = time.perf_counter()
-    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
+    notices, findings = checked(options, case)
     seconds = time.perf_counter() - begun
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         build_case = import_module("cmfsim.pipeline.outputs.model").build_case
@@ -181,12 +167,17 @@ def case_of(options: argparse.Namespace) -> Case:
     case = Case.load(options.case)
     if options.edge_length is not None:
         edge_length = as_positive("--edge-length", options.edge_length)
-        case = dataclasses.replace(
-            case, mesh=dataclasses.replace(case.mesh, edge_length=edge_length)
-        )
+        mesh = dataclasses.replace(case.mesh, edge_length=edge_length)
+        case = dataclasses.replace(case, mesh=mesh)
     if getattr(options, "plan", None) is not None:
         case = case.with_plan(options.plan)
-        _warn_of_other_state(case, options.plan)
+        made_for = MADE_FOR.search(options.plan.read_text(encoding="utf-8"))
+        if made_for is not None and made_for[1] != plan_key(case):
+            _log.warning(
+                "%s: this plan was made for another case, or for other images, landmarks or cuts "
+                "of this case: check the motions below, or create the planning page again",
+                options.plan,
+            )
     if options.output is not None:
         # A link that the user names is followed, and the folder it leads to is printed.
         output = options.output.resolve() if options.output.is_symlink() else options.output
@@ -208,36 +199,28 @@ def band_options(options: argparse.Namespace, case: Case) -> BandOptions | None:
     )
 
 
-def _warn_of_other_state(case: Case, path: Path) -> None:
-    """Warns of a plan that a planning page saved for another head, or for other cuts."""
-    made_for = MADE_FOR.search(path.read_text(encoding="utf-8"))
-    if made_for is not None and made_for[1] != plan_key(case):
-        _log.warning(
-            "%s: this plan was made for another case, or for other images, landmarks or cuts of "
-            "this case: check the motions below, or create the planning page again",
-            path,
-        )
-
-
 def checked(
-    case: Case, notices: Notices, models: Sequence[str] | None = None, *, quiet: bool
-) -> tuple[Finding, ...]:
-    """The findings of the doctor for a case and some models; warnings are printed.
+    options: argparse.Namespace, case: Case, models: Sequence[str] | None = None
+) -> tuple[Notices, tuple[Finding, ...]]:
+    """The notices of a command, and the doctor's findings for a case unless it is not asked.
 
     Raises `FindingsError`: An error is among the findings.
     """
-    with StageProgress(sys.stderr, quiet=quiet) as progress:
+    notices = Notices(quiet=options.quiet)
+    if options.no_doctor:
+        return notices, ()
+    with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("checking the case")
         asked = case if models is None else case_for_models(case, models)
         found = examine(asked, models=models)
-    if not quiet:
+    if not options.quiet:
         # Before the work: a reversed plan is seen here, not in the face.
         for line in plan_lines(_plan_values(found)):
             print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
     if _has_errors(found.findings):
         raise FindingsError(found.findings)
     notices.found(found.findings)
-    return found.findings
+    return notices, found.findings
 
 
 def _plan_values(found: Examination) -> dict[str, Any]:
@@ -289,15 +272,13 @@ def parts_of(path: Path, model: str | None = None) -> list[ViewPart]:
         if not output.is_dir():
             raise CaseInputError(f"{path}: has no results yet: run cmfsim predict {path} first")
         return _of_folder(output, model)
-    readers: dict[str, Callable[[Path], list[ViewPart]]] = {
-        **dict.fromkeys(SURFACES, _of_surface),
-        ".toml": _of_scene,
-        ".npz": _of_archive,
-    }
-    if path.suffix.lower() not in readers:
-        known = ", ".join(readers)
+    suffix = path.suffix.lower()
+    if suffix in SURFACES:
+        return [ViewPart(path.stem, read_surface(path), SKIN_COLOUR)]
+    if suffix not in {".toml", ".npz"}:
+        known = ", ".join((*SURFACES, ".toml", ".npz"))
         raise CaseInputError(f"{path.name}: view displays folders, and files ending in {known}")
-    return readers[path.suffix.lower()](path)
+    return _of_scene(path) if suffix == ".toml" else _of_archive(path)
 
 
 def _of_folder(folder: Path, model: str | None) -> list[ViewPart]:
@@ -324,10 +305,6 @@ def _of_model(folder: Path) -> list[ViewPart]:
     colours = segment_colours(list(bones))
     skin = ViewPart("skin", read_surface(folder / "skin.ply"), SKIN_COLOUR, OVER_BONES)
     return [skin, *(ViewPart(n, read_surface(p), colours[n]) for n, p in bones.items())]
-
-
-def _of_surface(path: Path) -> list[ViewPart]:
-    return [ViewPart(path.stem, read_surface(path), SKIN_COLOUR)]
 
 
 def _of_archive(path: Path) -> list[ViewPart]:

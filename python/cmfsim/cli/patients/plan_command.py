@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import socket
 import sys
 import time
 import webbrowser
@@ -14,11 +13,11 @@ import numpy as np
 
 from cmfsim.cli import DONE
 from cmfsim.cli.patients.case_commands import band_options, case_of, checked
-from cmfsim.cli.terminal import Notices, StageProgress, can_open, escaped, open_page
+from cmfsim.cli.terminal import StageProgress, can_open, escaped, open_page
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface, write_plan, write_surface
 from cmfsim.pipeline.building.inputs import check_output, plan_key
-from cmfsim.pipeline.planning import PLAN_FILE, TARGET_STD, PlanningPage, make_planning_page
+from cmfsim.pipeline.planning import PLAN_FILE, TARGET_STD, make_planning_page
 from cmfsim.planning.face_planning import FacePlan
 from cmfsim.planning.replanning import USUAL, ExpectedError, PlanCorrection
 from cmfsim.planning.server import open_port, serve_planning
@@ -32,9 +31,7 @@ def plan(options: argparse.Namespace) -> int:
     # Before the work: a port that is taken is not reported a minute later.
     listener = open_port(options.port) if options.serve else None
     begun = time.perf_counter()
-    notices = Notices(quiet=options.quiet)
-    models = (options.model,)
-    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
+    notices, findings = checked(options, case, (options.model,))
     expected = {**BUILDING, **PLANNING}
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         made = make_planning_page(
@@ -52,12 +49,17 @@ def plan(options: argparse.Namespace) -> int:
         )
     seconds = time.perf_counter() - begun
     if listener is not None:
-        _serve(options, made, case.file.name, listener)
+        serve_planning(
+            made.planning,
+            made.content,
+            case_file=case.file.name,
+            port=listener,
+            on_start=lambda url: _show(options, "page", url),
+        )
         return DONE
     if options.json:
-        found = {"findings": notices.as_dicts()}
-        answer = {"case": case.name, "seconds": seconds, **made.as_dict(), **found}
-        print(json.dumps(answer, allow_nan=False))
+        answer = {"case": case.name, "seconds": seconds, **made.as_dict()}
+        print(json.dumps({**answer, "findings": notices.as_dicts()}, allow_nan=False))
         return DONE
     print(f"page   {escaped(str(made.path))} ({made.path.stat().st_size / 1e6:.1f} MB)")
     print(f"error  {_error_text(made.errors)}")
@@ -70,19 +72,6 @@ def plan(options: argparse.Namespace) -> int:
     notices.summarise(None)
     open_page(made.path, wanted=not options.no_open)
     return DONE
-
-
-def _serve(
-    options: argparse.Namespace, made: PlanningPage, case_file: str, listener: socket.socket
-) -> None:
-    """Serves the page until it is interrupted."""
-    serve_planning(
-        made.planning,
-        made.content,
-        case_file=case_file,
-        port=listener,
-        on_start=lambda url: _show(options, "page", url),
-    )
 
 
 def _show(options: argparse.Namespace, what: str, url: str) -> None:
@@ -171,8 +160,7 @@ def splint_case(options: argparse.Namespace) -> int:
     case = case_of(options)
     kind = "intermediate" if options.intermediate else "final"
     path = _free_path(case, options.out, f"splint-{kind}.stl")
-    notices = Notices(quiet=options.quiet)
-    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
+    notices, findings = checked(options, case)
     more = {} if options.thickness is None else {"thickness": options.thickness}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         made = import_module("cmfsim.pipeline.planning").make_splint(
@@ -212,8 +200,7 @@ def bite_case(options: argparse.Namespace) -> int:
     case = case_of(options)
     path = _free_path(case, options.out, "bite.toml")
     scans = read_surface(options.upper), read_surface(options.lower)
-    notices = Notices(quiet=options.quiet)
-    findings = () if options.no_doctor else checked(case, notices, quiet=options.quiet)
+    notices, findings = checked(options, case)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         bite, plan = import_module("cmfsim.pipeline.planning").plan_for_bite(
             case, *scans, progress=progress.stage, check=False, findings=findings, observer=notices

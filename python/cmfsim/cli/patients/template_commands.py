@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli import BAD_INPUT, DONE
-from cmfsim.cli.terminal import StageProgress, columns, escaped, in_colour
-from cmfsim.doctor import findings_text
+from cmfsim.cli.patients.case_commands import print_findings
+from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.muscles.template import (
     MorphedMusculature,
@@ -22,7 +22,8 @@ from cmfsim.muscles.template import (
     template_names,
 )
 from cmfsim.pictures import picture_muscles
-from cmfsim.values.finding import SEVERITIES, Finding
+from cmfsim.pictures.anatomy import without_side
+from cmfsim.values.finding import SEVERITIES
 from cmfsim.values.musculature import Musculature
 
 # Landmarks that the table of a morph shows: those that disagree most with the others.
@@ -34,15 +35,10 @@ def list_templates(options: argparse.Namespace) -> int:
     entries = []
     for name in template_names():
         template = MuscleTemplate.load(name)
+        texts = {key: getattr(template, key) for key in ("licence", "attribution", "source")}
+        muscles = [muscle.name for muscle in template.muscles]
         entries.append(
-            {
-                "name": name,
-                "muscles": [muscle.name for muscle in template.muscles],
-                "landmarks": list(template.landmarks),
-                "licence": template.licence,
-                "attribution": template.attribution,
-                "source": template.source,
-            }
+            {"name": name, "muscles": muscles, "landmarks": list(template.landmarks), **texts}
         )
     if options.json:
         print(json.dumps({"templates": entries}, allow_nan=False))
@@ -63,7 +59,7 @@ def check(options: argparse.Namespace) -> int:
         entries = [dataclasses.asdict(finding) for finding in findings]
         print(json.dumps({"template": options.template, **counts, "findings": entries}))
     else:
-        _print_findings(findings)
+        print_findings(findings, sys.stdout)
     return BAD_INPUT if any(f.severity == "error" for f in findings) else DONE
 
 
@@ -88,7 +84,7 @@ def import_atlas(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"folder": str(options.output), **report}, allow_nan=False))
         return DONE
-    _print_findings(template.findings)
+    print_findings(template.findings, sys.stdout)
     print(f"wrote {options.output}: {len(template.muscles)} muscles; {template.licence}, ", end="")
     print(template.attribution)
     return DONE
@@ -110,7 +106,7 @@ def morph(options: argparse.Namespace) -> int:
         print(json.dumps({"folder": str(options.output), **report}, allow_nan=False))
         return DONE
     if muscles.findings:
-        _print_findings(muscles.findings)
+        print_findings(muscles.findings, sys.stdout)
     _print_landmarks(muscles)
     print(f"wrote {options.output}: {len(muscles)} muscles")
     return DONE
@@ -141,16 +137,12 @@ def _beside(output: Path, report: dict[str, Any]) -> dict[str, Any] | None:
 def _chosen(template: MuscleTemplate, names: Sequence[str]) -> Musculature:
     """The muscles with these names; a name without a side selects both."""
     known = {muscle.name for muscle in template.muscles}
-    bare = {name.removesuffix("_L").removesuffix("_R") for name in known}
+    bare = set(map(without_side, known))
     for name in names:
         if name not in known | bare:
             raise CaseInputError(f"no muscle {name!r}; muscles are: {', '.join(sorted(bare))}")
     return Musculature(
-        tuple(
-            muscle
-            for muscle in template.muscles
-            if {muscle.name, muscle.name.removesuffix("_L").removesuffix("_R")} & set(names)
-        )
+        tuple(m for m in template.muscles if {m.name, without_side(m.name)} & set(names))
     )
 
 
@@ -165,8 +157,3 @@ def _print_landmarks(muscles: MorphedMusculature) -> None:
     print(f"predicted from the others, each is off by {median:.1f} mm off (median); worst:")
     for line in left_out.table().splitlines()[: 1 + WORST_SHOWN]:
         print(f"  {escaped(line)}")
-
-
-def _print_findings(findings: Sequence[Finding]) -> None:
-    width = columns() if sys.stdout.isatty() else 0
-    print(findings_text(findings, colour=in_colour(sys.stdout), width=width, escape=escaped))

@@ -49,9 +49,8 @@ def predict(options: argparse.Namespace) -> int:
     if band is not None:
         band.check(models)
     prepare(case, report=not options.no_report)
-    notices = Notices(quiet=options.quiet)
     begun = time.perf_counter()
-    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
+    notices, findings = checked(options, case, models)
     before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
     each = (f"{work} {model}" for model in models for work in ("solving", "writing"))
     expected = expected_stages(*each, results.REPORT_STAGE)
@@ -116,8 +115,7 @@ def evaluate(options: argparse.Namespace) -> int:
         case = replace(case, postoperative=replace(case.postoperative, verified=True))
     models = models_of(options.model, MODELS)
     prepare(case, report=not options.no_report, evaluation=True)
-    notices = Notices(quiet=options.quiet)
-    findings = () if options.no_doctor else checked(case, notices, models, quiet=options.quiet)
+    notices, findings = checked(options, case, models)
     each = (f"{work} {model}" for work in ("solving", "writing") for model in models)
     expected = expected_stages(*each, "writing the comparison", results.REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
@@ -165,14 +163,14 @@ def sensitivity(options: argparse.Namespace) -> int:
     """Reports the effect of errors of skull landmarks on muscles and face."""
     case = case_of(options)
     prepare(case)
-    notices = Notices(quiet=options.quiet)
-    findings = (
-        () if options.no_doctor else checked(case, notices, (options.model,), quiet=options.quiet)
-    )
+    notices, findings = checked(options, case, (options.model,))
+    trials: Any = options.trials
+    if options.landmarks:
+        trials = [read_landmark_file(path).points for path in options.landmarks]
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         found = landmark_sensitivity(
             case,
-            trials=_trials(options),
+            trials=trials,
             std=options.std,
             seed=options.seed,
             model=options.model,
@@ -206,13 +204,6 @@ def sensitivity(options: argparse.Namespace) -> int:
     print(f"  skin that the operation moves: {moved:.3f} mm on average")
     notices.summarise(str(case.output / "sensitivity.json"))
     return DONE
-
-
-def _trials(options: argparse.Namespace) -> Any:
-    """The number of trials to draw, or the landmarks of each file."""
-    if not options.landmarks:
-        return options.trials
-    return [read_landmark_file(path).points for path in options.landmarks]
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -16,7 +16,7 @@ from cmfsim.io.cases.case_plans import is_achieved, osteotomies_of, plan_of
 from cmfsim.io.cases.tables import CaseChanges, Table, read_tables
 from cmfsim.io.files.reading_writing import is_there
 from cmfsim.values import case_parts
-from cmfsim.values.checks import as_text, listing
+from cmfsim.values.checks import AnyPath, as_text, listing
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import TissueData
 
@@ -132,7 +132,7 @@ class Case:
         return TissueData("preset", preset=muscles.preset, fraction=0.0)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, changes: CaseChanges | None = None) -> "Case":
+    def load(cls, path: AnyPath, *, changes: CaseChanges | None = None) -> "Case":
         """The case that a `case.toml` describes.
 
         Parameters
@@ -152,7 +152,7 @@ class Case:
         """
         return _read(_case_file(Path(path)), changes)
 
-    def with_plan(self, path: str | os.PathLike[str]) -> "Case":
+    def with_plan(self, path: AnyPath) -> "Case":
         """The case under the plan in another file, such as one saved by the planning page.
 
         Parameters
@@ -185,7 +185,7 @@ class Case:
 
 
 # What functions on cases take.
-CaseOrPath: TypeAlias = Case | str | os.PathLike[str]
+CaseOrPath: TypeAlias = Case | AnyPath
 
 
 def as_case(case: CaseOrPath) -> Case:

@@ -1,7 +1,6 @@
 """Cuts and plan of a case file: osteotomies, how each segment moves, and plans written back."""
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,7 @@ from cmfsim.io.cases.tables import Table
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.slicer.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
 from cmfsim.values.case_parts import DIRECTIONS, PROCEDURES, CaseMotion, CaseOsteotomy
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import AnyPath, Floats
 from cmfsim.values.motion import rigid_matrix, rigid_motion
 
 # A name that TOML takes as a key without quotes.
@@ -153,9 +152,7 @@ def _transform(motion: Table, folder: Path) -> CaseMotion:
     return CaseMotion(transform=file, direction=direction, frame=frame)
 
 
-def write_plan(
-    path: str | os.PathLike[str], plan: Mapping[str, ArrayLike], *, made_for: str = ""
-) -> None:
+def write_plan(path: AnyPath, plan: Mapping[str, ArrayLike], *, made_for: str = "") -> None:
     """Writes rigid motions as tables `[plan.SEGMENT]`, which `cmfsim predict --plan` reads.
 
     Parameters

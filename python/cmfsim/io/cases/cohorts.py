@@ -1,7 +1,6 @@
 """Cohorts and their variants, and the files `cohort.toml` and `variants.toml` (docs/formats.md)."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.cases.case_files import CASE_FILE
 from cmfsim.io.cases.tables import CaseChanges, Table, read_tables
 from cmfsim.io.files.reading_writing import is_there
-from cmfsim.values.checks import as_text, check_one_of
+from cmfsim.values.checks import AnyPath, as_text, check_one_of
 from cmfsim.values.prediction import MODELS
 
 # The variant without changes, with which all others are compared.
@@ -81,7 +80,7 @@ class Variants:
     description: str = ""
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], models: tuple[str, ...] = MODELS) -> "Variants":
+    def load(cls, path: AnyPath, models: tuple[str, ...] = MODELS) -> "Variants":
         """The variants that a `variants.toml` describes.
 
         Parameters
@@ -210,7 +209,7 @@ class Cohort:
             check_one_of("model", model, MODELS)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "Cohort":
+    def load(cls, path: AnyPath) -> "Cohort":
         """The cohort that a `cohort.toml` describes.
 
         Parameters

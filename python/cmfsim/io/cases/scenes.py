@@ -1,6 +1,5 @@
 """Scenes and plans: one `.npz`, or a text beside its mesh and surfaces (docs/formats.md)."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from cmfsim.io.files.reading_writing import (
 )
 from cmfsim.io.meshes.mesh_files import read_mesh, read_tets
 from cmfsim.io.meshes.surfaces import read_moved_surface, read_surface
-from cmfsim.values.checks import as_floats
+from cmfsim.values.checks import AnyPath, as_floats
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.node_kinds import NODE_KINDS
 from cmfsim.values.scene import Scene, SegmentData
@@ -59,7 +58,7 @@ PLAN_KEYS = ("format", "version", "name", "note", "units", "plan")
 TISSUE_TEXTS = ("kind", "law", "preset", "mixing")
 
 
-def read_scene(path: str | os.PathLike[str]) -> Scene:
+def read_scene(path: AnyPath) -> Scene:
     """The scene in a file: one `.npz`, or a `.toml` next to its mesh and surfaces.
 
     Parameters
@@ -87,7 +86,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
         return _scene_from_members(*read_archive(path, SCENE_FORMAT, "scene"))
 
 
-def write_scene(path: str | os.PathLike[str], scene: Scene) -> None:
+def write_scene(path: AnyPath, scene: Scene) -> None:
     """Writes a scene as one `.npz` that `read_scene` and `cmfsim solve` take.
 
     The same scene gives the same bytes. An existing file is replaced in one step.
@@ -116,7 +115,7 @@ def write_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     write_archive(path, SCENE_FORMAT, "scene", scene.header(), scene.arrays())
 
 
-def read_plan(path: str | os.PathLike[str], scene: Scene) -> dict[str, NDArray[Any] | MovedSurface]:
+def read_plan(path: AnyPath, scene: Scene) -> dict[str, NDArray[Any] | MovedSurface]:
     """The plan in a `.toml` or `.json` file, for the segments of a scene.
 
     Parameters

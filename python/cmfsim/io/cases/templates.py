@@ -4,7 +4,6 @@ A survey reads as much as it can and lists everything that is wrong; reading ref
 """
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from cmfsim.io.landmarks import read_landmark_file, write_landmarks
 from cmfsim.io.meshes.surfaces import read_surface, write_surface
 from cmfsim.io.slicer.markups import read_curves, write_curves
 from cmfsim.values.case_parts import FRAMES, UNITS
+from cmfsim.values.checks import AnyPath
 from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import MUSCLE_KINDS, MUSCLE_SIDES, MuscleSurface, TemplateData
 from cmfsim.values.surface_data import SurfaceData
@@ -48,7 +48,7 @@ class TemplateSurvey:
     findings: tuple[Finding, ...]
 
 
-def read_template(path: str | os.PathLike[str]) -> TemplateData:
+def read_template(path: AnyPath) -> TemplateData:
     """The template of a folder with `template.toml`, or of an `.npz` archive.
 
     Raises `FileNotFoundError`: The folder or archive, or a file that it names, does not exist.
@@ -64,7 +64,7 @@ def read_template(path: str | os.PathLike[str]) -> TemplateData:
     return survey.template
 
 
-def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
+def survey_template(path: AnyPath) -> TemplateSurvey:
     """What a template on disk holds, and everything that keeps it from being read.
 
     Raises `FileNotFoundError`: There is no such folder or archive.
@@ -87,7 +87,7 @@ def survey_template(path: str | os.PathLike[str]) -> TemplateSurvey:
 
 
 def write_template(
-    path: str | os.PathLike[str], template: TemplateData, report: Mapping[str, Any] | None = None
+    path: AnyPath, template: TemplateData, report: Mapping[str, Any] | None = None
 ) -> None:
     """Writes a template: a folder, or one archive if the name ends in `.npz`.
 

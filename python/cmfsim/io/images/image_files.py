@@ -1,7 +1,6 @@
 """Images: NRRD, NIfTI and MetaImage by our own readers, DICOM's pixels and writing by ITK."""
 
 import glob
-import os
 import shutil
 from dataclasses import dataclass
 from importlib import import_module
@@ -20,6 +19,7 @@ from cmfsim.io.images.image_headers import KNOWN
 from cmfsim.io.images.nifti import GZIP, is_nifti, read_nifti
 from cmfsim.io.images.nrrd import is_meta, read_meta, read_nrrd
 from cmfsim.processes.worker import Answer
+from cmfsim.values.checks import AnyPath
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
@@ -113,7 +113,7 @@ class ImageFile:
     findings: tuple[Finding, ...] = ()
 
 
-def read_image(path: str | os.PathLike[str], *, series: str | None = None) -> ImageData:
+def read_image(path: AnyPath, *, series: str | None = None) -> ImageData:
     """The image of a file or a DICOM folder, in LPS on an axis-aligned grid.
 
     Parameters
@@ -139,7 +139,7 @@ def read_image(path: str | os.PathLike[str], *, series: str | None = None) -> Im
     return read_image_file(path, series=series).image
 
 
-def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) -> ImageFile:
+def read_image_file(path: AnyPath, *, series: str | None = None) -> ImageFile:
     """The image of a file or a DICOM folder, with its modality and findings.
 
     Raises `ImageError`: As `read_image`.
@@ -174,7 +174,7 @@ def read_image_file(path: str | os.PathLike[str], *, series: str | None = None) 
     return ImageFile(*read_dicom_file(path))
 
 
-def write_image(image: ImageData, path: str | os.PathLike[str]) -> None:
+def write_image(image: ImageData, path: AnyPath) -> None:
     """Writes an image to a file whose name ends in .nrrd, .nii, .nii.gz or .mha.
 
     It is written under another name first, so that a failure leaves an older file intact.

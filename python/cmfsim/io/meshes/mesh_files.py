@@ -2,7 +2,6 @@
 
 import contextlib
 import io as stdio
-import os
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
@@ -24,6 +23,7 @@ from cmfsim.io.meshes.vtk.legacy import read_vtk_legacy
 from cmfsim.io.meshes.vtk.xml import read_vtk_xml
 from cmfsim.processes.child import ReaderError, read_in_child
 from cmfsim.processes.worker import Answer, ReadLimits
+from cmfsim.values.checks import AnyPath
 from cmfsim.values.finding import Finding
 
 # Formats of meshio whose files name other files, which may lie anywhere, or hold no mesh.
@@ -164,7 +164,7 @@ def meshio_answer(path: str) -> Answer:
     return Answer(texts, arrays)
 
 
-def read_tet_mesh(path: str | os.PathLike[str]) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+def read_tet_mesh(path: AnyPath) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
     """The nodes (n, 3), mm, and tets (m, 4) of a file, all positively oriented.
 
     Parameters

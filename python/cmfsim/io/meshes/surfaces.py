@@ -1,7 +1,6 @@
 """Triangle surfaces in STL, PLY, OBJ and VTP: reading into LPS mm, and writing."""
 
 import logging
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from cmfsim.io.meshes.polygons import triangles_of
 from cmfsim.io.meshes.stl import write_stl
 from cmfsim.io.meshes.vtk.writing import write_triangles
 from cmfsim.values.case_parts import FRAMES, UNITS
-from cmfsim.values.checks import Floats, check_one_of
+from cmfsim.values.checks import AnyPath, Floats, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
@@ -41,11 +40,7 @@ class SurfaceFile:
 
 
 def read_surface(
-    path: str | os.PathLike[str],
-    crease_angle: float = 60.0,
-    *,
-    units: str = "mm",
-    frame: str | None = None,
+    path: AnyPath, crease_angle: float = 60.0, *, units: str = "mm", frame: str | None = None
 ) -> SurfaceData:
     """The triangles of a file, in LPS mm, with coincident vertices merged.
 
@@ -81,11 +76,7 @@ def read_surface(
 
 
 def read_surface_file(
-    path: str | os.PathLike[str],
-    crease_angle: float = 60.0,
-    *,
-    units: str = "mm",
-    frame: str | None = None,
+    path: AnyPath, crease_angle: float = 60.0, *, units: str = "mm", frame: str | None = None
 ) -> SurfaceFile:
     """As `read_surface`, with what was ignored on reading, for those who report it."""
     read = surface_as_stored(Path(path), crease_angle)
@@ -112,11 +103,7 @@ def _scale(path: Path, units: str, frame: str | None, stated: str | None) -> NDA
 
 
 def read_moved_surface(
-    before: str | os.PathLike[str],
-    after: str | os.PathLike[str],
-    *,
-    units: str = "mm",
-    frame: str | None = None,
+    before: AnyPath, after: AnyPath, *, units: str = "mm", frame: str | None = None
 ) -> MovedSurface:
     """The motion of a bone given by its surface before and after, vertex by vertex.
 
@@ -169,11 +156,7 @@ def read_moved_surface(
 
 
 def read_bone_pair(
-    before: str | os.PathLike[str],
-    after: str | os.PathLike[str],
-    *,
-    units: str = "mm",
-    frame: str | None = None,
+    before: AnyPath, after: AnyPath, *, units: str = "mm", frame: str | None = None
 ) -> MovedSurface | tuple[SurfaceData, SurfaceData]:
     """A bone before and after: followed by its vertices if the triangles are the same, else both.
 
@@ -256,7 +239,7 @@ def _welded(rows: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
     return first[rise], number[back]
 
 
-def write_surface(path: str | os.PathLike[str], surface: SurfaceData) -> None:
+def write_surface(path: AnyPath, surface: SurfaceData) -> None:
     """Writes a surface as `.ply`, `.stl`, `.obj` or `.vtp`, LPS mm.
 
     An existing file is replaced in one step. PLY, OBJ and VTP keep every digit; STL has single

@@ -1,7 +1,6 @@
 """Calibrations as JSON (docs/band.md): scores by case and region, with what they belong to."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ from cmfsim.errors import CalibrationError, CaseInputError
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.files.summaries import Closed, Maybe, Span, check, plain_json
 from cmfsim.values.calibration import Calibration, CalibrationCase
+from cmfsim.values.checks import AnyPath
 from cmfsim.values.prediction import MODELS
 
 CALIBRATION_FORMAT, CALIBRATION_VERSION = "cmfsim-calibration", 1
@@ -28,7 +28,7 @@ _CALIBRATION = Closed(
 )
 
 
-def read_calibration(path: str | os.PathLike[str]) -> Calibration:
+def read_calibration(path: AnyPath) -> Calibration:
     """The calibration in a file.
 
     Raises
@@ -67,7 +67,7 @@ def read_calibration(path: str | os.PathLike[str]) -> Calibration:
     return found
 
 
-def write_calibration(path: str | os.PathLike[str], calibration: Calibration) -> None:
+def write_calibration(path: AnyPath, calibration: Calibration) -> None:
     """Writes a calibration; the same calibration always gives the same bytes.
 
     Raises

@@ -1,7 +1,6 @@
 """An evaluation: its figures as `metrics.json` and `metrics.csv`, errors as `error-MODEL.vtp`."""
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from cmfsim.io.files import summaries
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.vtk.writing import write_triangles
-from cmfsim.values.checks import Floats, as_floats, as_rows, frozen
+from cmfsim.values.checks import AnyPath, Floats, as_floats, as_rows, frozen
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.surface_data import SurfaceData
 
@@ -104,7 +103,7 @@ def skin_errors_file(model: str) -> str:
 
 
 def write_skin_errors(
-    path: str | os.PathLike[str], skin: SurfaceData, vertices: NDArray[Any], signed: Floats
+    path: AnyPath, skin: SurfaceData, vertices: NDArray[Any], signed: Floats
 ) -> None:
     """Writes a predicted skin with its distances; an old file goes in one step.
 
@@ -120,9 +119,7 @@ def write_skin_errors(
         write_triangles(file, skin.vertices, skin.triangles, arrays, frame="LPS")
 
 
-def read_skin_errors(
-    folder: str | os.PathLike[str], evaluation: Mapping[str, Any], model: str
-) -> SkinErrors:
+def read_skin_errors(folder: AnyPath, evaluation: Mapping[str, Any], model: str) -> SkinErrors:
     """The errors of a model that an evaluation lists, as they were written.
 
     folder: With the files of the evaluation.
@@ -152,7 +149,7 @@ def is_evaluation_file(name: str) -> bool:
     return EVALUATION_FILES.fullmatch(name) is not None
 
 
-def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any]:
+def read_evaluation(folder: AnyPath) -> dict[str, Any]:
     """What `metrics.json` in a folder holds, which `cmfsim evaluate` wrote there.
 
     Raises `FileNotFoundError`: There is none.
@@ -161,9 +158,7 @@ def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any]:
     return summaries.read_summary(Path(folder) / EVALUATION_FILE, _EVALUATION, AGAIN)
 
 
-def read_evaluation_picture(
-    folder: str | os.PathLike[str], evaluation: Mapping[str, Any], name: str
-) -> bytes:
+def read_evaluation_picture(folder: AnyPath, evaluation: Mapping[str, Any], name: str) -> bytes:
     """A picture that an evaluation lists, as it was written.
 
     Raises `FileNotFoundError`: It is missing.
@@ -183,7 +178,7 @@ def read_picture(path: Path) -> bytes:
     return data
 
 
-def write_metrics(path: str | os.PathLike[str], metrics: Any) -> None:
+def write_metrics(path: AnyPath, metrics: Any) -> None:
     """Writes figures as `.json` (all) or `.csv` (a table), replacing an old file in one step.
 
     Parameters

@@ -1,7 +1,6 @@
 """A population of virtual patients and its file, `population.json` (docs/virtual_patients.md)."""
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from typing import Any
 
 from cmfsim.io.files.reading_writing import FORMAT_VERSION, check_readable, named, replacing
 from cmfsim.io.files.summaries import Closed, Maybe, Shape, Span, check, plain_json
-from cmfsim.values.checks import check_one_of
+from cmfsim.values.checks import AnyPath, check_one_of
 
 POPULATION_FILE = "population.json"
 FORMAT = "cmfsim-population"
@@ -104,7 +103,7 @@ class Population:
             file.write((json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
 
     @classmethod
-    def load(cls, folder: str | os.PathLike[str]) -> "Population":
+    def load(cls, folder: AnyPath) -> "Population":
         """The population of a folder.
 
         Raises

@@ -37,6 +37,7 @@ from cmfsim.io.results.metrics import (
     read_picture,
 )
 from cmfsim.io.results.result_files import write_result
+from cmfsim.values.checks import AnyPath
 from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.surface_data import SurfaceData
@@ -174,7 +175,7 @@ def is_result_file(name: str) -> bool:
     return is_prediction_file(name) or is_evaluation_file(name)
 
 
-def read_prediction(folder: str | os.PathLike[str]) -> dict[str, Any]:
+def read_prediction(folder: AnyPath) -> dict[str, Any]:
     """What `prediction.json` in a folder holds, which `write_prediction` wrote there.
 
     Raises `FileNotFoundError`: There is none: another program's folder, or a run that was stopped.
@@ -183,9 +184,7 @@ def read_prediction(folder: str | os.PathLike[str]) -> dict[str, Any]:
     return read_summary(Path(folder) / PREDICTION_FILE, PREDICTION, AGAIN)
 
 
-def read_prediction_picture(
-    folder: str | os.PathLike[str], summary: Mapping[str, Any], name: str
-) -> bytes | None:
+def read_prediction_picture(folder: AnyPath, summary: Mapping[str, Any], name: str) -> bytes | None:
     """A picture of a prediction as it was written; None where it was not drawn.
 
     Raises `FileNotFoundError`: It is missing.
@@ -196,7 +195,7 @@ def read_prediction_picture(
     return read_picture(checked_file(Path(folder), summary, name, AGAIN))
 
 
-def predictions_of(folder: str | os.PathLike[str]) -> dict[Path, dict[str, Any]]:
+def predictions_of(folder: AnyPath) -> dict[Path, dict[str, Any]]:
     """The predictions in a case's output folder, all of one plan, by the folder of each.
 
     What a stopped run had still to put in place is put there first.
@@ -265,9 +264,7 @@ def _key_of(read: Callable[[Path], Mapping[str, Any]], folder: Path) -> str | No
 
 
 def write_prediction(
-    folder: str | os.PathLike[str],
-    prediction: Prediction,
-    draw: Callable[[Path], Iterable[str]] | None = None,
+    folder: AnyPath, prediction: Prediction, draw: Callable[[Path], Iterable[str]] | None = None
 ) -> list[str]:
     """The names of the files of a prediction, written to a folder, which is created if necessary.
 
@@ -386,7 +383,7 @@ def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
 
 
 def read_parts(
-    folder: str | os.PathLike[str], kinds: Sequence[str] | None = None
+    folder: AnyPath, kinds: Sequence[str] | None = None
 ) -> dict[str, dict[str, tuple[SurfaceData, NDArray[np.float64]]]]:
     """The surfaces of a prediction that was written, with their vertices after the operation.
 

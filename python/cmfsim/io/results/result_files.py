@@ -1,7 +1,6 @@
 """Results of a solve as `.npz`, `.vtu` and `.vtp`, and the output folder of `cmfsim build`."""
 
 import json
-import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ from cmfsim.io.files.folders import replacing_files
 from cmfsim.io.files.reading_writing import named, replacing
 from cmfsim.io.meshes.surfaces import write_surface
 from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
+from cmfsim.values.checks import AnyPath
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.scene import SceneResult
@@ -25,7 +25,7 @@ from cmfsim.values.surface_data import used_nodes
 RESULT_FORMAT = "cmfsim-result"
 
 
-def read_result(path: str | os.PathLike[str]) -> SceneResult:
+def read_result(path: AnyPath) -> SceneResult:
     """The result in a `.npz` file that `write_result` made.
 
     Raises
@@ -87,7 +87,7 @@ def _check(arrays: Mapping[str, NDArray[Any]]) -> None:
             raise CaseInputError(f"array {name!r} names a node that is not among {n}")
 
 
-def write_result(path: str | os.PathLike[str], result: SceneResult) -> None:
+def write_result(path: AnyPath, result: SceneResult) -> None:
     """Writes a result as `.npz` (everything), `.vtu` (tissue) or `.vtp` (its boundary).
 
     An existing file is replaced in one step.
@@ -140,9 +140,7 @@ def is_model_file(name: str) -> bool:
 
 
 def write_model(
-    folder: str | os.PathLike[str],
-    model: PatientModel,
-    draw: Callable[[Path], Iterable[str]] | None = None,
+    folder: AnyPath, model: PatientModel, draw: Callable[[Path], Iterable[str]] | None = None
 ) -> list[str]:
     """The names of the files of a model, written to a folder, which is created if necessary.
 

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim.errors import LandmarkInputError
 from cmfsim.io.files.reading_writing import MAX_WHOLE, check_readable, parsed_json, replacing
-from cmfsim.values.checks import Floats, as_rows
+from cmfsim.values.checks import AnyPath, Floats, as_rows
 
 # What Slicer calls markups whose points follow one another along a line.
 CURVE_KINDS = ("Curve", "ClosedCurve", "Line")
@@ -174,7 +173,7 @@ def _unit_length(value: object) -> float:
     return UNIT_LENGTHS[name]
 
 
-def read_curves(path: str | os.PathLike[str]) -> tuple[Floats, ...]:
+def read_curves(path: AnyPath) -> tuple[Floats, ...]:
     """The curves of a `.mrk.json` file as polylines through their points, (n, 3) each, LPS mm.
 
     A closed curve ends where it starts. A file that states no frame is read as LPS, as Slicer's
@@ -193,7 +192,7 @@ def read_curves(path: str | os.PathLike[str]) -> tuple[Floats, ...]:
         raise LandmarkInputError(f"{path.name}: {error}") from error
 
 
-def write_curves(path: str | os.PathLike[str], lines: Sequence[ArrayLike]) -> None:
+def write_curves(path: AnyPath, lines: Sequence[ArrayLike]) -> None:
     """Writes polylines as open curves of 3D Slicer, LPS mm; `read_curves` gives them back."""
     path = Path(path)
     markups = []

@@ -5,7 +5,6 @@ where it is before the operation under a transform that carries it to where it g
 landmarks. All coordinates are LPS mm, which every file states.
 """
 
-import os
 import stat
 import zipfile
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.meshes.vtk.writing import write_triangles
 from cmfsim.io.slicer.markups import markup_of, markups_text
 from cmfsim.io.slicer.transforms import motion_in_lps, transform_text
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import AnyPath, Floats
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData
 
@@ -126,7 +125,7 @@ class _Look:
     is_visible: bool = True
 
 
-def write_slicer_bundle(path: str | os.PathLike[str], prediction: Prediction) -> None:
+def write_slicer_bundle(path: AnyPath, prediction: Prediction) -> None:
     """Writes a prediction as one `.mrb`, which 3D Slicer opens by drag and drop.
 
     Models `face predicted` (arrays `displacement_mm`, `displacement_length_mm`, `forwards_mm`;

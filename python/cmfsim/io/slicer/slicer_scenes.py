@@ -4,7 +4,6 @@ A scene is XML that names files and what moves what. Files come from strangers: 
 refused, sizes are limited, and only files in the scene's own folder are named.
 """
 
-import os
 import re
 import shutil
 import stat
@@ -20,7 +19,7 @@ import numpy as np
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files.reading_writing import check_readable, is_below, is_there, named, walk_xml
 from cmfsim.io.slicer.transforms import motion_in_lps, read_transform_file
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import AnyPath, Floats
 from cmfsim.values.motion import rigid_matrix
 
 # A planning scene has some hundred files, with a CT of half a gigabyte.
@@ -152,7 +151,7 @@ class SlicerScene:
         return motion_in_lps(rigid_matrix(numbers.reshape(4, 4)), "RAS")
 
 
-def read_slicer_scene(path: str | os.PathLike[str]) -> SlicerScene:
+def read_slicer_scene(path: AnyPath) -> SlicerScene:
     """The nodes of a scene file that a case may use.
 
     path: `.mrml`. Files that it names are looked for, and not read.

@@ -4,7 +4,6 @@ A transform file does not record whether it moves the bone to its new position o
 the caller or the case file states the direction (docs/formats.md).
 """
 
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import MAX_TEXT, check_readable, named, replacing
 from cmfsim.io.slicer.itk_hdf5 import read_itk_hdf5
 from cmfsim.values.case_parts import DIRECTIONS, FRAMES
-from cmfsim.values.checks import Floats, as_floats, check_one_of
+from cmfsim.values.checks import AnyPath, Floats, as_floats, check_one_of
 from cmfsim.values.motion import rigid_matrix
 
 MATRIX_SUFFIXES = (".txt", ".mat")
@@ -63,7 +62,7 @@ class TransformFile:
         return f"{self.direction}, {self.frame}{assumed}"
 
 
-def is_itk_file(path: str | os.PathLike[str]) -> bool:
+def is_itk_file(path: AnyPath) -> bool:
     """Whether a file's suffix marks it as an ITK transform; `.txt` and `.mat` may hold one too."""
     return Path(path).suffix.lower() in (".tfm", *HDF5_SUFFIXES)
 
@@ -74,7 +73,7 @@ def motion_in_lps(matrix: Floats, frame: str) -> Floats:
 
 
 def read_transform(
-    path: str | os.PathLike[str], *, direction: str | None = None, frame: str | None = None
+    path: AnyPath, *, direction: str | None = None, frame: str | None = None
 ) -> Floats:
     """The motion of the bone in a transform file, as a matrix in LPS.
 
@@ -125,7 +124,7 @@ def read_transform(
 
 
 def read_transform_file(
-    path: str | os.PathLike[str], *, direction: str | None = None, frame: str | None = None
+    path: AnyPath, *, direction: str | None = None, frame: str | None = None
 ) -> TransformFile:
     """The motion in a transform file, and how it was interpreted; as `read_transform` otherwise."""
     path = Path(path)
@@ -186,11 +185,7 @@ def _understood(
 
 
 def write_transform(
-    path: str | os.PathLike[str],
-    matrix: ArrayLike,
-    *,
-    direction: str | None = None,
-    frame: str = "LPS",
+    path: AnyPath, matrix: ArrayLike, *, direction: str | None = None, frame: str = "LPS"
 ) -> None:
     """Writes a rigid motion as ITK text (`.tfm`) or as a 4 × 4 matrix (`.txt`).
 
