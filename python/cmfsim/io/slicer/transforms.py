@@ -174,9 +174,9 @@ def _understood(
                 f"is an ITK transform, and does not record its direction: state {DIRECTION_CHOICE}"
             )
         frame = "LPS"
-        matrix = rigid_matrix(matrix)
-        both = {"direction": direction, "frame": frame}
-        assumed = tuple(name for name, value in both.items() if value is None)
+    matrix = rigid_matrix(matrix)
+    both = {"direction": direction, "frame": frame}
+    assumed = tuple(name for name, value in both.items() if value is None)
     direction, frame = direction or DEFAULT_DIRECTION, frame or DEFAULT_FRAME
     matrix = motion_in_lps(matrix, frame)
     if direction == "from-parent":
