@@ -5,7 +5,7 @@ import pytest
 
 import cmfsim
 from benches.scenes import meshes
-from cmfsim.pictures import faces
+from cmfsim.pictures import canvas, faces
 from cmfsim.pictures.faces import FILM_SIZE, animate_face
 
 pytest.importorskip("pyvista")
@@ -45,7 +45,7 @@ def test_a_film_gets_every_frame_as_long_as_it_is_seen(tmp_path, monkeypatch):
     tool.write_text("#!/bin/sh\nwc -c\n")
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    monkeypatch.setattr(faces, "drawn", lambda *_: np.zeros((*FILM_SIZE[::-1], 3), np.uint8))
+    monkeypatch.setattr(canvas, "drawn", lambda *_: np.zeros((*FILM_SIZE[::-1], 3), np.uint8))
     animate_face(tmp_path / "face.mp4", BALL, MOVED)
     assert int((tmp_path / "face.mp4").read_bytes()) == 3 * FILM_SIZE[0] * FILM_SIZE[1] * (
         2 * 12 + 2

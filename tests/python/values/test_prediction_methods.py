@@ -64,7 +64,7 @@ def test_a_notebook_without_opengl_shows_the_lines(prediction, monkeypatch):
     def refuse(*_, **__):
         raise CaseInputError("OpenGL does not work")
 
-    monkeypatch.setattr(pictures.faces, "draw", refuse)
+    monkeypatch.setattr(pictures.canvas, "draw", refuse)
     shown = prediction._repr_html_()
     assert shown.startswith("<pre>Prediction of M")
     assert "<img" not in shown
