@@ -28,7 +28,7 @@ import oracles
 from cmfsim.io.images.segmentations import read_labels, read_segmentation
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.photos import read_photo
-from cmfsim.io.meshes.vtk.writing import write_tets
+from cmfsim.io.meshes.vtk_writing import write_tets
 from cmfsim.io.slicer.markups import read_curves, write_curves
 from cmfsim.io.slicer.slicer_scenes import read_slicer_scene, unpack_bundle
 from cmfsim.pictures.canvas import write_picture

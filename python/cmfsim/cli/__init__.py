@@ -119,7 +119,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from cmfsim.cli.patients.case_commands import print_findings  # noqa: PLC0415 (loads numpy)
+    from cmfsim.cli.case_commands import print_findings  # noqa: PLC0415 (loads numpy)
     from cmfsim.cli.terminal import FindingsError  # noqa: PLC0415 (loads numpy)
 
     try:

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
-from cmfsim.cli.patients import (
+from cmfsim.cli import (
     case_commands,
+    lab_commands,
     landmarks_command,
     plan_command,
     scene_commands,
+    study_commands,
     template_commands,
 )
-from cmfsim.cli.research import lab_commands, study_commands
 from cmfsim.io import result_suffixes
 from cmfsim.io.results.populations import PARTS, TEST
 from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST

@@ -9,7 +9,7 @@ import numpy as np
 
 from cmfsim.drafting.roles import NameRole, name_role
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.images.dicom.series import dicom_places
+from cmfsim.io.images.dicom_series import dicom_places
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.images.segmentations import NAMES_FILE, are_labels, read_labels
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file

@@ -188,7 +188,7 @@ def test_missing_packages_are_one_line_before_any_work(command, case, monkeypatc
     assert "pip install '.[mesh,report]' in cmfsim's folder" in capsys.readouterr().err
     # Without pictures there is still a report.
     missing -= {"jinja2"}
-    monkeypatch.setattr("cmfsim.cli.research.study_commands.checked", stop)
+    monkeypatch.setattr("cmfsim.cli.study_commands.checked", stop)
     with pytest.raises(KeyboardInterrupt):
         main_without_handlers(command, case)
     assert "skipped: pyvista" in capsys.readouterr().err

@@ -110,7 +110,7 @@ def noticed(tmp_path, monkeypatch):
     given = {"where": "case.toml:3", "why": "why", "fix": "fix it"}
     doctor = Finding("of-doctor", "the case is doubtful", severity="warning", **given)
     found = cmfsim.doctor.Examination((doctor,), {})
-    monkeypatch.setattr("cmfsim.cli.patients.case_commands.examine", lambda *_, **__: found)
+    monkeypatch.setattr("cmfsim.cli.case_commands.examine", lambda *_, **__: found)
     head = HeadCase(rounds=2)
     head.toml = head.toml.replace("edge_length = 4.0", "edge_length = 16.0")
     return head.write(tmp_path)

@@ -16,7 +16,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.cli.patients.case_commands import case_of
+from cmfsim.cli.case_commands import case_of
 from cmfsim.io.cases.tables import read_tables
 from cmfsim.pipeline.building.inputs import plan_key
 from cmfsim.pipeline.planning import page_state

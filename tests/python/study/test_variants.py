@@ -235,7 +235,7 @@ def test_models_and_output_of_a_cohort_change_for_one_run(tmp_path, monkeypatch,
         asked.append(cohort)
         raise CaseInputError("far enough")
 
-    monkeypatch.setattr("cmfsim.cli.research.study_commands.run_study", run)
+    monkeypatch.setattr("cmfsim.cli.study_commands.run_study", run)
     words = ["study", str(tmp_path), "-q"]
     assert main([*words, "--model", "M+S", "--model", "M", "-o", str(tmp_path / "x")]) == 2
     assert main(words) == 2

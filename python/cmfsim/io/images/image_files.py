@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cmfsim.errors import ImageError, ImageInputError, third_party
 from cmfsim.io.files.leftovers import abandoned, temporary_folder
 from cmfsim.io.files.reading_writing import is_there, utf8_path
-from cmfsim.io.images.dicom.series import read_dicom_file, read_dicom_folder
+from cmfsim.io.images.dicom_series import read_dicom_file, read_dicom_folder
 from cmfsim.io.images.image_grids import on_axes
 from cmfsim.io.images.image_headers import KNOWN
 from cmfsim.io.images.nifti import GZIP, is_nifti, read_nifti

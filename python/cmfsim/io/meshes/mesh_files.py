@@ -19,8 +19,8 @@ from cmfsim.io.meshes.obj import read_obj
 from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, oriented, stated_frame
 from cmfsim.io.meshes.ply import read_ply
 from cmfsim.io.meshes.stl import read_stl
-from cmfsim.io.meshes.vtk.legacy import read_vtk_legacy
-from cmfsim.io.meshes.vtk.xml import read_vtk_xml
+from cmfsim.io.meshes.vtk_legacy import read_vtk_legacy
+from cmfsim.io.meshes.vtk_xml import read_vtk_xml
 from cmfsim.processes.child import ReaderError, read_in_child
 from cmfsim.processes.worker import Answer, ReadLimits
 from cmfsim.values.checks import AnyPath

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files.texts import real_numbers, shown, whole_numbers
-from cmfsim.io.meshes.polygons import triangles_of
+from cmfsim.io.meshes.plain_mesh import triangles_of
 from cmfsim.values.checks import Floats
 
 Integers = NDArray[np.int64]

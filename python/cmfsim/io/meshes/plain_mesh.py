@@ -1,4 +1,7 @@
-"""A mesh as a file has it: points, cells, values, the frame that it states; tets repaired."""
+"""A mesh as a file has it, points, cells, values, frame; tets repaired; triangles from faces.
+
+Indices are checked, and polygons are cut only where one way alone is right.
+"""
 
 import re
 from collections.abc import Mapping
@@ -15,6 +18,7 @@ from cmfsim.values.checks import Floats, Indices, as_index_rows, as_rows
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import used_nodes
 
+Integers = NDArray[np.int64]
 # The limits of `TetMesh`: volume over longest edge cubed, and the longest edge, mm.
 DEGENERATE_VOLUME, SHORTEST_EDGE = 1e-12, 1e-9
 # Largest coordinate, whatever its unit: a head in µm has 1e6. Far larger ones overflow in areas and
@@ -42,8 +46,8 @@ class RepairedTets(NamedTuple):
 
     nodes: Floats
     tets: Indices
-    kept_nodes: NDArray[np.int64]
-    kept_tets: NDArray[np.int64]
+    kept_nodes: Integers
+    kept_tets: Integers
     n_turned: int
     n_dropped: int
 
@@ -111,7 +115,7 @@ class Cells:
     """
 
     type: str
-    data: NDArray[np.int64]
+    data: Integers
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +165,7 @@ class PlainMesh:
                 raise CaseInputError(f"cell data {name!r} has {rows} rows for {needed} cells")
 
     @property
-    def cells_dict(self) -> dict[str, NDArray[np.int64]]:
+    def cells_dict(self) -> dict[str, Integers]:
         """All cells of each type."""
         types = dict.fromkeys(block.type for block in self.cells)
         return {
@@ -190,7 +194,6 @@ def _check_block(block: Cells, count: int) -> None:
         )
 
 
-Integers = NDArray[np.int64]
 # VTK's numbers (vtkCellType.h); other cells keep their number as their name.
 NAMES = {
     1: "vertex", 3: "line", 5: "triangle", 9: "quad", 10: "tetra", 12: "hexahedron", 13: "wedge",
@@ -284,3 +287,121 @@ def _header(head: bytes, suffix: str) -> bytes:
         return b"\n".join(lines)
     # Legacy VTK: its second line is a title.
     return b"\n".join(head.split(b"\n", 2)[1:2])
+
+
+# A corner may turn inwards by this share of a polygon's area and count as rounding.
+FLAT_SHARE = 1e-9
+
+
+def checked_indices(
+    indices: Integers, count: int, *, of: str = "triangle", first: int = 0
+) -> Integers:
+    """The indices (m, k), if each names one of `count` vertices.
+
+    indices: (m, k) int64, from 0 on.
+    count: Number of vertices.
+    of: What a row is, for the error.
+    first: Number of the first vertex in the file's own count: 1 in OBJ, 0 elsewhere.
+    Raises `CaseError`: An index below 0 or beyond the last.
+    """
+    if indices.size and (int(indices.min()) < 0 or int(indices.max()) >= count):
+        row, column = np.argwhere((indices < 0) | (indices >= count))[0]
+        value = int(indices[row, column]) + first
+        allowed = f"{first} to {count - 1 + first}" if count else "none"
+        hint = "" if first else "; is the file numbered from 1?" if value == count else ""
+        raise CaseInputError(
+            f"{of} {row} names vertex {value}, but there are {count} vertices (allowed {allowed})"
+            f"{hint}"
+        )
+    return indices
+
+
+def _check_corners(of: str, counts: Integers) -> None:
+    few = np.flatnonzero(counts < 3)
+    if len(few):
+        raise CaseInputError(
+            f"{of} {few[0]} has {counts[few[0]]} corners: three or more are needed"
+        )
+
+
+def triangles_of(
+    points: Floats, counts: Integers, corners: Integers, *, first: int = 0
+) -> Integers:
+    """The triangles (t, 3) of faces, in the order of the faces.
+
+    A polygon becomes a fan of triangles about its first corner from which all of them face the same
+    way; one that no fan fills, such as a star or a bow, is refused.
+
+    points: (n, 3).
+    counts: (f,) int64. Number of corners of each face.
+    corners: (sum of counts,) int64, from 0 on.
+    first: Number of the first vertex in the file's own count.
+    Raises `CaseError`: A face of fewer than three corners, an index that is not there, a polygon
+        that no fan fills.
+    """
+    _check_corners("face", counts)
+    if not (counts > 3).any():
+        return checked_indices(corners.reshape(-1, 3), len(points), of="face", first=first)
+    starts = np.cumsum(counts) - counts
+    face = np.repeat(np.arange(len(counts)), counts)
+    bad = np.flatnonzero((corners < 0) | (corners >= len(points)))
+    if len(bad):
+        value = int(corners[bad[0]]) + first
+        raise CaseInputError(
+            f"face {face[bad[0]]} names vertex {value}, but there are {len(points)} vertices"
+        )
+    corners = corners.copy()
+    for size in np.unique(counts[counts > 3]):
+        mine = np.flatnonzero(counts == size)
+        rows = starts[mine][:, None] + np.arange(size)
+        corners[rows] = _turned(points, corners[rows], mine)
+    n_fan = counts - 2
+    owner = np.repeat(np.arange(len(counts)), n_fan)
+    step = np.arange(len(owner)) - np.repeat(np.cumsum(n_fan) - n_fan, n_fan) + 1
+    at = starts[owner]
+    return np.stack([corners[at], corners[at + step], corners[at + step + 1]], axis=1)
+
+
+def triangles_of_strips(points: Floats, counts: Integers, corners: Integers) -> Integers:
+    """The triangles (t, 3) of strips, each of which shares an edge with the one before.
+
+    Every other triangle of a strip runs the other way round, so that all face the same way. One
+    that names a corner twice joins two parts of a strip and is none.
+
+    points: (n, 3).
+    counts: (s,) int64. Number of corners of each strip.
+    corners: (sum of counts,) int64, from 0 on.
+    Raises `CaseError`: A strip of fewer than three corners, an index that is not there.
+    """
+    _check_corners("strip", counts)
+    begins = np.cumsum(counts) - counts
+    within = np.arange(int(counts.sum())) - np.repeat(begins, counts)
+    # A triangle begins at each corner of a strip but its last two.
+    at = np.flatnonzero(within < np.repeat(counts, counts) - 2)
+    odd = within[at] % 2
+    triangles = np.stack([corners[at + odd], corners[at + 1 - odd], corners[at + 2]], axis=1)
+    checked_indices(triangles, len(points), of="triangle")
+    a, b, c = triangles.T
+    whole: Integers = triangles[(a != b) & (b != c) & (c != a)]
+    return whole
+
+
+def _turned(points: Floats, polygons: Integers, faces: Integers) -> Integers:
+    """Polygons (m, k) that each begin at a corner whose fan fills them."""
+    polygons = polygons.copy()
+    todo = np.arange(len(polygons))
+    for _ in range(polygons.shape[1]):
+        places = points[polygons[todo]]
+        spokes = places[:, 1:] - places[:, :1]
+        normals = np.cross(spokes[:, :-1], spokes[:, 1:])
+        whole = normals.sum(axis=1)
+        along = (normals * whole[:, None]).sum(axis=2)
+        least = -FLAT_SHARE * (whole * whole).sum(axis=1)
+        todo = todo[~(along >= least[:, None]).all(axis=1)]
+        if not len(todo):
+            return polygons
+        polygons[todo] = np.roll(polygons[todo], -1, axis=1)
+    raise CaseInputError(
+        f"face {faces[todo[0]]} has {polygons.shape[1]} corners that no fan of triangles fills: "
+        "triangulate the surface before it is exported"
+    )

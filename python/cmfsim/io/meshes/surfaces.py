@@ -14,11 +14,10 @@ from cmfsim.errors import CaseInputError, UnpairedError
 from cmfsim.io.files.reading_writing import named, replacing
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.obj import write_obj
-from cmfsim.io.meshes.plain_mesh import PlainMesh
+from cmfsim.io.meshes.plain_mesh import PlainMesh, triangles_of
 from cmfsim.io.meshes.ply import write_ply
-from cmfsim.io.meshes.polygons import triangles_of
 from cmfsim.io.meshes.stl import write_stl
-from cmfsim.io.meshes.vtk.writing import write_triangles
+from cmfsim.io.meshes.vtk_writing import write_triangles
 from cmfsim.values.case_parts import FRAMES, UNITS
 from cmfsim.values.checks import AnyPath, Floats, check_one_of
 from cmfsim.values.finding import Finding

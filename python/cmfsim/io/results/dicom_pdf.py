@@ -6,7 +6,7 @@ from pathlib import Path
 from cmfsim._core import __version__
 from cmfsim.errors import ImageInputError, third_party
 from cmfsim.io.files.reading_writing import replacing
-from cmfsim.io.images.dicom.series import dicom_files
+from cmfsim.io.images.dicom_series import dicom_files
 
 # What is taken over from the CT: whose the document is, and to which study it belongs.
 PATIENT = ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "SpecificCharacterSet")

@@ -14,7 +14,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io.files import summaries
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.meshes.mesh_files import read_mesh
-from cmfsim.io.meshes.vtk.writing import write_triangles
+from cmfsim.io.meshes.vtk_writing import write_triangles
 from cmfsim.values.checks import AnyPath, Floats, as_floats, as_rows, frozen
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.surface_data import SurfaceData

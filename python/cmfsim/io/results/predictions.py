@@ -26,7 +26,7 @@ from cmfsim.io.files.summaries import (
 )
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.surfaces import write_surface
-from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
+from cmfsim.io.meshes.vtk_writing import write_tets, write_triangles
 from cmfsim.io.results.metrics import (
     CHART_PAGE_FILE,
     DICOM_PAGE_FILE,

@@ -15,7 +15,7 @@ from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.io.files.folders import replacing_files
 from cmfsim.io.files.reading_writing import named, replacing
 from cmfsim.io.meshes.surfaces import write_surface
-from cmfsim.io.meshes.vtk.writing import write_tets, write_triangles
+from cmfsim.io.meshes.vtk_writing import write_tets, write_triangles
 from cmfsim.values.checks import AnyPath
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import PatientModel

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.io.files.reading_writing import replacing
-from cmfsim.io.meshes.vtk.writing import write_triangles
+from cmfsim.io.meshes.vtk_writing import write_triangles
 from cmfsim.io.slicer.markups import markup_of, markups_text
 from cmfsim.io.slicer.transforms import motion_in_lps, transform_text
 from cmfsim.values.checks import AnyPath, Floats

@@ -16,7 +16,7 @@ from cmfsim._core import __version__
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface_file, read_transform
 from cmfsim.io.files.folders import check_below, check_writable
-from cmfsim.io.images.dicom.series import dicom_files
+from cmfsim.io.images.dicom_series import dicom_files
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.meshes.photos import photo_files
 from cmfsim.io.results.result_files import is_model_file

@@ -9,7 +9,7 @@ import pytest
 from small_scans import SHAPE, codes, noisy, refused, same, smooth
 
 import cmfsim
-from cmfsim.io.images.dicom.series import dicom_files, dicom_places
+from cmfsim.io.images.dicom_series import dicom_files, dicom_places
 from cmfsim.io.images.image_files import read_image_file
 from dicom_series import axial, write_classic_frames, write_enhanced, write_series
 

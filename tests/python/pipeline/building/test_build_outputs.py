@@ -232,7 +232,7 @@ def test_the_doctor_is_asked_once_or_not_at_all(ellipsoids, monkeypatch, small_m
         return cmfsim.doctor.Examination(diagnose(case, models), {})
 
     monkeypatch.setattr(case_model, "diagnose", diagnose)
-    monkeypatch.setattr("cmfsim.cli.patients.case_commands.examine", examine)
+    monkeypatch.setattr("cmfsim.cli.case_commands.examine", examine)
     monkeypatch.setattr(case_model, "read_anatomy", lambda *_: (small_model.anatomy, ()))
     monkeypatch.setattr(model_output, "_draw", lambda *_: [])
     for words, times in (((), 1), (("--no-doctor",), 0)):

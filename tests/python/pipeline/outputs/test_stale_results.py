@@ -13,7 +13,7 @@ import cmfsim
 import cmfsim.pipeline.building
 import cmfsim.pipeline.predicting
 from cmfsim.cli import main
-from cmfsim.cli.research.study_commands import _plan_text
+from cmfsim.cli.study_commands import _plan_text
 from cmfsim.io import finish_writing, read_parts
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.results.metrics import read_evaluation

@@ -10,7 +10,7 @@ import pytest
 import cmfsim
 import cmfsim.planning.page.content
 from cmfsim.cli import main
-from cmfsim.cli.patients.plan_command import _correction_text
+from cmfsim.cli.plan_command import _correction_text
 from cmfsim.planning.occlusion import patient_rows
 from cmfsim.planning.replanning import plan_distance
 from cmfsim.planning.replanning.corrected import chosen_plans

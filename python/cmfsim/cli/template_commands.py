@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli import BAD_INPUT, DONE
-from cmfsim.cli.patients.case_commands import print_findings
+from cmfsim.cli.case_commands import print_findings
 from cmfsim.cli.terminal import StageProgress, escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.muscles.template import (

@@ -1,4 +1,4 @@
-"""VTK's XML files of surfaces (`.vtp`) and volumes (`.vtu`), read; `vtk` writes them.
+"""VTK's XML files of surfaces (`.vtp`) and volumes (`.vtu`), read; `vtk_writing` writes them.
 
 VTK's own reader takes the process down for some damaged files and goes on with what is there for
 others. Here every array must have the length that the counts of its piece ask for.
@@ -18,9 +18,15 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.io.files.reading_writing import walk_xml
 from cmfsim.io.files.texts import real_numbers, whole_numbers
-from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, cells_by_type, stated_in_field
-from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
-from cmfsim.io.meshes.vtk.writing import UNPACKERS
+from cmfsim.io.meshes.plain_mesh import (
+    Cells,
+    PlainMesh,
+    cells_by_type,
+    stated_in_field,
+    triangles_of,
+    triangles_of_strips,
+)
+from cmfsim.io.meshes.vtk_writing import UNPACKERS
 
 # Nested elements and all elements that a file may have; VTK nests eight.
 MAX_DEPTH, MAX_ELEMENTS = 32, 100_000

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.errors import ImageInputError
-from cmfsim.io.images.dicom.headers import (
+from cmfsim.io.images.dicom_headers import (
     DicomHeader,
     counted,
     dicom_header,
@@ -18,7 +18,7 @@ from cmfsim.io.images.dicom.headers import (
     listed,
     slices_of,
 )
-from cmfsim.io.images.dicom.stack import volume_of
+from cmfsim.io.images.dicom_stack import volume_of
 from cmfsim.io.images.image_headers import check_shape
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData

@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io.files.reading_writing import utf8_path
-from cmfsim.io.meshes.plain_mesh import Cells, PlainMesh, cells_by_type, stated_frame
-from cmfsim.io.meshes.polygons import triangles_of, triangles_of_strips
+from cmfsim.io.meshes.plain_mesh import (
+    Cells,
+    PlainMesh,
+    cells_by_type,
+    stated_frame,
+    triangles_of,
+    triangles_of_strips,
+)
 from cmfsim.processes.child import ReaderError, read_in_child
 from cmfsim.processes.worker import Answer, ReadLimits
 
@@ -73,7 +79,7 @@ def read_vtk_legacy(path: Path) -> PlainMesh:
     limits = ReadLimits(SECONDS + len(data) / 2e6, MEMORY + 64 * len(data))
     try:
         with utf8_path(path) as plain:
-            task = "cmfsim.io.meshes.vtk.legacy:legacy_answer"
+            task = "cmfsim.io.meshes.vtk_legacy:legacy_answer"
             answer = read_in_child(task, limits, path=plain, reader=READERS[kind])
     except ReaderError as error:
         raise CaseInputError(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.io.files.reading_writing import utf8_path
-from cmfsim.io.images.dicom.headers import (
+from cmfsim.io.images.dicom_headers import (
     SHOWN_INVERTED,
     DicomHeader,
     Slice,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim.cli import DONE, FAILED
-from cmfsim.cli.patients.case_commands import band_options, case_of, checked
+from cmfsim.cli.case_commands import band_options, case_of, checked
 from cmfsim.cli.terminal import Notices, StageProgress, escaped
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing

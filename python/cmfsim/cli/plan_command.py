@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.cli import DONE
-from cmfsim.cli.patients.case_commands import band_options, case_of, checked
+from cmfsim.cli.case_commands import band_options, case_of, checked
 from cmfsim.cli.terminal import StageProgress, can_open, escaped, open_page
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface, write_plan, write_surface

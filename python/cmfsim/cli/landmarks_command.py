@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli import DONE
-from cmfsim.cli.patients.case_commands import print_findings
+from cmfsim.cli.case_commands import print_findings
 from cmfsim.cli.terminal import StageProgress, escaped, open_page
 from cmfsim.errors import CmfsimError, LandmarkError
 from cmfsim.io import Case

@@ -1,1 +1,0 @@
-"""Commands for one patient: case, landmarks, plan, prediction, pictures."""

@@ -1,1 +1,0 @@
-"""Commands that study methods: benches, benchmark, cohorts, virtual patients."""

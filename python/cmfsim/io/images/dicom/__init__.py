@@ -1,1 +1,0 @@
-"""DICOM: headers, slices, and the series that they make up."""

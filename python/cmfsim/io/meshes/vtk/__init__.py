@@ -1,1 +1,0 @@
-"""The VTK formats: legacy and XML, read and written."""
