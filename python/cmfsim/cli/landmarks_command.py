@@ -28,7 +28,6 @@ from cmfsim.pipeline.proposing import (
     proposed_head,
     unproposed_head,
 )
-from cmfsim.planning.landmark_page import LandmarkContent
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import short_name
@@ -58,7 +57,11 @@ def landmarks(options: argparse.Namespace) -> int:
         written, unwritten = _write(case.output, replace(head, landmarks=found), options.names)
         if options.page:
             progress.stage("making the page")
-            size = write_landmark_page(case.output / PAGE_FILE, _page(case, head))
+            # With what a person has placed in the case's files.
+            given = read_placed_sites(case)
+            placed = {key: (at, state) for key, (at, state) in given.items() if state.by_person}
+            content = head_content(case.name, head, placed)
+            size = write_landmark_page(case.output / PAGE_FILE, content)
             written.append(PAGE_FILE)
     findings = (*noticed, *head.findings, *found.findings, *unwritten)
     report = {
@@ -94,13 +97,6 @@ def _head(
         return unproposed_head(anatomy, str(error))
 
 
-def _page(case: Case, head: ProposedHead) -> LandmarkContent:
-    """The content of the page, with what a person has placed in the case's files."""
-    given = read_placed_sites(case)
-    placed = {key: (point, state) for key, (point, state) in given.items() if state.by_person}
-    return head_content(case.name, head, placed)
-
-
 def _write(folder: Path, head: ProposedHead, labels: str) -> tuple[list[str], tuple[Finding, ...]]:
     """The names of the files written, and the findings."""
     found = head.landmarks
@@ -113,23 +109,16 @@ def _write(folder: Path, head: ProposedHead, labels: str) -> tuple[list[str], tu
             points = {label[name]: site.point for name, site in sites.items()}
             write_landmarks(folder / FILES[kind], points, descriptions=texts)
             names.append(FILES[kind])
-    doubtful = {
-        kind: [name for name, site in sites.items() if site.doubt]
-        for kind, sites in (("skull", found.skull), ("skin", found.skin))
-    }
+    kinds = {"skull": found.skull, "skin": found.skin}
+    doubtful = {kind: [n for n, site in own.items() if site.doubt] for kind, own in kinds.items()}
     if not found.skull and not found.skin:
         return names, ()
     try:
         picture_landmarks(folder / PICTURE, head.bones, head.skin, found.points, doubtful=doubtful)
         names.append(PICTURE)
     except CmfsimError as error:
-        findings.append(
-            Finding(
-                "landmarks-no-picture",
-                f"the picture was not drawn: {error}",
-                where=str(folder / PICTURE),
-            )
-        )
+        what, where = f"the picture was not drawn: {error}", str(folder / PICTURE)
+        findings.append(Finding("landmarks-no-picture", what, where=where))
     return names, tuple(findings)
 
 

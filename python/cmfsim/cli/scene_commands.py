@@ -51,9 +51,11 @@ def solve(options: argparse.Namespace) -> int:
         f"(error {summary['error_estimate']:.2e} mm, estimated)"
     )
     if len(result.contact_nodes):
+        gap = summary["contact_gap"]
+        gap = "unknown" if gap is None else f"{gap:.2e}"
         print(
-            f"contact       {len(result.contact_nodes)} nodes, largest gap "
-            f"{_number(summary['contact_gap'])} mm, {summary['contact_iterations']} iterations"
+            f"contact       {len(result.contact_nodes)} nodes, largest gap {gap} mm, "
+            f"{summary['contact_iterations']} iterations"
         )
     print(f"displacement  {size.max():.3f} mm at most, {size.mean():.3f} mm on average")
     print(f"time          {seconds:.3f} s")
@@ -74,11 +76,8 @@ def _check_output(output: Path, scene: Path) -> None:
 
 
 def _with_overrides(scene: Scene, options: argparse.Namespace) -> Scene:
-    given = {
-        name: getattr(options, name)
-        for name in ("method", "contact", "tolerance")
-        if getattr(options, name) is not None
-    }
+    words = {name: getattr(options, name) for name in ("method", "contact", "tolerance")}
+    given = {name: value for name, value in words.items() if value is not None}
     changes: dict[str, Any] = {}
     if given:
         changes["options"] = dataclasses.replace(scene.options, **given)
@@ -101,22 +100,18 @@ def info(options: argparse.Namespace) -> int:
             name: {"joined": int(np.size(s.joined)), "sliding": int(np.size(s.sliding))}
             for name, s in scene.segments.items()
         }
-        print(
-            json.dumps(
-                {
-                    "sha256": scene.sha256(),
-                    "n_nodes": scene.n_nodes,
-                    "n_tets": scene.n_tets,
-                    "n_fixed": int(np.size(scene.fixed)),
-                    "lowest": nodes.min(axis=0).tolist() if len(nodes) else None,
-                    "highest": nodes.max(axis=0).tolist() if len(nodes) else None,
-                    "tissue": scene.header()["tissue"],
-                    "segments": counts,
-                    "solver": scene.options.header(),
-                },
-                allow_nan=False,
-            )
-        )
+        answer = {
+            "sha256": scene.sha256(),
+            "n_nodes": scene.n_nodes,
+            "n_tets": scene.n_tets,
+            "n_fixed": int(np.size(scene.fixed)),
+            "lowest": nodes.min(axis=0).tolist() if len(nodes) else None,
+            "highest": nodes.max(axis=0).tolist() if len(nodes) else None,
+            "tissue": scene.header()["tissue"],
+            "segments": counts,
+            "solver": scene.options.header(),
+        }
+        print(json.dumps(answer, allow_nan=False))
         return DONE
     print(f"mesh      {scene.n_nodes} nodes, {scene.n_tets} tets")
     if len(nodes):
@@ -133,10 +128,6 @@ def info(options: argparse.Namespace) -> int:
     print(f"solver    {scene.options.method}, {scene.options.contact} contact")
     print(f"sha256    {scene.sha256()}")
     return DONE
-
-
-def _number(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2e}"
 
 
 DEMO_FOLDER = Path("cmfsim-demo")
@@ -161,13 +152,8 @@ def demo(options: argparse.Namespace) -> int:
     page = made.case.output / name
     seconds = time.perf_counter() - begun
     if options.json:
-        answer = {
-            "case": str(made.case.file),
-            "report": str(page),
-            "seconds": seconds,
-            "findings": notices.as_dicts(),
-        }
-        print(json.dumps(answer, allow_nan=False))
+        answer = {"case": str(made.case.file), "report": str(page), "seconds": seconds}
+        print(json.dumps({**answer, "findings": notices.as_dicts()}, allow_nan=False))
         return DONE
     print(f"case    {escaped(str(made.case.file))}")
     for finding in notices.findings:

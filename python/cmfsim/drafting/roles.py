@@ -101,13 +101,7 @@ class NameRole:
 
 
 def name_role(name: str) -> NameRole:
-    """The meaning of a file's name without its ending, or of the name of a node.
-
-    Examples
-    --------
-    >>> name_role("Maxilla_postOp").part, name_role("Maxilla_postOp").is_after
-    ('maxilla', True)
-    """
+    """The meaning of a file's name without its ending, or of the name of a node."""
     letters = unicodedata.normalize("NFKD", name.translate(UMLAUTS))
     plain = "".join(c for c in letters if not unicodedata.combining(c))
     words = [word.lower() for word in WORDS.findall(re.sub(r"[&+]", " and ", plain))]

@@ -7,7 +7,6 @@ known better than its voxels and cutting a bone by a plane is a minimum of two n
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from cmfsim.values.checks import (
     as_text,
     check_instance,
     check_one_of,
+    keep,
 )
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
@@ -67,8 +67,7 @@ class Anatomy(Frozen):
             )
             if not same:
                 raise CaseInputError(f"{name} is not on the same grid as the skin")
-        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
-        object.__setattr__(self, "surfaces", MappingProxyType(dict(self.surfaces)))
+        keep(self, bones=self.bones, surfaces=self.surfaces)
 
 
 @dataclass(frozen=True, eq=False)

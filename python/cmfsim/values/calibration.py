@@ -10,13 +10,12 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from cmfsim.errors import CalibrationError
-from cmfsim.values.checks import Floats, as_number, as_positive, as_text, check_one_of
+from cmfsim.values.checks import Floats, as_number, as_positive, as_text, check_one_of, keep
 from cmfsim.values.solver_options import MODELS
 
 
@@ -184,7 +183,7 @@ class CalibrationCase:
                     f"score of {region!r} in case {self.case!r} is {value!r}: a finite number "
                     "from 0 on is needed; omit regions that were not compared"
                 )
-        object.__setattr__(self, "scores", MappingProxyType(dict(self.scores)))
+        keep(self, scores=self.scores)
 
 
 @dataclass(frozen=True)
@@ -231,8 +230,7 @@ class Calibration:
             raise CalibrationError(f"coverage is {self.coverage!r}: it must be above 0 and below 1")
         # As a file gives them back: tuples are lists.
         settings = json.loads(json.dumps(dict(self.settings)))
-        object.__setattr__(self, "settings", MappingProxyType(settings))
-        object.__setattr__(self, "digest", settings_digest(self.settings))
+        keep(self, settings=settings, digest=settings_digest(settings))
 
     @property
     def regions(self) -> tuple[str, ...]:

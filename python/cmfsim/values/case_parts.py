@@ -108,8 +108,11 @@ class Plane(checks.Frozen):
     normal: checks.Floats
 
     def __init__(self, point: ArrayLike, normal: ArrayLike) -> None:
-        object.__setattr__(self, "point", checks.as_point("plane point", point))
-        object.__setattr__(self, "normal", checks.as_direction("plane normal", normal))
+        place, unit = (
+            checks.as_point("plane point", point),
+            checks.as_direction("plane normal", normal),
+        )
+        checks.keep(self, point=place, normal=unit)
 
     def distance(self, points: ArrayLike) -> checks.Floats:
         """The signed distances of (n, 3) points from the plane, mm: positive along its normal."""
@@ -199,7 +202,7 @@ class CaseSurfaces:
         checks.check_one_of("units", self.units, tuple(UNITS))
         if self.frame is not None:
             checks.check_one_of("frame", self.frame, FRAMES)
-        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
+        checks.keep(self, bones=self.bones)
 
 
 # With fewer landmarks of the skull than this, the others are found where the case needs them.
@@ -316,7 +319,7 @@ class CaseOsteotomy:
         else:
             checks.as_text("bone", self.bone)
             checks.as_text("name", self.name)
-        object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
+        checks.keep(self, options=self.options)
 
     @property
     def segments(self) -> tuple[str, ...]:
@@ -463,4 +466,4 @@ class CasePostoperative:
         checks.check_one_of("units", self.units, tuple(UNITS))
         if self.frame is not None:
             checks.check_one_of("frame", self.frame, FRAMES)
-        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
+        checks.keep(self, bones=self.bones)

@@ -31,6 +31,13 @@ class Frozen:
             object.__setattr__(self, name, _read_only(value))
 
 
+def keep(value: object, **made: Any) -> None:
+    """Gives a frozen value its fields, as its constructor makes them; mappings become read-only."""
+    for name, entry in made.items():
+        read_only = MappingProxyType(dict(entry)) if isinstance(entry, Mapping) else entry
+        object.__setattr__(value, name, read_only)
+
+
 def listing(title: str, rows: Mapping[str, str]) -> str:
     """What a value shows of itself: a title, and a line for each row that has a text."""
     shown = {name: text for name, text in rows.items() if text}

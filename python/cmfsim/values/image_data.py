@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, Frozen, as_point, as_rows, as_unmasked
+from cmfsim.values.checks import Floats, Frozen, as_point, as_rows, as_unmasked, keep
 
 # Points that are looked up at a time.
 AT_A_TIME = 8192
@@ -55,9 +55,7 @@ class ImageData(Frozen):
         steps = as_point("image spacing", spacing)
         if (steps <= 0.0).any():
             raise CaseInputError(f"image spacing is {steps.tolist()} mm: must be above 0")
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "spacing", steps)
-        object.__setattr__(self, "origin", as_point("image origin", origin))
+        keep(self, values=values, spacing=steps, origin=as_point("image origin", origin))
 
     @property
     def lowest(self) -> Floats:

@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 from cmfsim._core import Tissue
 from cmfsim.errors import MaterialError, MaterialInputError
-from cmfsim.values.checks import as_number, as_text, check_instance
+from cmfsim.values.checks import as_number, as_text, check_instance, keep
 from cmfsim.values.finding import Finding
 from cmfsim.values.tissue_data import TissueData
 
@@ -213,7 +213,7 @@ class TissueModuli:
         for name, moduli in self.muscles.items():
             as_text("muscle name", name)
             check_instance(f"moduli of {name}", moduli, MuscleModuli)
-        object.__setattr__(self, "muscles", MappingProxyType(dict(self.muscles)))
+        keep(self, muscles=self.muscles)
 
     def resolved(self, preset: str) -> "TissueModuli":
         """The same without gaps: each None replaced, from `muscle` and then from the preset.

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim._core import MOST_BOXES, MuscleFibres
 from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.values import checks
 from cmfsim.values.checks import Floats, Frozen, as_rows, as_text, check_instance, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData
@@ -125,8 +126,7 @@ class Musculature:
             if muscle.name in seen:
                 raise CaseInputError(f"muscles[{i}] is a second {muscle.name!r}: names must differ")
             seen.add(muscle.name)
-        object.__setattr__(self, "muscles", muscles)
-        object.__setattr__(self, "findings", tuple(self.findings))
+        checks.keep(self, muscles=muscles, findings=tuple(self.findings))
 
     def __len__(self) -> int:
         """The number of muscles."""
@@ -191,11 +191,9 @@ class TemplateData(Frozen):
                     f"muscles {other!r} and {muscle.name!r} differ only in capitals, which some "
                     "file systems do not distinguish"
                 )
-        object.__setattr__(self, "muscles", muscles)
-        object.__setattr__(self, "landmarks", as_landmarks(self.landmarks))
-        for name in ("definitions", "concepts"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-        object.__setattr__(self, "findings", tuple(self.findings))
+        checks.keep(self, muscles=muscles, landmarks=as_landmarks(self.landmarks))
+        checks.keep(self, definitions=self.definitions, concepts=self.concepts)
+        checks.keep(self, findings=tuple(self.findings))
 
     @property
     def musculature(self) -> Musculature:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Frozen, check_one_of, frozen
+from cmfsim.values.checks import Frozen, check_one_of, frozen, keep
 
 # Kinds of node (paper 2.5), by the number that files hold.
 NODE_KINDS = ("free", "fixed", "joined", "sliding")
@@ -38,8 +38,7 @@ class NodeKinds(Frozen):
         bad = np.flatnonzero((kind > 3) | ((kind >= 2) & (segment < 0)))
         if len(bad) or (segment >= len(self.segments)).any():
             raise CaseInputError("kind is 0 to 3, and joined and sliding nodes need a segment")
-        object.__setattr__(self, "kind", frozen(kind))
-        object.__setattr__(self, "segment", frozen(segment))
+        keep(self, kind=frozen(kind), segment=frozen(segment))
 
     def of_nodes(self, nodes: NDArray[np.integer]) -> "NodeKinds":
         """The kinds of some nodes, in their order: of the mesh that has only these."""

@@ -71,10 +71,7 @@ class LiftedTissue(Frozen):
         moves. At the border between both the motion is along the bone, so that a node that changes
         sides changes little.
 
-        Parameters
-        ----------
-        plan : mapping of str to (4, 4) float64, mm, (j, 3) float64, mm, or MovedSurface
-            As in `Scene.plan`; what it does not name stays.
+        plan: As in `Scene.plan`; what it does not name stays.
         """
         moves = np.zeros_like(self.places)
         for number, name in enumerate(self.pieces):
@@ -92,13 +89,9 @@ class LiftedTissue(Frozen):
     ) -> tuple[Indices, dict[str, SegmentData]]:
         """The fixed nodes and the segments of a scene under a plan, without the nodes it frees.
 
-        Parameters
-        ----------
-        fixed : (f,) uint32
-            Fixed nodes of the scene; whether lifted ones are among them does not matter.
-        segments : mapping of str to SegmentData
-            Of the scene; the same is true of what is joined to them.
-        plan : as for `free`
+        fixed: (f,). Fixed nodes of the scene; whether lifted ones are among them does not matter.
+        segments: Of the scene; the same is true of what is joined to them.
+        plan: As for `free`.
         """
         made = dict(segments)
         if not self.is_joined:

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import AnyPath, Floats, Frozen, check_one_of, listing
+from cmfsim.values.checks import AnyPath, Floats, Frozen, check_one_of, keep, listing
 from cmfsim.values.finding import Finding, counted_findings
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import no_progress
@@ -66,7 +65,7 @@ class Prediction(Frozen):
 
     def __post_init__(self) -> None:
         check_one_of("model", self.model, MODELS)
-        object.__setattr__(self, "summary", MappingProxyType(dict(self.summary)))
+        keep(self, summary=self.summary)
 
     def __repr__(self) -> str:
         """Patient, plan, how far the skin moves, how it was solved and what was found."""

@@ -63,21 +63,18 @@ class SegmentData(checks.Frozen):
         contact: SurfaceData | None = None,
         gap: ArrayLike | str = 0.0,
     ) -> None:
-        object.__setattr__(self, "joined", checks.as_indices("joined", joined))
-        object.__setattr__(self, "sliding", checks.as_indices("sliding", sliding))
+        held, slides = checks.as_indices("joined", joined), checks.as_indices("sliding", sliding)
         if contact is not None:
             checks.check_instance("contact", contact, SurfaceData)
-        object.__setattr__(self, "contact", contact)
         if isinstance(gap, str):
             checks.check_one_of("gap", gap, ("rest",))
         else:
             gap = checks.frozen(checks.as_floats("gap", gap))
-            if gap.shape not in {(), (len(self.sliding),)}:
+            if gap.shape not in {(), (len(slides),)}:
                 raise CaseInputError(
-                    f"gap has shape {gap.shape}: one number or {len(self.sliding)} "
-                    "(one per sliding node)"
+                    f"gap has shape {gap.shape}: one number or {len(slides)} (one per sliding node)"
                 )
-        object.__setattr__(self, "gap", gap)
+        checks.keep(self, joined=held, sliding=slides, contact=contact, gap=gap)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +153,9 @@ class Scene(checks.Frozen):
         touching: Iterable[TouchingData] = (),
         obstacles: Iterable[ObstacleData] = (),
     ) -> None:
-        keep = partial(object.__setattr__, self)
-        keep("nodes", checks.as_rows("nodes", nodes, 3))
-        keep("tets", checks.as_index_rows("tets", tets, 4, self.n_nodes, "nodes"))
-        keep("fixed", checks.as_indices("fixed", fixed, self.n_nodes))
+        places = checks.as_rows("nodes", nodes, 3)
+        corners = checks.as_index_rows("tets", tets, 4, len(places), "nodes")
+        held = checks.as_indices("fixed", fixed, len(places))
         for name, value, kind in (
             ("tissue", tissue, TissueData),
             ("segments", segments, Mapping),
@@ -167,20 +163,17 @@ class Scene(checks.Frozen):
             ("options", options, SolverOptions),
         ):
             checks.check_instance(name, value, kind)
-        keep("tissue", tissue)
-        keep("segments", MappingProxyType(dict(segments)))
-        keep("options", options)
+        keep = partial(checks.keep, self)
+        keep(nodes=places, tets=corners, fixed=held)
+        keep(tissue=tissue, segments=segments, options=options)
         self._check_parts()
         if loads is not None:
             loads = checks.as_rows("loads", loads, 3)
             if len(loads) != self.n_nodes:
                 raise CaseInputError(f"loads has {len(loads)} rows for {self.n_nodes} nodes")
-        keep("loads", loads)
         checks.check_one_of("conflicts", conflicts, CONFLICTS)
-        keep("conflicts", conflicts)
-        keep("plan", MappingProxyType(self._checked_plan(plan)))
-        keep("touching", tuple(touching))
-        keep("obstacles", tuple(obstacles))
+        keep(loads=loads, conflicts=conflicts, plan=self._checked_plan(plan))
+        keep(touching=tuple(touching), obstacles=tuple(obstacles))
         self._check_contact()
 
     def _check_parts(self) -> None:

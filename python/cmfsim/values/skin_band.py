@@ -47,13 +47,7 @@ class BandOptions:
             )
 
     def check(self, models: Sequence[str]) -> None:
-        """Refuses a calibration that is not for these models or this coverage.
-
-        Raises
-        ------
-        CalibrationError
-            (also `ValueError`)
-        """
+        """Refuses, by a `CalibrationError`, a calibration of other models or another coverage."""
         found = self.calibration
         if found is None:
             return

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, Frozen, Indices, as_index_rows, as_number, as_rows
+from cmfsim.values.checks import Floats, Frozen, Indices, as_index_rows, as_number, as_rows, keep
 
 
 def used_nodes(cells: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -20,14 +20,6 @@ def used_nodes(cells: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64
         negative.
     Returns `nodes`: (k,) int64. Rows to keep of whatever is stored by node.
     Returns `cells`: as `cells`, int64. Indices into `nodes`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from cmfsim.values.surface_data import used_nodes
-    >>> nodes, triangles = used_nodes(np.array([[7, 2, 4], [4, 2, 9]]))
-    >>> nodes.tolist(), triangles.tolist()
-    ([2, 4, 7, 9], [[2, 0, 1], [1, 0, 3]])
     """
     used = np.zeros(int(cells.max(initial=0)) + 1, dtype=bool)
     used[cells] = True
@@ -63,9 +55,8 @@ class SurfaceData(Frozen):
     ) -> None:
         places = as_rows("surface vertices", vertices, 3)
         corners = as_index_rows("surface triangles", triangles, 3, len(places), "vertices")
-        object.__setattr__(self, "vertices", places)
-        object.__setattr__(self, "triangles", corners)
-        object.__setattr__(self, "crease_angle", as_number("crease_angle", crease_angle))
+        crease_angle = as_number("crease_angle", crease_angle)
+        keep(self, vertices=places, triangles=corners, crease_angle=crease_angle)
 
     @cached_property
     def searched(self) -> Surface:
@@ -116,5 +107,4 @@ class MovedSurface(Frozen):
             raise CaseInputError(
                 f"moved_vertices has {len(moved)} rows, but the surface has {count} vertices"
             )
-        object.__setattr__(self, "surface", surface)
-        object.__setattr__(self, "moved_vertices", moved)
+        keep(self, surface=surface, moved_vertices=moved)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,11 +33,9 @@ class LipRegion(checks.Frozen):
     released: Mapping[str, NDArray[np.uint32]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("triangles", "nodes"):
-            object.__setattr__(
-                self, name, checks.frozen(np.asarray(getattr(self, name), np.uint32))
-            )
-        object.__setattr__(self, "released", MappingProxyType(dict(self.released)))
+        triangles, nodes = (np.asarray(part, np.uint32) for part in (self.triangles, self.nodes))
+        made = {"triangles": checks.frozen(triangles), "nodes": checks.frozen(nodes)}
+        checks.keep(self, **made, released=self.released)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +66,7 @@ class TouchingData(checks.Frozen):
         given = np.asarray(triangles)
         count = 1 + int(given.max(initial=0)) if given.dtype.kind in "iu" else 0
         corners = checks.as_index_rows("triangles that are touched", given, 3, count, "nodes")
-        object.__setattr__(self, "nodes", touching)
-        object.__setattr__(self, "triangles", corners)
+        checks.keep(self, nodes=touching, triangles=corners)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +99,5 @@ class ObstacleData(checks.Frozen):
     def __init__(self, nodes: ArrayLike, segment: str, surface: SurfaceData) -> None:
         checks.as_text("segment of an obstacle", segment)
         checks.check_instance("surface of an obstacle", surface, SurfaceData)
-        object.__setattr__(self, "nodes", checks.as_indices("nodes before an obstacle", nodes))
-        object.__setattr__(self, "segment", segment)
-        object.__setattr__(self, "surface", surface)
+        held = checks.as_indices("nodes before an obstacle", nodes)
+        checks.keep(self, nodes=held, segment=segment, surface=surface)

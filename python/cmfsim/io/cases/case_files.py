@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from cmfsim.errors import CaseInputError
@@ -16,7 +15,7 @@ from cmfsim.io.cases.case_plans import is_achieved, osteotomies_of, plan_of
 from cmfsim.io.cases.tables import CaseChanges, Table, read_tables
 from cmfsim.io.files.reading_writing import is_there
 from cmfsim.values import case_parts
-from cmfsim.values.checks import AnyPath, as_text, listing
+from cmfsim.values.checks import AnyPath, as_text, keep, listing
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.tissue_data import TissueData
 
@@ -104,8 +103,7 @@ class Case:
             raise CaseInputError("a case has either an image or surfaces")
         if self.achieved and self.plan:
             raise CaseInputError("a plan is either given or achieved, not both")
-        for name in ("plan", "node_kinds", "places"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        keep(self, plan=self.plan, node_kinds=self.node_kinds, places=self.places)
 
     def __repr__(self) -> str:
         """File, inputs, cuts, plan and muscles."""

@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NoReturn, TypeVar, get_type_hints
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.files import reading_writing
 from cmfsim.io.files.texts import KeyPath, line_of, toml_lines
-from cmfsim.values.checks import Floats, nearest
+from cmfsim.values.checks import Floats, keep, nearest
 
 # A case file above this size is not what it says it is, bytes.
 MAX_CASE_TEXT = 2**20
@@ -60,8 +59,7 @@ class CaseChanges:
 
     def __post_init__(self) -> None:
         lines = self.lines or dict.fromkeys(_paths(self.values, ()), 1)
-        for name, table in (("values", self.values), ("lines", lines)):
-            object.__setattr__(self, name, MappingProxyType(dict(table)))
+        keep(self, values=self.values, lines=lines)
 
     def as_json(self) -> str:
         """The changes as a text that travels to another process."""

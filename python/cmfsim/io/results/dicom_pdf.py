@@ -21,15 +21,9 @@ def write_dicom_pdf(path: Path, pdf: bytes, source: Path, title: str) -> None:
     """Writes a PDF as a DICOM file of its own series in the study of a CT.
 
     source: The folder of the CT's series, or one file of it.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) pydicom is not installed.
-    ImageError
-        (also `ValueError`) No DICOM, or that of several patients or studies.
-    OSError
-        A file cannot be read or written.
+    Raises `CaseError`: pydicom is not installed.
+    Raises `ImageError`: No DICOM, or that of several patients or studies.
+    Raises `OSError`: A file cannot be read or written.
     """
     pydicom = third_party("pydicom", "DICOM is written", "imaging")
     uid = third_party("pydicom.uid", "DICOM is written", "imaging")

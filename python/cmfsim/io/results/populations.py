@@ -5,12 +5,11 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from cmfsim.io.files.reading_writing import FORMAT_VERSION, check_readable, named, replacing
 from cmfsim.io.files.summaries import Closed, Maybe, Shape, Span, check, plain_json
-from cmfsim.values.checks import AnyPath, check_one_of
+from cmfsim.values.checks import AnyPath, check_one_of, keep
 
 POPULATION_FILE = "population.json"
 FORMAT = "cmfsim-population"
@@ -79,8 +78,7 @@ class Population:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("patients", "settings"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        keep(self, patients=self.patients, settings=self.settings)
 
     def named(self, state: str, *parts: str) -> tuple[str, ...]:
         """The names of the patients in a state, of some parts or, without, of all."""
