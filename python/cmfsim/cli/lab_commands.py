@@ -15,7 +15,6 @@ from cmfsim.lab.benchmark import run_benchmark
 from cmfsim.lab.frontier import (
     FACTORS,
     WHOLE,
-    Choice,
     Frontier,
     case_choice,
     reference_choice,
@@ -46,7 +45,9 @@ def frontier(options: argparse.Namespace) -> int:
                 progress.stage("making a head and imaging it")
                 write_phantom_case(path.parent, make_head(), spacing=PHANTOM_SPACING)
         case = Case.load(path)
-        base = _base_choice(case, options)
+        words = {"edge_length": options.edge_length, "model": options.model}
+        given = {name: value for name, value in words.items() if value is not None}
+        base = replace(case_choice(case), **given)
         choices = sweep_choices(
             base,
             edges=options.edges,
@@ -80,13 +81,6 @@ def frontier(options: argparse.Namespace) -> int:
         print(_frontier_text(found))
         print(f"written  {escaped(str(options.output))}: {', '.join(names)}")
     return DONE
-
-
-def _base_choice(case: Case, options: argparse.Namespace) -> Choice:
-    """The case's own choice, with the changes given on the command line."""
-    own = case_choice(case)
-    words = {"edge_length": options.edge_length, "model": options.model}
-    return replace(own, **{name: value for name, value in words.items() if value is not None})
 
 
 def _frontier_text(found: Frontier) -> str:

@@ -173,9 +173,11 @@ def choose_images(found: Sequence[ImageFind]) -> Images:
     images = Images()
     before: list[ImageFind] = []
     for find in found:
-        other = _no_ct(find)
-        if other:
-            images.taken.append(Taken(find.label, "not used", other))
+        why = f"cannot be read: {find.error}" if find.error else ""
+        if not why and find.modality not in {"", "CT"}:
+            why = f"its header says {find.modality}, which is not a CT"
+        if why:
+            images.taken.append(Taken(find.label, "not used", why))
         elif not find.role.is_after:
             before.append(find)
         elif images.after is None:
@@ -200,15 +202,6 @@ def _choice(find: ImageFind) -> str:
     path = find.label.removesuffix(f" (series {find.series})")
     series = "" if find.series is None else f' with series = "{find.series}" on a line of its own'
     return f'"{path}"{series}: {_said(find)}'
-
-
-def _no_ct(find: ImageFind) -> str:
-    """Why an image is no CT of the case; empty if it may be."""
-    if find.error:
-        return f"cannot be read: {find.error}"
-    if find.modality not in {"", "CT"}:
-        return f"its header says {find.modality}, which is not a CT"
-    return ""
 
 
 def _check_values(images: Images, find: ImageFind) -> None:

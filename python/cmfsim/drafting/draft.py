@@ -34,7 +34,6 @@ from cmfsim.drafting.written import (
     unaccounted,
 )
 from cmfsim.values.case_parts import PROCEDURES
-from cmfsim.values.checks import Floats
 from cmfsim.values.proposed_landmarks import ProposedSite
 
 # Middles of the skins before and after that are farther apart are those of two scans, mm.
@@ -140,7 +139,13 @@ def draft_case(
     _write_cuts(draft, typed.cuts)
     if not achieved:
         _write_plan(draft, typed.cuts)
-    _write_muscles(draft)
+    given = draft.marks.skin is not None or draft.marks.questions
+    if draft.marks.skull is None and (given or not _shows_skull(draft)):
+        text.lines.append("")
+        text.comment("Muscles are placed from landmarks of the skull: name their file, and add")
+        text.comment("an empty [muscles]. Landmarks are found only where none are given.")
+    else:
+        text.table("muscles", "the built-in template, placed by the skull landmarks")
     _write_after(draft)
     text.table("output")
     text.value("folder", '"out"')
@@ -173,9 +178,12 @@ def _decide(found: Gathered, unpacked: Path) -> Draft:
     ]
     anatomy = choose_surfaces(found.surfaces, boxes)
     by_image = images.is_there and not (
-        anatomy.is_complete and (anatomy.skin is not None) and _is_cut(anatomy)
+        anatomy.is_complete and anatomy.skin is not None and _is_cut(anatomy)
     )
-    box = boxes[0][1] if boxes and images.ct is not None else _box_of(anatomy)
+    box = boxes[0][1] if boxes and images.ct is not None else None
+    if box is None and anatomy.chosen:
+        points = np.concatenate([anatomy.placed(find) for find in anatomy.chosen])
+        box = np.stack([points.min(axis=0), points.max(axis=0)])
     marks = choose_landmarks(found.landmarks, box)
     reference = np.eye(4)
     if by_image and images.ct is not None:
@@ -195,13 +203,6 @@ def _is_cut(anatomy: Anatomy) -> bool:
     """Whether the surfaces say more than a CT: pieces that are cut already, or that move."""
     pieces = set(anatomy.bones) - {"cranium", "mandible"}
     return bool(pieces) or any(find.is_moved for find in anatomy.bones.values())
-
-
-def _box_of(anatomy: Anatomy) -> Floats | None:
-    if not anatomy.chosen:
-        return None
-    points = np.concatenate([anatomy.placed(find) for find in anatomy.chosen])
-    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _taken(draft: Draft) -> list[Taken]:
@@ -394,17 +395,6 @@ def _write_motion(text: Text, name: str, motion: motions.DraftMotion) -> None:
         text.matrix(motion.matrix.tolist(), lead)
     elif motion.transform and not motion.question:
         text.value("transform", motion.transform)
-
-
-def _write_muscles(draft: Draft) -> None:
-    text = draft.text
-    given = draft.marks.skin is not None or draft.marks.questions
-    if draft.marks.skull is None and (given or not _shows_skull(draft)):
-        text.lines.append("")
-        text.comment("Muscles are placed from landmarks of the skull: name their file, and add")
-        text.comment("an empty [muscles]. Landmarks are found only where none are given.")
-        return
-    text.table("muscles", "the built-in template, placed by the skull landmarks")
 
 
 def _write_place_after(draft: Draft) -> str | None:

@@ -57,24 +57,20 @@ def gather(
         ]
     else:
         _gather_files(found, paths, progress)
-    _gather_landmarks(found, rest(paths.markups))
+    # Landmarks of a scene come before those of files.
+    has_marks = bool(found.landmarks)
+    for path in rest(paths.markups):
+        if has_marks and not name_role(path.name).is_after:
+            why = f"the scene {found.scene} has landmarks of its own"
+            found.others.append(finds.OtherFind(found.shown(path), why))
+        else:
+            _read(found, path, finds.landmark_find, found.landmarks)
     # A folder of DICOM is named last where it is the case's own: it holds all else as well.
     files = [(path, None) for path in rest(paths.images)]
     places = sorted(paths.dicom, key=lambda place: place[0] == folder)
     _gather_images(found, [*files, *places], progress)
     found.by_slicer = bool(found.scene) or any(map(_by_slicer, (*paths.surfaces, *paths.labels)))
     return found
-
-
-def _gather_landmarks(found: finds.Gathered, paths: list[Path]) -> None:
-    """Adds the landmarks of files; those of a scene come before them."""
-    has_marks = bool(found.landmarks)
-    for path in paths:
-        if has_marks and not name_role(path.name).is_after:
-            why = f"the scene {found.scene} has landmarks of its own"
-            found.others.append(finds.OtherFind(found.shown(path), why))
-        else:
-            _read(found, path, finds.landmark_find, found.landmarks)
 
 
 def _gather_images(

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -99,7 +98,13 @@ def scene_motions(
         world.
     """
     back = np.linalg.inv(reference)
-    asked = _asked(plan.anatomy)
+    # Surfaces about which there are questions, by the bone's name.
+    asked: dict[str, list[SurfaceFind]] = {}
+    for question in plan.anatomy.questions:
+        part, _, name = question.key.partition(".")
+        finds = [find for find, _ in question.choices if find is not None]
+        if part == "bones" and finds:
+            asked[name] = finds
     # What the skin lies under as well moves no segment.
     skin = plan.anatomy.skin
     shared = set() if skin is None else {*skin.chain}
@@ -115,8 +120,8 @@ def scene_motions(
             f"{find.label} lies under: {chain}; the matrix is what that does to it relative to",
             "the rest of the head, in LPS mm: from where it is to where it goes.",
         )
-        question, choices = _unusual(name, find, words)
-        plan.motions[name] = DraftMotion(words, source, matrix, "", question, choices, matrix)
+        asks, choices = _unusual(name, find, words)
+        plan.motions[name] = DraftMotion(words, source, matrix, "", asks, choices, matrix)
         plan.links |= {*find.chain} - shared
         why = f"transform to parent of {find.label} in the scene: {words}"
         label = ", ".join(find.chain) or find.label
@@ -127,17 +132,6 @@ def scene_motions(
             _ask_whose(plan, name, finds, motions)
     for motion in loose:
         _add_loose(plan, motion)
-
-
-def _asked(anatomy: Anatomy) -> dict[str, list[SurfaceFind]]:
-    """The surfaces about which there are questions, by the bone's name."""
-    found: dict[str, list[SurfaceFind]] = {}
-    for question in anatomy.questions:
-        part, _, name = question.key.partition(".")
-        finds = [find for find, _ in question.choices if find is not None]
-        if part == "bones" and finds:
-            found[name] = finds
-    return found
 
 
 def _ask_whose(
@@ -257,9 +251,10 @@ def _of_file(plan: Plan, name: str, find: TransformFind, *, by_slicer: bool) -> 
     def read_as(direction: str) -> Floats:
         return read_transform_file(find.path, direction=direction).matrix
 
-    itk = is_itk_file(find.path) or _holds_itk(find.path)
-    if not itk:
-        return _of_text(plan, name, find)
+    if not is_itk_file(find.path):
+        with find.path.open("rb") as begin:
+            if not begin.read(30).startswith(b"#Insight Transform File"):
+                return _of_text(plan, name, find)
     try:
         stated = read_transform_file(find.path)
     except CmfsimError:
@@ -303,11 +298,6 @@ def _of_text(plan: Plan, name: str, find: TransformFind) -> DraftMotion:
         f'"LPS" (typed, or made by ITK): {here}',
     )
     return DraftMotion("", (), None, f'{{{file}, frame = "?"}}', text, choices)
-
-
-def _holds_itk(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(30).startswith(b"#Insight Transform File")
 
 
 @dataclass(frozen=True)

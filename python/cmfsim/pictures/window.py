@@ -130,7 +130,17 @@ def view_parts(
             for part in parts:
                 _add(plotter, part, unit)
             for row, part in enumerate(named):
-                _add_name(plotter, part, height - (row + 1) * ROW - LEFT, switch=path is None)
+                low = height - (row + 1) * ROW - LEFT
+                plotter.add_text(part.name, position=(LEFT + ROW, low), font_size=9, color="black")
+                if path is None:
+                    # A box that shows and hides the part.
+                    plotter.add_checkbox_button_widget(
+                        plotter.renderer.actors[part.name].SetVisibility,
+                        value=part.shown,
+                        position=(LEFT, low),
+                        size=ROW - 8,
+                        color_on=part.colour,
+                    )
             plotter.reset_camera_clipping_range()
             if path is None:
                 plotter.show()
@@ -171,16 +181,3 @@ def _add(plotter: Any, part: ViewPart, unit: str) -> None:
             **looks,
         )
     plotter.renderer.actors[part.name].SetVisibility(part.shown)
-
-
-def _add_name(plotter: Any, part: ViewPart, low: int, *, switch: bool) -> None:
-    """The name of a part; in a window with a box that shows and hides it."""
-    plotter.add_text(part.name, position=(LEFT + ROW, low), font_size=9, color="black")
-    if switch:
-        plotter.add_checkbox_button_widget(
-            plotter.renderer.actors[part.name].SetVisibility,
-            value=part.shown,
-            position=(LEFT, low),
-            size=ROW - 8,
-            color_on=part.colour,
-        )

@@ -84,7 +84,14 @@ def read_dicom_folder(
     Raises `ImageError`: No CT, several to choose from, slices that do not make a volume.
     """
     headers, findings = _headers(folder, series)
-    chosen, more = _chosen(folder, _series(headers), series)
+    groups: dict[tuple[str, str], list[DicomHeader]] = {}
+    stated = {uid: modality for uid, modality in map(_key, headers) if modality}
+    for header in headers:
+        uid, modality = _key(header)
+        # A slice that states no modality has that of its series.
+        groups.setdefault((uid, modality or stated.get(uid, "")), []).append(header)
+    there = [Series(uid, tuple(group)) for (uid, _), group in sorted(groups.items())]
+    chosen, more = _chosen(folder, there, series)
     findings += more
     slices = [s for header in chosen.headers for s in slices_of(header)]
     return volume_of(folder.name, slices, chosen.modality, findings)
@@ -264,17 +271,6 @@ def _key(header: DicomHeader) -> tuple[str, str]:
 def _is_meant(header: DicomHeader, wanted: str) -> bool:
     """Whether an image is of the series of a UID or number."""
     return wanted.strip() in {header.text("series_uid"), header.text("series_number").strip()}
-
-
-def _series(headers: list[DicomHeader]) -> list[Series]:
-    """The series of a folder."""
-    groups: dict[tuple[str, str], list[DicomHeader]] = {}
-    stated = {uid: modality for uid, modality in map(_key, headers) if modality}
-    for header in headers:
-        uid, modality = _key(header)
-        # A slice that states no modality has that of its series.
-        groups.setdefault((uid, modality or stated.get(uid, "")), []).append(header)
-    return [Series(uid, tuple(group)) for (uid, _), group in sorted(groups.items())]
 
 
 def _chosen(folder: Path, found: list[Series], wanted: str | None) -> tuple[Series, list[Finding]]:

@@ -175,9 +175,8 @@ def of_slices(
     low, count = _grid(corners, steps[nearest], name)
     grid = steps[nearest]
     x, y, z = (low[a] + grid[a] * np.arange(count[a]) for a in range(3))
-    outside = _outside(values)
+    outside, slack = _outside(values), SAME * gap
     made = np.empty((count[2], count[1], count[0]), dtype=values.dtype)
-    slack = SAME * gap
     starts = positions @ np.array([along_row, along_column]).T
     # Slices that do not exist, so that every slice has a neighbour; nothing is read of them.
     ends = np.concatenate([[heights[0] - gap], heights, [heights[-1] + gap]])

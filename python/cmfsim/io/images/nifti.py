@@ -155,20 +155,12 @@ def _header(path: Path, data: bytes) -> _Header:
     if codes[1] > 0 >= codes[0] and not _is_spacing(spacing[1:]) and np.isfinite(rows).all():
         ignored.append(f"pixdim {spacing[1:].tolist()}: its sform states the size of a voxel")
         spacing[1:] = np.linalg.norm(rows[:, :3], axis=0)
-    numbers = {
-        "pixdim": spacing[1:],
-        "pixdim[0], the quaternion and offset of its qform": (spacing[0], *turn)
-        if codes[0] > 0
-        else (),
-        "sform": rows if codes[1] > 0 else (),
-        "slope and intercept": scale,
-        "start of the data": start,
-    }
-    _check_numbers(path, numbers)
-    if not _is_spacing(spacing[1:]):
-        raise ImageInputError(f"{path.name}: spacing is {spacing[1:].tolist()}: must be above 0")
-    if not first <= start <= MOST_START:
-        raise ImageInputError(f"{path.name}: its data begin at byte {start:g}")
+    used = {"pixdim": spacing[1:], "slope and intercept": scale, "start of the data": start}
+    if codes[0] > 0:
+        used["pixdim[0], the quaternion and offset of its qform"] = (spacing[0], *turn)
+    if codes[1] > 0:
+        used["sform"] = rows
+    _check_numbers(path, used, first)
     unit = NIFTI_UNITS.get(units & 7, 1.0)
     turn[3:] *= unit
     return _Header(
@@ -186,8 +178,8 @@ def _header(path: Path, data: bytes) -> _Header:
     )
 
 
-def _check_numbers(path: Path, used: Mapping[str, Any]) -> None:
-    """Refuses the numbers of a header that are used and not finite."""
+def _check_numbers(path: Path, used: Mapping[str, Any], header: int) -> None:
+    """Refuses numbers that are used and not finite, no size of a voxel, data within the header."""
     for name, values in used.items():
         numbers = np.ravel(values)
         if not (np.abs(numbers) <= MOST_NUMBER).all():
@@ -195,6 +187,11 @@ def _check_numbers(path: Path, used: Mapping[str, Any]) -> None:
                 f"{path.name}: {name} is {numbers.tolist()}: every number must be finite; convert "
                 "the DICOM series again"
             )
+    spacing, start = used["pixdim"], used["start of the data"]
+    if not _is_spacing(spacing):
+        raise ImageInputError(f"{path.name}: spacing is {spacing.tolist()}: must be above 0")
+    if not header <= start <= MOST_START:
+        raise ImageInputError(f"{path.name}: its data begin at byte {start:g}")
 
 
 def _is_spacing(steps: NDArray[np.float64]) -> bool:

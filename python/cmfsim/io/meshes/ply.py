@@ -113,8 +113,8 @@ def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
     if left:
         what = (
             f"{left} after the last row were ignored: they are no row that its header could have "
+            "missed"
         )
-        what += "missed"
         why = "the file may have been changed after it was written"
         fix = "look at the surface; if a part is missing, export it again"
         findings = (Finding("field-ignored", what, why=why, fix=fix),)

@@ -121,9 +121,13 @@ def legacy_answer(path: str, reader: str) -> Answer:
     said = str(complaints.GetOutput()).strip()
     read = source.GetOutput()
     if said or read is None:
+        # "ERROR: In …cxx, line 199", and then "vtkPolyDataReader (0x…): …".
+        lines = [line.strip() for line in said.splitlines() if line.strip()]
+        texts = [line for line in lines if not line.startswith(("ERROR: In", "Warning: In"))]
+        first = re.sub(r"^\w+ \(0x[0-9a-f]+\): ", "", texts[0]) if texts else "it holds nothing"
         raise CaseInputError(
-            f"is cut short or damaged (VTK reports: {_first_complaint(said)}): export it again, as "
-            "STL or PLY if you can"
+            f"is cut short or damaged (VTK reports: {first[:100]}): export it again, as STL or PLY "
+            "if you can"
         )
     points = read.GetPoints()
     arrays = {"points": np.zeros((0, 3)) if points is None else _array(points.GetData())}
@@ -144,15 +148,6 @@ def legacy_answer(path: str, reader: str) -> Answer:
         names[key] = [str(array.GetName()) for array in found]
         arrays |= {f"{key}.{i}": _array(array) for i, array in enumerate(found)}
     return Answer(names, arrays)
-
-
-def _first_complaint(said: str) -> str:
-    """The first error of VTK, without the place in its sources."""
-    lines = [line.strip() for line in said.splitlines() if line.strip()]
-    # "ERROR: In …cxx, line 199", and then "vtkPolyDataReader (0x…): …".
-    texts = [line for line in lines if not line.startswith(("ERROR: In", "Warning: In"))]
-    text = re.sub(r"^\w+ \(0x[0-9a-f]+\): ", "", texts[0]) if texts else "it holds nothing"
-    return text[:100]
 
 
 def _array(array: Any) -> NDArray[Any]:
