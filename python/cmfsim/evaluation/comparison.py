@@ -266,8 +266,13 @@ def compare_skins(
     skin, other = Skin(simulated), Skin(postoperative)
     warps = _warps(landmarks) if method == "landmarks" else _Warps()
     names = landmarks[0] if landmarks is not None else None
-    has_names = isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS)
-    parts = _chosen_regions(regions, skin, names if has_names else None)
+    count = len(skin.vertices)
+    if regions is not None:
+        parts = {n: _as_choice(f"region {n!r}", v, count) for n, v in regions.items()}
+    elif isinstance(names, Mapping) and all(name in names for name in SKIN_LANDMARKS):
+        parts = skin_regions(skin.vertices, names)
+    else:
+        parts = {}
     asked = _chosen_vertices(mask, skin, parts)
     chosen, seen = _uncovered(skin, asked), ~other.covered()
     matches = match_skins(
@@ -348,11 +353,16 @@ def _from_behind(matches: Matches, backward: Matches) -> dict[str, Any]:
     """What a `SkinComparison` has from the post-operative skin, and from both directions."""
     # Seen from the post-operative side, behind is in front.
     signed = -backward.signed
+    both = (matches.signed, signed)
+    # Half of the weight to each direction.
+    weights = np.concatenate([np.full(len(v), 0.5 / max(len(v), 1)) for v in both])
     return {
         "back_signed": frozen(signed),
         "back_vertices": frozen(backward.vertices.astype(np.uint32)),
         "backward": distance_statistics(signed) if len(signed) else None,
-        "symmetric": _half_each(matches.signed, signed) if len(signed) else None,
+        "symmetric": distance_statistics(np.concatenate(both), weights=weights)
+        if len(signed)
+        else None,
         "back_border": backward.n_border,
         "back_far": backward.n_far,
     }
@@ -396,14 +406,6 @@ def _paired(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats, tuple[F
             "must have the same number, in the same order"
         )
     return first, second, ()
-
-
-def _chosen_regions(
-    regions: Mapping[str, ArrayLike] | None, skin: Skin, names: Landmarks | None
-) -> dict[str, NDArray[np.bool_]]:
-    if regions is not None:
-        return {n: _as_choice(f"region {n!r}", v, len(skin.vertices)) for n, v in regions.items()}
-    return skin_regions(skin.vertices, names) if isinstance(names, Mapping) else {}
 
 
 def _chosen_vertices(
@@ -459,11 +461,6 @@ def _backward(
         max_distance=limit,
         exclude_borders=exclude_borders or part is not skin,
     )
-
-
-def _half_each(one: Floats, other: Floats) -> DistanceStatistics:
-    weights = np.concatenate([np.full(len(v), 0.5 / len(v)) for v in (one, other)])
-    return distance_statistics(np.concatenate([one, other]), weights=weights)
 
 
 def _findings(

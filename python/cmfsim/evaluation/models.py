@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -15,6 +15,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.comparison import Choice, Landmarks, SkinComparison, compare_skins
 from cmfsim.evaluation.regions import skin_regions
 from cmfsim.evaluation.statistics import (
+    LENGTHS,
     DistanceStatistics,
     PairedTest,
     distance_statistics,
@@ -30,10 +31,7 @@ NO_CHANGE = "no change"
 # Name of the whole evaluated part, next to the names of regions.
 WHOLE = "whole"
 # Columns of the CSV file after patient, region and model.
-COLUMNS = (
-    "count", "mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm",
-    "signed_mean_mm", "signed_std_mm", "outliers",
-)  # fmt: skip
+COLUMNS = ("count", *(f"{name}_mm" for name in LENGTHS), "outliers")
 AVERAGE = "average"
 # Stands where a patient has no figure.
 NOTHING = "–"
@@ -182,7 +180,7 @@ def compare_models(  # noqa: PLR0913 (options by name)
     """
     if not predictions:
         raise CaseInputError("there is no prediction to compare")
-    skin = preoperative if isinstance(preoperative, Surface) else _core(preoperative)
+    skin, after = _core(preoperative), _core(postoperative)
     moved = {NO_CHANGE: skin.vertices}
     for name, vertices in predictions.items():
         if as_text("model", name) == NO_CHANGE:
@@ -200,7 +198,6 @@ def compare_models(  # noqa: PLR0913 (options by name)
     if regions is None and isinstance(names, Mapping) and all(n in names for n in SKIN_LANDMARKS):
         parts = skin_regions(skin.vertices, names)
     chosen = parts[mask] if isinstance(mask, str) and mask in parts else mask
-    after = postoperative if isinstance(postoperative, Surface) else _core(postoperative)
     comparisons = {
         name: compare_skins(
             skin.moved(vertices),
@@ -232,32 +229,25 @@ def _side_by_side(
     inside = {name: part[common] for name, part in parts.items() if part[common].any()}
     whole = {WHOLE: np.ones(len(common), dtype=bool)}
 
-    def gain(name: str, chosen: NDArray[np.bool_]) -> Improvement:
-        before, after = np.abs(errors[NO_CHANGE][chosen]), np.abs(errors[name][chosen])
-        return Improvement(
-            float(before.mean()), float(after.mean()), float((after < before).mean())
-        )
+    def figures(part: NDArray[np.bool_] | slice) -> Mapping[str, DistanceStatistics]:
+        found = {name: distance_statistics(e[part]) for name, e in errors.items()}
+        return MappingProxyType(found)
+
+    def gains(name: str) -> Mapping[str, Improvement]:
+        found = {}
+        for region, chosen in (whole | inside).items():
+            before, after = np.abs(errors[NO_CHANGE][chosen]), np.abs(errors[name][chosen])
+            better = float((after < before).mean())
+            found[region] = Improvement(float(before.mean()), float(after.mean()), better)
+        return MappingProxyType(found)
 
     return ModelComparison(
         comparisons=MappingProxyType(dict(comparisons)),
         vertices=frozen(common),
         errors=MappingProxyType(errors),
-        statistics=MappingProxyType({n: distance_statistics(e) for n, e in errors.items()}),
-        regions=MappingProxyType(
-            {
-                region: MappingProxyType(
-                    {name: distance_statistics(e[part]) for name, e in errors.items()}
-                )
-                for region, part in inside.items()
-            }
-        ),
-        improvements=MappingProxyType(
-            {
-                name: MappingProxyType({r: gain(name, p) for r, p in (whole | inside).items()})
-                for name in errors
-                if name != NO_CHANGE
-            }
-        ),
+        statistics=figures(slice(None)),
+        regions=MappingProxyType({region: figures(part) for region, part in inside.items()}),
+        improvements=MappingProxyType({n: gains(n) for n in errors if n != NO_CHANGE}),
     )
 
 
@@ -277,7 +267,9 @@ def _carried(
     return places + motion.displacement(places), second
 
 
-def _core(surface: SurfaceData) -> Surface:
+def _core(surface: SurfaceData | Surface) -> Surface:
+    if isinstance(surface, Surface):
+        return surface
     return Surface(surface.vertices, surface.triangles, crease_angle=surface.crease_angle)
 
 
@@ -346,12 +338,7 @@ class ErrorTable:
 
     def csv(self) -> str:
         """The rows as comma-separated values, with a header."""
-        rows = self.rows()
-        text = io.StringIO()
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({name: _plain(value) for name, value in row.items()} for row in rows)
-        return text.getvalue()
+        return csv_of(self.rows())
 
     def text(self, region: str = WHOLE) -> str:
         """Mean ± SD, 90th and 95th percentile, mm, as Table 3 of Kim et al. (2010) has them."""
@@ -436,6 +423,15 @@ def error_table(patients: Mapping[str, ModelComparison]) -> ErrorTable:
             for model in models:
                 cells[patient, region, model] = by_model[model]
     return ErrorTable(tuple(patients), models, tuple(regions), MappingProxyType(cells))
+
+
+def csv_of(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows of the same names as comma-separated values, with a header."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _plain(value) for name, value in row.items()} for row in rows)
+    return text.getvalue()
 
 
 def _plain(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -29,6 +29,8 @@ LEAST_PAIRS = 6
 LIMITS = (1.0, 1.5, 2.0, 3.0)
 # A distance is an outlier of a box plot beyond the upper quartile by this many boxes (Tukey 1977).
 WHISKER = 1.5
+# The figures of distances that are in mm.
+LENGTHS = ("mean", "std", "median", "rms", "p90", "p95", "max", "signed_mean", "signed_std")
 
 
 @dataclass(frozen=True)
@@ -66,17 +68,9 @@ class PairedTest:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values with their unit in the name, as JSON holds them."""
-        return {
-            "test": "Wilcoxon signed-rank, two-sided",
-            "by": self.by,
-            "n": self.n,
-            "n_equal": self.n_equal,
-            "statistic": self.statistic,
-            "p": self.p,
-            "median_difference_mm": self.median_difference,
-            "effect": self.effect,
-            "caveat": self.caveat,
-        }
+        renamed = {"median_difference": "median_difference_mm"}
+        values = {renamed.get(name, name): value for name, value in asdict(self).items()}
+        return {"test": "Wilcoxon signed-rank, two-sided", **values}
 
 
 def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") -> PairedTest:
@@ -259,15 +253,7 @@ class DistanceStatistics:
         """Plain values with their unit in the name, as JSON holds them."""
         return {
             "count": self.count,
-            "mean_mm": self.mean,
-            "std_mm": self.std,
-            "median_mm": self.median,
-            "rms_mm": self.rms,
-            "p90_mm": self.p90,
-            "p95_mm": self.p95,
-            "max_mm": self.max,
-            "signed_mean_mm": self.signed_mean,
-            "signed_std_mm": self.signed_std,
+            **{f"{name}_mm": getattr(self, name) for name in LENGTHS},
             "quartiles_mm": list(self.quartiles),
             "outliers": self.outliers,
             "within": {f"{limit:g} mm": share for limit, share in self.within.items()},
@@ -282,14 +268,12 @@ class DistanceStatistics:
         CaseError
             (also `ValueError`) A figure is missing.
         """
-        plain = ("count", "outliers")
-        lengths = ("mean", "std", "median", "rms", "p90", "p95", "max", "signed_mean", "signed_std")
         try:
             lower, upper = values["quartiles_mm"]
             within = {float(k.removesuffix(" mm")): v for k, v in values["within"].items()}
             return cls(
-                **{name: values[name] for name in plain},
-                **{name: values[f"{name}_mm"] for name in lengths},
+                **{name: values[name] for name in ("count", "outliers")},
+                **{name: values[f"{name}_mm"] for name in LENGTHS},
                 within=MappingProxyType(within),
                 quartiles=(lower, upper),
             )

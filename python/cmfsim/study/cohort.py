@@ -152,14 +152,9 @@ def run_study(
     >>> [outcome.status for outcome in report.outcomes]  # doctest: +SKIP
     ['done', 'done', 'kept', 'failed']
     """
-
-    def say(cohort: Cohort, outcome: CaseOutcome) -> None:
-        del cohort
-        if progress is not None:
-            progress(outcome)
-
     options = StudyOptions(workers, scheduler, fresh)
-    return run_studies([cohort], options, progress=say)[0]
+    say = progress or (lambda _: None)
+    return run_studies([cohort], options, progress=lambda _, outcome: say(outcome))[0]
 
 
 @dataclass(frozen=True)
@@ -374,8 +369,16 @@ def write_study_report(report: StudyReport) -> list[str]:
         page = write_report_page(fresh, study_document(values, figures=figures))
         return [*names, STUDY_FILE, *([] if page is None else [page])]
 
+    return replacing_all(folder, STUDY_FILES, fill)
+
+
+def replacing_all(
+    folder: Path, ours: re.Pattern[str], fill: Callable[[Path], list[str]]
+) -> list[str]:
+    """The names of files that took the places of all in a folder whose names match a pattern."""
+
     def is_ours(name: str) -> bool:
-        return STUDY_FILES.fullmatch(name) is not None
+        return ours.fullmatch(name) is not None
 
     def stale() -> list[str]:
         return [path.name for path in folder.iterdir() if is_ours(path.name)]

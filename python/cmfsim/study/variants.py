@@ -1,7 +1,5 @@
 """A cohort under several settings: the error of each patient, and its change by each variant."""
 
-import csv
-import io
 import json
 import logging
 import re
@@ -12,12 +10,20 @@ from typing import Any
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.evaluation import NO_CHANGE, ErrorTable, PairedChange, paired_change
-from cmfsim.io import AS_GIVEN, Case, CaseChanges, Cohort, Variants, replacing_files
+from cmfsim.evaluation.models import csv_of
+from cmfsim.io import AS_GIVEN, Case, CaseChanges, Cohort, Variants
 from cmfsim.pipeline.building.case_model import kind_options_of
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
 from cmfsim.pipeline.outputs.results import write_report_page
 from cmfsim.report.variants import variants_document, variants_markdown, variants_text
-from cmfsim.study.cohort import CaseOutcome, StudyOptions, StudyReport, run_studies, study_table
+from cmfsim.study.cohort import (
+    CaseOutcome,
+    StudyOptions,
+    StudyReport,
+    replacing_all,
+    run_studies,
+    study_table,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -93,7 +99,9 @@ class VariantsReport:
         variant, report = self.variants.variants[name], self.reports[name]
         made = variant.changes or CaseChanges({})
         same = self.same[name]
-        ours = {o.name: set(o.evaluation.get("warnings", ())) for o in self._as_given}
+        ours = {
+            o.name: set(o.evaluation.get("warnings", ())) for o in self.reports[AS_GIVEN].outcomes
+        }
         return {
             "name": name,
             "description": variant.description,
@@ -115,10 +123,6 @@ class VariantsReport:
                 for outcome in report.outcomes
             ],
         }
-
-    @property
-    def _as_given(self) -> tuple[CaseOutcome, ...]:
-        return self.reports[AS_GIVEN].outcomes
 
 
 def run_variants(
@@ -292,7 +296,7 @@ def write_variants_report(report: VariantsReport) -> list[str]:
     def fill(fresh: Path) -> list[str]:
         names = [VARIANTS_TEXT, VARIANTS_JSON]
         if values["rows"]:
-            (fresh / VARIANTS_CSV).write_text(_csv(values["rows"]), encoding="utf-8")
+            (fresh / VARIANTS_CSV).write_text(csv_of(values["rows"]), encoding="utf-8")
             names.insert(0, VARIANTS_CSV)
         (fresh / VARIANTS_TEXT).write_text(variants_markdown(values), encoding="utf-8")
         text = json.dumps(values, indent=1, allow_nan=False, ensure_ascii=False)
@@ -300,18 +304,4 @@ def write_variants_report(report: VariantsReport) -> list[str]:
         page = write_report_page(fresh, variants_document(values))
         return [*names, *([] if page is None else [page])]
 
-    def is_ours(name: str) -> bool:
-        return FILES.fullmatch(name) is not None
-
-    def stale() -> list[str]:
-        return [path.name for path in folder.iterdir() if is_ours(path.name)]
-
-    return replacing_files(folder, None, is_ours, fill, stale)
-
-
-def _csv(rows: list[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return replacing_all(folder, FILES, fill)
