@@ -64,22 +64,9 @@ def _head(p: HeadParameters) -> list[Step | Engraving]:
         Step("join", Egg((0, -81 + chin, -75), (24, 18, 15), power=2.2), 12.0),
         Step("join", Egg((42, -25, -55), (13 + fat, 18, 14)), 12.0),
         # Brow ridge and glabella.
-        Step(
-            "join",
-            _tube(
-                [
-                    [0, -89, 43, 8],
-                    [14, -88, 41, 8.5],
-                    [30, -83, 42, 8],
-                    [46, -71, 37, 7],
-                    [53.5, -61, 25, 6.5],
-                    [54.5, -59.5, 12, 6.5],
-                    [54, -60, 2, 5],
-                ]
-            ),
-            9.0,
-        ),
-    ]
+        Step("join", _tube([[0, -89, 43, 8], [14, -88, 41, 8.5], [30, -83, 42, 8], [46, -71, 37, 7],
+                            [53.5, -61, 25, 6.5], [54.5, -59.5, 12, 6.5], [54, -60, 2, 5]]), 9.0),
+    ]  # fmt: skip
 
 
 def _lower_face(fat: float) -> Blend:
@@ -112,16 +99,8 @@ def _lower_face(fat: float) -> Blend:
 
 
 def _neck(fat: float) -> Tube:
-    return _tube(
-        [
-            [0, 21, -150, 53 + fat],
-            [0, 16, -95, 48 + fat],
-            [0, 14, -55, 47 + 0.5 * fat],
-            [0, 18, -20, 48],
-            [0, 22, 15, 48],
-        ],
-        12,
-    )
+    return _tube([[0, 21, -150, 53 + fat], [0, 16, -95, 48 + fat], [0, 14, -55, 47 + 0.5 * fat],
+                  [0, 18, -20, 48], [0, 22, 15, 48]], 12)  # fmt: skip
 
 
 def _eyes() -> list[Step | Engraving]:
@@ -130,18 +109,12 @@ def _eyes() -> list[Step | Engraving]:
         Step("cut", Egg((32, -98, 19), (19, 13, 12), turn=turn_about("z", 18)), 9.0),
         Step("join", Egg((31.5, -75.5, 18.5), (15, 12.4, 12.6)), 6.0),
         # Slit between the lids, the lower rim of the lower lid, the crease above.
-        _engrave(
-            [[16.5, 17.5, 0.5], [23, 14.6, 1.2], [31, 13.2, 1.3], [39, 14.6, 1.2], [46, 18.0, 0.4]],
-            2.0,
-            -50.0,
-        ),
-        _engrave(
-            [[17, 19, 0.2], [23, 24.0, 0.8], [31, 26.2, 1.1], [39, 25.0, 0.9], [46.5, 20.5, 0.2]],
-            2.6,
-            -50.0,
-        ),
+        _engrave([[16.5, 17.5, 0.5], [23, 14.6, 1.2], [31, 13.2, 1.3], [39, 14.6, 1.2],
+                  [46, 18.0, 0.4]], 2.0, -50.0),
+        _engrave([[17, 19, 0.2], [23, 24.0, 0.8], [31, 26.2, 1.1], [39, 25.0, 0.9],
+                  [46.5, 20.5, 0.2]], 2.6, -50.0),
         _engrave([[18, 13, 0.1], [24, 8.0, 0.4], [34, 5.0, 0.4], [43, 7, 0.0]], 4.0, -50.0),
-    ]
+    ]  # fmt: skip
 
 
 def _nose(p: HeadParameters) -> list[Step | Engraving]:
@@ -149,52 +122,26 @@ def _nose(p: HeadParameters) -> list[Step | Engraving]:
     out, down = -p.nose_projection, -p.nose_length
     tip_y, tip_z = -113.0 + out, -7.0 + down
     return [
-        Step(
-            "join",
-            _tube(
-                [
-                    [0, -87.5, 34, 6.0],
-                    [0, -91.5 + 0.2 * out, 22, 6.2],
-                    [0, -98.5 + 0.6 * out, 9 + 0.4 * down, 7.2],
-                    [0, -106.5 + 0.9 * out, -0.5 + 0.8 * down, 7.6],
-                    [0, tip_y, tip_z, 7.8],
-                ]
-            ),
-            8.0,
-        ),
+        Step("join", _tube([[0, -87.5, 34, 6.0], [0, -91.5 + 0.2 * out, 22, 6.2],
+                            [0, -98.5 + 0.6 * out, 9 + 0.4 * down, 7.2],
+                            [0, -106.5 + 0.9 * out, -0.5 + 0.8 * down, 7.6],
+                            [0, tip_y, tip_z, 7.8]]), 8.0),
         Step("join", Egg((5.5, -92 + 0.5 * out, 1 + 0.5 * down), (9.0, 9, 15)), 8.0),
         Step("join", Egg((0, -102 + 0.6 * out, -10 + down), (12.0, 15, 8.5)), 6.0),
         Step("join", Egg((3.2, tip_y - 0.2, tip_z), (5.5, 7.6, 7)), 4.0),
         Step("join", Egg((7.5, -103 + 0.7 * out, -6.5 + down), (7.0, 9.5, 8)), 6.0),
         # Wings.
-        Step(
-            "join",
-            Egg(
-                (12.2, -102.0 + 0.6 * out, -12.0 + down), (5.2, 8.5, 7.2), turn=turn_about("z", 14)
-            ),
-            3.5,
-        ),
+        Step("join", Egg((12.2, -102.0 + 0.6 * out, -12.0 + down), (5.2, 8.5, 7.2),
+                         turn=turn_about("z", 14)), 3.5),
         # Column.
         Step("join", _tube([[0, tip_y - 2, tip_z - 6, 3.4], [0, -103, -17.5 + down, 4.2]]), 4.0),
         # Nostrils.
-        Step(
-            "cut",
-            Egg((6.6, -107 + 0.7 * out, -20.0 + down), (2.8, 5.8, 5.0), turn=turn_about("z", 24)),
-            2.0,
-        ),
+        Step("cut", Egg((6.6, -107 + 0.7 * out, -20.0 + down), (2.8, 5.8, 5.0),
+                        turn=turn_about("z", 24)), 2.0),
         # Fold behind the wing.
-        _engrave(
-            [
-                [9, -2 + down, 0.1],
-                [13.5, -3 + down, 0.8],
-                [17.4, -8 + down, 1.2],
-                [18.2, -14 + down, 1.2],
-                [15, -20 + down, 0.6],
-            ],
-            3.0,
-            -85.0,
-        ),
-    ]
+        _engrave([[9, -2 + down, 0.1], [13.5, -3 + down, 0.8], [17.4, -8 + down, 1.2],
+                  [18.2, -14 + down, 1.2], [15, -20 + down, 0.6]], 3.0, -85.0),
+    ]  # fmt: skip
 
 
 def _mouth(p: HeadParameters) -> list[Step | Engraving]:
