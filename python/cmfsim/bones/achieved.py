@@ -293,7 +293,10 @@ def measure_pair(
     except RegistrationError as error:
         _LOG.warning("using the vertices, because the shapes cannot be compared: %s", error)
         return by_vertex
-    if not shape.is_rigid or _is_bent(shape.bent, coherent.pieces):
+    # Whether the bone, or a piece of it, lies off where the rigid motion of the whole takes it.
+    parts = [shape.bent, *(shape.bent[piece.vertices] for piece in coherent.pieces)]
+    is_bent = any(float(np.sqrt((part**2).mean())) > BENT for part in parts)
+    if not shape.is_rigid or is_bent:
         return replace(by_vertex, fit=shape.fit, stray=shape.stray)
     known = {"removed": shape.removed, "stray": shape.stray, "slip": shape.slip}
     if is_still:
@@ -369,14 +372,17 @@ def achieved_plan(
     targets = _targets(postoperative, parts)
 
     def measure(name: str, frame: Floats) -> AchievedMotion:
-        after = _transformed(targets[name], frame)
+        there = targets[name]
+        after = SurfaceData(carried(frame, there.vertices), there.triangles, there.crease_angle)
         centre = (centres or {}).get(name)
         if _same_triangles(parts[name], after):
             return measure_pair(parts[name], after, centre=centre, is_still=name == reference)
         others = (*beside, *(part for other, part in parts.items() if other != name))
         bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
         fit = lay_on(name, parts[name], bone, options)
-        return _matched(parts[name], bone, fit, centre, others)
+        stray, _ = stray_patches(parts[name], bone, fit.similarity, fit.rms, others)
+        removed = missing_patches(parts[name], bone, fit.carried(parts[name].vertices))
+        return _by_shape("icp", parts[name], fit, centre, removed=removed, stray=stray)
 
     correction = None
     if reference is not None:
@@ -391,25 +397,6 @@ def achieved_plan(
         )
     motions = {name: measure(name, into) for name in parts}
     return AchievedPlan(MappingProxyType(motions), frozen(into), correction)
-
-
-def _matched(
-    segment: SurfaceData,
-    bone: Surface,
-    fit: ShapeFit,
-    centre: ArrayLike | None,
-    others: Sequence[SurfaceData],
-) -> AchievedMotion:
-    """The motion of a segment that was registered to the bone."""
-    stray, _ = stray_patches(segment, bone, fit.similarity, fit.rms, others)
-    return _by_shape(
-        "icp",
-        segment,
-        fit,
-        centre,
-        removed=missing_patches(segment, bone, fit.carried(segment.vertices)),
-        stray=stray,
-    )
 
 
 def _by_shape(
@@ -432,12 +419,6 @@ def _by_shape(
             **known,
         }
     )
-
-
-def _is_bent(off: Floats, pieces: Sequence[RigidPiece]) -> bool:
-    """Whether a bone, or a piece of it, lies off where the rigid motion of the whole takes it."""
-    parts = [off, *(off[piece.vertices] for piece in pieces)]
-    return any(float(np.sqrt((part**2).mean())) > BENT for part in parts)
 
 
 def _surfaces(segments: Segments) -> dict[str, SurfaceData]:
@@ -472,11 +453,6 @@ def _same_triangles(one: SurfaceData, other: SurfaceData) -> bool:
     return len(one.vertices) == len(other.vertices) and np.array_equal(
         one.triangles, other.triangles
     )
-
-
-def _transformed(surface: SurfaceData, matrix: Floats) -> SurfaceData:
-    vertices = carried(matrix, surface.vertices)
-    return SurfaceData(vertices, surface.triangles, surface.crease_angle)
 
 
 def _centre(centre: ArrayLike | None, vertices: Floats) -> Floats:

@@ -145,18 +145,21 @@ def cut_bones(
         for cut in procedure.cuts:
             _make_cut(procedure, cut, grid, pieces, findings=findings, options=options)
     levels = {name: grid.with_values(values) for name, values in pieces.items()}
+    return CutBones(_checked_segments(levels, options.surface), placed, tuple(findings))
+
+
+def _checked_segments(
+    levels: Mapping[str, ImageData], options: SurfaceOptions | None = None
+) -> tuple[BoneSegment, ...]:
+    """Segments of levels, with their surfaces."""
     # Marching cubes and smoothing of one piece go on while another is decimated; decimation itself
     # takes one piece at a time.
     with ThreadPoolExecutor(SURFACES_AT_ONCE) as pool:
-        surfaces = pool.map(
-            lambda name: surface_of_level(name, levels[name], options.surface), levels
-        )
-        segments = tuple(
-            BoneSegment(name, levels[name], surface)
-            for name, surface in zip(levels, surfaces, strict=True)
-        )
+        made = pool.map(lambda name: surface_of_level(name, levels[name], options), levels)
+        named = zip(levels.items(), made, strict=True)
+        segments = tuple(BoneSegment(name, level, surface) for (name, level), surface in named)
     check_segments(segments)
-    return CutBones(segments, placed, tuple(findings))
+    return segments
 
 
 def segments_from_surfaces(
@@ -224,7 +227,15 @@ def _make_cut(
 ) -> None:
     source, rest_name = _names_of_cut(procedure, cut, pieces)
     if source == "skull" and cut.joined is not None:
-        findings.append(_jaws_joined(procedure.kind, cut.segment))
+        findings.append(
+            Finding(
+                "cut-of-joined-jaws",
+                f"{cut.segment!r} is cut from a skull whose jaws are not separated; it ends at the "
+                "edges of the upper teeth: bone below stays where it is, but the front of the rami "
+                "may move with it",
+                where=procedure.kind,
+            )
+        )
     cut = cut.of(source)
     bone = pieces[source]
     limit = max(float(bone.max()), -float(bone.min()))
@@ -249,13 +260,14 @@ def _make_cut(
         moved, kept = _join_crumbs(one, other, bone, limit, int(options.crumb_volume / voxel))
         volumes = ([n * voxel for n in moved], [n * voxel for n in kept])
         findings.extend(_fragment_findings(procedure.kind, both, *volumes))
-    names_now = list(pieces.items())
+    # Clipped beyond the box.
+    parts = (np.full(whole.shape, np.float32(-limit)), np.full(whole.shape, np.float32(-limit)))
+    parts[0][box], parts[1][box] = rest, piece
+    others = list(pieces.items())
     pieces.clear()
-    for name, values in names_now:
-        pieces[rest_name if name == source else name] = (
-            _within(whole, box, rest, limit) if name == source else values
-        )
-    pieces[cut.segment] = _within(whole, box, piece, limit)
+    for name, values in others:
+        pieces[rest_name if name == source else name] = parts[0] if name == source else values
+    pieces[cut.segment] = parts[1]
 
 
 def _names_of_cut(procedure: Procedure, cut: Cut, pieces: Iterable[str]) -> tuple[str, str]:
@@ -276,15 +288,6 @@ def _names_of_cut(procedure: Procedure, cut: Cut, pieces: Iterable[str]) -> tupl
             f"{procedure.kind} makes {cut.segment!r}, but a segment of this name already exists"
         )
     return source, rest_name
-
-
-def _jaws_joined(kind: str, segment: str) -> Finding:
-    return Finding(
-        "cut-of-joined-jaws",
-        f"{segment!r} is cut from a skull whose jaws are not separated; it ends at the edges of "
-        "the upper teeth: bone below stays where it is, but the front of the rami may move with it",
-        where=kind,
-    )
 
 
 def _fragment_findings(
@@ -309,13 +312,6 @@ def _fragment_findings(
             severity="warning",
             where=kind,
         )
-
-
-def _within(whole: Levels, box: tuple[slice, ...], part: Levels, limit: float) -> Levels:
-    """A part of the grid on the whole grid, clipped elsewhere."""
-    values = np.full(whole.shape, np.float32(-limit))
-    values[box] = part
-    return values
 
 
 def _scaled(cut: Cut, grid: ImageData, limit: float) -> Levels:
@@ -446,14 +442,7 @@ def part_segment(
             f"none of the {len(pieces)} moved pieces lies in bone {segment.name!r}: give the "
             "surfaces of this bone before and after, both in the frame and unit of the case"
         )
-    with ThreadPoolExecutor(SURFACES_AT_ONCE) as pool:
-        made = pool.map(lambda name: surface_of_level(name, parted[name]), parted)
-        segments = tuple(
-            BoneSegment(name, parted[name], surface)
-            for name, surface in zip(parted, made, strict=True)
-        )
-    check_segments(segments)
-    return segments
+    return _checked_segments(parted)
 
 
 def _distance(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.float64]:

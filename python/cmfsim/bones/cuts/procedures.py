@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,32 +32,19 @@ NEEDED: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "le_fort_1": ("supradentale", "supra_m2_L", "supra_m2_R"),
         "le_fort_3": (
-            "nasion",
-            "supradentale",
-            *(
-                f"{name}_{side}"
-                for name in (
-                    "supra_m2",
-                    "supraorbital",
-                    "suborbital",
-                    "lateral_orbit",
-                    "zygomatic_arch",
-                )
-                for side in "LR"
-            ),
+            "nasion", "supradentale", "supra_m2_L", "supra_m2_R", "supraorbital_L",
+            "supraorbital_R", "suborbital_L", "suborbital_R", "lateral_orbit_L", "lateral_orbit_R",
+            "zygomatic_arch_L", "zygomatic_arch_R",
         ),
         "bsso": (
-            "infradentale",
-            "menton",
-            *(f"{name}_{s}" for name in ("sub_m2", "occlusal_line", "gonion") for s in "LR"),
+            "infradentale", "menton", "sub_m2_L", "sub_m2_R", "occlusal_line_L", "occlusal_line_R",
+            "gonion_L", "gonion_R",
         ),
         "genioplasty": (
-            "infradentale",
-            "menton",
-            *(f"{name}_{s}" for name in ("sub_m2", "occlusal_line") for s in "LR"),
+            "infradentale", "menton", "sub_m2_L", "sub_m2_R", "occlusal_line_L", "occlusal_line_R",
         ),
     }
-)
+)  # fmt: skip
 # With these three, every procedure can be placed; the rest is estimated from them.
 PLACING: Mapping[str, tuple[str, str, str]] = MappingProxyType(
     {
@@ -125,6 +113,8 @@ _OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float, str]]] = MappingP
 PROCEDURES = tuple(_OPTIONS)
 _JAW = ("mandible_body", "mandible")
 _UPPER = ("midface", "cranium", "skull")
+# The cuts of a procedure, and what is noticed as they are placed.
+Placed: TypeAlias = tuple[tuple[Cut, ...], tuple[Finding, ...]]
 
 
 def with_missing_sites(
@@ -157,16 +147,13 @@ def with_missing_sites(
     errors = dict(zip(expected.names, expected.errors, strict=True))
     points |= {name: places["skull", name] for name in missing}
     worst = max(errors["skull", name] for name in missing)
-    return points, (_estimated(kind, missing, len(known), worst),)
-
-
-def _estimated(kind: str, missing: Sequence[str], count: int, error: float) -> Finding:
-    return Finding(
+    estimated = Finding(
         "cut-site-estimated",
-        f"{kind} is placed with {', '.join(missing)} estimated from {count} other landmarks and an "
-        f"average head; they may be {error:.0f} mm off",
+        f"{kind} is placed with {', '.join(missing)} estimated from {len(known)} other landmarks "
+        f"and an average head; they may be {worst:.0f} mm off",
         where=kind,
     )
+    return points, (estimated,)
 
 
 def _spread(points: Sequence[Floats]) -> bool:
@@ -257,15 +244,18 @@ def place_procedure(
     ['maxilla']
     """
     chosen = _chosen_options(kind, options or {})
-    given = {n: _point(kind, n, place) for n, place in landmarks.items() if n in SKULL_LANDMARKS}
+    given = {}
+    for name, place in landmarks.items():
+        if name not in SKULL_LANDMARKS:
+            continue
+        given[name] = point = np.asarray(place, dtype=np.float64)
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise LandmarkInputError(
+                f"landmark {name!r} of {kind} is {place!r}: three numbers needed"
+            )
     points, estimated = with_missing_sites(kind, given)
-    place = {
-        "le_fort_1": _le_fort_1,
-        "le_fort_3": _le_fort_3,
-        "bsso": _bsso,
-        "genioplasty": _genioplasty,
-    }[kind]
-    cuts, findings = place(points, chosen)
+    makers = (_le_fort_1, _le_fort_3, _bsso, _genioplasty)
+    cuts, findings = dict(zip(PROCEDURES, makers, strict=True))[kind](points, chosen)
     if kind == "le_fort_1" and "height" not in (options or {}):
         findings = (*findings, *_small_head(given, chosen["height"]))
     return Procedure(kind, cuts, chosen, (*estimated, *findings))
@@ -299,13 +289,6 @@ def _chosen_options(kind: str, options: Mapping[str, float]) -> dict[str, float]
             raise CaseInputError(f"{kind} {name} is {number:g}: {low:g} to {high:g} is allowed")
         chosen[name] = number
     return chosen
-
-
-def _point(kind: str, name: str, value: ArrayLike) -> Floats:
-    point = np.asarray(value, dtype=np.float64)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise LandmarkInputError(f"landmark {name!r} of {kind} is {value!r}: three numbers needed")
-    return point
 
 
 def _middle(points: Mapping[str, Floats], name: str) -> Floats:
@@ -364,9 +347,7 @@ def _turned(vector: Floats, towards: Floats, degrees: float) -> Floats:
     return math.cos(angle) * vector + math.sin(angle) * towards
 
 
-def _le_fort_1(
-    points: Mapping[str, Floats], options: Mapping[str, float]
-) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
+def _le_fort_1(points: Mapping[str, Floats], options: Mapping[str, float]) -> Placed:
     frame = _upper_frame("le_fort_1", points)
     molars = _middle(points, "supra_m2")
     tip = points["supradentale"] + (UPPER_CANINE_REACH + options["height"]) * frame.up
@@ -407,9 +388,7 @@ def _junction(points: Mapping[str, Floats], frame: _Frame, posterior: float) -> 
     return CuttingPlane(place, frame.front, "pterygomaxillary junction")
 
 
-def _le_fort_3(
-    points: Mapping[str, Floats], options: Mapping[str, float]
-) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
+def _le_fort_3(points: Mapping[str, Floats], options: Mapping[str, float]) -> Placed:
     frame = _upper_frame("le_fort_3", points)
     junction = _junction(points, frame, options["posterior"])
     top = points["nasion"] + options["height"] * frame.up
@@ -435,9 +414,7 @@ def _le_fort_3(
     return (Cut("midface", tuple(groups), ("cranium", "skull"), joined=bite),), ()
 
 
-def _bsso(
-    points: Mapping[str, Floats], options: Mapping[str, float]
-) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
+def _bsso(points: Mapping[str, Floats], options: Mapping[str, float]) -> Placed:
     frame = _lower_frame("bsso", points)
     middle = 0.5 * (points["infradentale"] + points["menton"])
     cuts = []
@@ -455,9 +432,7 @@ def _bsso(
     return tuple(cuts), ()
 
 
-def _genioplasty(
-    points: Mapping[str, Floats], options: Mapping[str, float]
-) -> tuple[tuple[Cut, ...], tuple[Finding, ...]]:
+def _genioplasty(points: Mapping[str, Floats], options: Mapping[str, float]) -> Placed:
     frame = _lower_frame("genioplasty", points)
     tip, menton = points["infradentale"], points["menton"]
     symphysis = float((tip - menton) @ frame.up)
