@@ -16,6 +16,7 @@ from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface_fil
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.slicer.transforms import TransformFile, read_transform_file
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.repair import INNER_WALL, RepairOptions, repair_surface
 from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
 from cmfsim.values.checks import Floats
@@ -112,8 +113,7 @@ def distances_from(bodies: Iterable[Body], points: Floats) -> Floats:
     """The distance of each point from the nearest of some surfaces, mm; infinite without any."""
     nearest = np.full(len(points), np.inf)
     for body in bodies:
-        closest = body.index.closest(points)[0]
-        nearest = np.minimum(nearest, np.linalg.norm(closest - points, axis=1))
+        nearest = np.minimum(nearest, distances(points, body.index))
     return nearest
 
 

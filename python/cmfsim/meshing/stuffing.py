@@ -134,15 +134,11 @@ def mesh_report(mesh: TetMesh, making: Mapping[str, Any] | None = None) -> MeshR
 
 def report_of_part(part: TetMesh, whole: MeshReport) -> MeshReport:
     """The quality of a mesh of which tets were left out, with what the making of the whole said."""
-    return replace(
-        mesh_report(part),
-        volume_error=whole.volume_error,
-        boundary_error_mean=whole.boundary_error_mean,
-        boundary_error_max=whole.boundary_error_max,
-        dropped_parts=whole.dropped_parts,
-        dropped_volume=whole.dropped_volume,
-        dropped_tets=whole.dropped_tets,
-    )
+    names = (
+        "volume_error", "boundary_error_mean", "boundary_error_max", "dropped_parts",
+        "dropped_volume", "dropped_tets",
+    )  # fmt: skip
+    return replace(mesh_report(part), **{name: getattr(whole, name) for name in names})
 
 
 def mesh_findings(report: MeshReport) -> tuple[Finding, ...]:

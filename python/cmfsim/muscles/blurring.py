@@ -97,11 +97,8 @@ def blurred(
     found = blur(np.concatenate(columns, axis=1))
     fraction, fibre = found[:, 0], _principal(found[:, 1:], found[:, 0] > 0.0)
     if tissue.kind == "preset":
-        return (
-            fraction,
-            fibre,
-            TissueData("preset", preset=tissue.preset, fraction=fraction, fibre=fibre),
-        )
+        made = TissueData("preset", preset=tissue.preset, fraction=fraction, fibre=fibre)
+        return fraction, fibre, made
     if tissue.kind == "stiffness":
         stiffness = blur(tissue.arrays()["stiffness"].reshape(-1, 36)).reshape(-1, 6, 6)
         return fraction, fibre, TissueData("stiffness", stiffness=stiffness)

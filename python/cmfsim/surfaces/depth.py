@@ -44,3 +44,11 @@ def moved_outward(skin: Surface, vertices: Floats, outward: Floats) -> Floats:
     normals = skin.moved(vertices).vertex_normals
     shifted: Floats = vertices + outward[:, None] * normals
     return shifted
+
+
+def distances(points: Floats, surface: Surface) -> Floats:
+    """The distance of each of (k, 3) points from a surface, (k,) mm."""
+    if not len(points):
+        return np.zeros(0)
+    away: Floats = np.linalg.norm(surface.closest(points)[0] - points, axis=1)
+    return away

@@ -14,6 +14,7 @@ from cmfsim.bones.cuts.planes import Cut, Procedure
 from cmfsim.bones.cuts.procedures import PROCEDURES, place_procedure
 from cmfsim.bones.segment_checks import check_segments
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, as_number, check_instance
@@ -422,16 +423,16 @@ def part_segment(
     points = level.lowest + index * spacing
     beside = ((points >= low - BESIDE) & (points <= high + BESIDE)).all(axis=1)
     index, points = index[beside], points[beside]
-    distances = np.array([_distance(surface, points) for surface in surfaces])
+    away = np.array([distances(points, surface) for surface in surfaces])
     # Scaled as a cut by planes is: linear in the cells that it crosses.
     steep = limit / float(np.linalg.norm(spacing))
     voxel = float(np.prod(spacing))
     parted: dict[str, ImageData] = {}
     place = tuple(index.T)
     for number, name in enumerate(pieces):
-        others = np.delete(distances, number, axis=0)
+        others = np.delete(away, number, axis=0)
         nearest = others.min(axis=0) if len(others) else np.full(len(points), np.inf)
-        depth = np.clip(0.5 * (nearest - distances[number]) * steep, -limit, limit)
+        depth = np.clip(0.5 * (nearest - away[number]) * steep, -limit, limit)
         region = np.full(values.shape, np.float32(-limit if number else limit))
         region[place] = depth
         piece = np.minimum(values, region)
@@ -443,10 +444,3 @@ def part_segment(
             "surfaces of this bone before and after, both in the frame and unit of the case"
         )
     return _checked_segments(parted)
-
-
-def _distance(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    if not len(points):
-        return np.zeros(0)
-    size: NDArray[np.float64] = np.linalg.norm(surface.closest(points)[0] - points, axis=1)
-    return size

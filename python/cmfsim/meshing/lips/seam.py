@@ -107,7 +107,10 @@ def lip_regions(
                 f"{'above' if sign > 0 else 'below'} the seam between the lips: it must run "
                 "through the mouth, with its normals up"
             )
-        patches[name] = _without_scraps(mine)
+        # Without small patches that no edge connects to the rest.
+        label = connected_labels(edges_of(mine.astype(np.int64)).pairs, len(mine))
+        size = np.bincount(label)
+        patches[name] = mine[size[label] >= LEAST_PATCH * size.max()]
     return {
         name: _region(patches[name], patches[LIPS[name == "upper"]], kinds, held) for name in LIPS
     }
@@ -138,15 +141,6 @@ def _sides(
     over = aslant <= np.maximum(ASLANT * length, ASLANT_MM)
     side[near] = np.where(over & (length <= height), np.sign(upwards).astype(np.int8), 0)
     return side
-
-
-def _without_scraps(triangles: Indices) -> Indices:
-    """The triangles without small patches that no edge connects to the rest."""
-    edges = edges_of(triangles.astype(np.int64))
-    label = connected_labels(edges.pairs, len(triangles))
-    size = np.bincount(label)
-    large: Indices = triangles[size[label] >= LEAST_PATCH * size.max()]
-    return large
 
 
 def _region(mine: Indices, other: Indices, kinds: NodeKinds, held: NDArray[np.bool_]) -> LipRegion:

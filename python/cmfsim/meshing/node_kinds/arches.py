@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.meshing.node_kinds.options import KindOptions
+from cmfsim.surfaces.depth import distances
 from cmfsim.values.anatomy import SHEET_DEPTH, Anatomy, BoneSegment, DentalArch
 from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.finding import Finding
@@ -81,8 +82,24 @@ def dental_arches(
     if missing:
         places = _places_of_teeth(anatomy)
         if places is None:
-            return DentalArches(findings=(_nothing_slides(missing),))
-        findings = (_from_teeth(missing),)
+            nothing = Finding(
+                "sliding-landmarks",
+                f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing, and "
+                "the image does not show teeth apart from bone",
+                severity="warning",
+                where="landmarks",
+                fix="place them, define regions, or set sliding = false",
+            )
+            return DentalArches(findings=(nothing,))
+        from_teeth = Finding(
+            "sliding-landmarks",
+            f"landmarks {', '.join(missing)} are missing: the sliding regions were placed from the "
+            "teeth that the image shows",
+            severity="note",
+            where="landmarks",
+            why="the depth of the vestibule is accurate only to about 3 mm",
+        )
+        findings = (from_teeth,)
     else:
         places = {n: as_point(f"landmark {n!r}", landmarks[n])
                   for n in (*UPPER_ARCH, *LOWER_ARCH)}  # fmt: skip
@@ -99,28 +116,6 @@ def dental_arches(
             jaw, tip, left, right, out, float((tip - tip_2) @ out), float(molars @ out)
         )
     return DentalArches(arches, _bearers(anatomy, segments, arches), findings)
-
-
-def _nothing_slides(missing: Sequence[str]) -> Finding:
-    return Finding(
-        "sliding-landmarks",
-        f"no sliding region at the teeth: landmarks {', '.join(missing)} are missing, and the "
-        "image does not show teeth apart from bone",
-        severity="warning",
-        where="landmarks",
-        fix="place them, define regions, or set sliding = false",
-    )
-
-
-def _from_teeth(missing: Sequence[str]) -> Finding:
-    return Finding(
-        "sliding-landmarks",
-        f"landmarks {', '.join(missing)} are missing: the sliding regions were placed from the "
-        "teeth that the image shows",
-        severity="note",
-        where="landmarks",
-        why="the depth of the vestibule is accurate only to about 3 mm",
-    )
 
 
 def _above(places: Mapping[str, Floats]) -> Floats:
@@ -281,23 +276,21 @@ def sliding_nodes(
         inside = [_in_arch(points, arches.by_jaw[jaw], options, alone=alone) for jaw in jaws]
         mine = np.flatnonzero(np.logical_and.reduce([nearest == number, near_teeth, *inside]))
         if segment.name in contacts and len(mine):
-            there = mine[_on_sheet(points[mine], contacts[segment.name])]
+            away = distances(points[mine], contacts[segment.name].searched)
+            there = mine[away <= SHEET_DEPTH]
             if len(mine) >= MANY and len(there) < LEAST_SHARE * len(mine):
-                findings.append(_far_sheet(segment.name, len(there), len(mine)))
+                far = Finding(
+                    "contact-sheet",
+                    f"of {len(mine)} nodes on {segment.name!r} at the arch only {len(there)} lie "
+                    f"within {SHEET_DEPTH:g} mm of its contact sheet; the others are joined",
+                    severity="warning",
+                    where=f"segment {segment.name}",
+                    why="lips and cheeks would be attached to the teeth there",
+                )
+                findings.append(far)
             mine = there
         slides[mine] = True
     return slides, findings
-
-
-def _far_sheet(name: str, on_sheet: int, within: int) -> Finding:
-    return Finding(
-        "contact-sheet",
-        f"of {within} nodes on {name!r} at the arch only {on_sheet} lie within {SHEET_DEPTH:g} mm "
-        "of its contact sheet; the others are joined",
-        severity="warning",
-        where=f"segment {name}",
-        why="lips and cheeks would be attached to the teeth there",
-    )
 
 
 def _in_arch(
@@ -327,12 +320,6 @@ def _in_arch(
         bite = 0.5 * arch.depth_molars + PAST_BITE
         region &= (ahead >= 0.0) | (-(offset @ out) <= bite)
     return region
-
-
-def _on_sheet(points: Floats, sheet: SurfaceData) -> NDArray[np.bool_]:
-    closest, _, _ = sheet.searched.closest(points)
-    near: NDArray[np.bool_] = np.linalg.norm(closest - points, axis=1) <= SHEET_DEPTH
-    return near
 
 
 def _near_teeth(points: Floats, anatomy: Anatomy, options: KindOptions) -> NDArray[np.bool_]:

@@ -125,9 +125,18 @@ def classify_nodes(  # noqa: PLR0913 (options by name)
     if options.sliding:
         if arches is None:
             arches = dental_arches(anatomy, segments, landmarks)
-        slides, findings = _sliding(
-            border, nearest, anatomy, segments, arches=arches, contacts=contacts, options=options
+        slides, noticed = sliding_nodes(
+            border.points,
+            nearest,
+            anatomy,
+            segments,
+            arches=arches,
+            contacts=contacts or {},
+            options=options,
         )
+        # Where every segment has regions of its own, no arch is asked for.
+        asked = set(names) - {region.segment for region in options.regions}
+        findings = (*(arches.findings if asked else ()), *noticed)
     moves = np.array([name in moved for name in names])
     carried = on_bone & moves[nearest]
     kind = np.zeros(len(points), dtype=np.uint8)
@@ -143,32 +152,6 @@ def classify_nodes(  # noqa: PLR0913 (options by name)
     counts["contested"] = int((near > 1).sum())
     counts["overruled"] = int((on_plane & (carried | slides)).sum())
     return ClassifiedNodes(kinds, counts, (*findings, *_noticed(points, kinds, counts, moved)))
-
-
-def _sliding(
-    border: "_Boundary",
-    nearest: NDArray[np.int64],
-    anatomy: Anatomy,
-    segments: Sequence[BoneSegment],
-    *,
-    arches: DentalArches,
-    contacts: Mapping[str, SurfaceData] | None,
-    options: KindOptions,
-) -> tuple[NDArray[np.bool_], tuple[Finding, ...]]:
-    """Which nodes of the boundary slide, and what to know of it."""
-    slides, findings = sliding_nodes(
-        border.points,
-        nearest,
-        anatomy,
-        segments,
-        arches=arches,
-        contacts=contacts or {},
-        options=options,
-    )
-    # Where every segment has regions of its own, no arch is asked for.
-    if {segment.name for segment in segments} - {r.segment for r in options.regions}:
-        return slides, (*arches.findings, *findings)
-    return slides, tuple(findings)
 
 
 def _counts(kinds: NodeKinds, *, fixed_on_planes: int) -> dict[str, int]:

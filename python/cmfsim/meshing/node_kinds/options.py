@@ -156,9 +156,8 @@ class KindOptions:
     def __post_init__(self) -> None:
         for name in ("bone_distance", "plane_distance", "teeth_distance"):
             as_positive(name, getattr(self, name))
-        for name in ("upper_front", "upper_molars", "lower_front", "lower_molars"):
-            as_number(name, getattr(self, name))
-        for name in ("behind", "beside"):
+        fronts = ("upper_front", "upper_molars", "lower_front", "lower_molars")
+        for name in (*fronts, "behind", "beside"):
             as_number(name, getattr(self, name))
         if not 0.0 <= as_number("lifted", self.lifted) <= MOST_LIFTED:
             raise CaseInputError(

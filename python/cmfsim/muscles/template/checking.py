@@ -12,8 +12,8 @@ from cmfsim.io.cases.templates import survey_template
 from cmfsim.io.files.reading_writing import is_there
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.repair import clean_surface
-from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface, TemplateData
@@ -125,12 +125,6 @@ def _searchable(surface: object) -> Surface | None:
     return Surface(cleaned.vertices, cleaned.triangles)
 
 
-def _distances(surface: Surface, points: Floats) -> Floats:
-    closest = surface.closest(points)[0]
-    distances: Floats = np.linalg.norm(closest - points, axis=1)
-    return distances
-
-
 def _listed(names: list[str]) -> str:
     return ", ".join(names[:MOST_NAMES]) + (", …" if len(names) > MOST_NAMES else "")
 
@@ -167,8 +161,9 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             fix="describe their positions under [landmarks.definitions], or use the usual names",
         )
     points = np.array(list(template.landmarks.values()))
-    pairs = _coincident(points)
-    for one, other in pairs:
+    away = np.linalg.norm(points[:, None] - points[None], axis=2)
+    close = np.triu(away <= 1e-6 * max(float(away.max()), 1e-300), k=1)
+    for one, other in np.argwhere(close):
         yield Finding(
             "template-landmarks",
             f"{names[one]} and {names[other]} lie in the same place",
@@ -185,12 +180,6 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             where=template.name,
             why="the map to a patient is undefined in the third direction",
         )
-
-
-def _coincident(points: Floats) -> list[tuple[int, int]]:
-    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
-    close = np.argwhere(np.triu(distance <= 1e-6 * max(float(distance.max()), 1e-300), k=1))
-    return [(int(one), int(other)) for one, other in close]
 
 
 def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Iterator[Finding]:
@@ -213,7 +202,7 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
     if skull is None:
         return
     points = np.array(list(template.landmarks.values()))
-    for name, distance in zip(template.landmarks, _distances(skull, points), strict=True):
+    for name, distance in zip(template.landmarks, distances(points, skull), strict=True):
         if distance > LANDMARK_DISTANCE:
             yield Finding(
                 "template-off",
@@ -278,7 +267,7 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
     yield from _check_muscle_surface(muscle)
     if skull is None or not len(muscle.surface.vertices):
         return
-    nearest = float(_distances(skull, muscle.surface.vertices).min())
+    nearest = float(distances(muscle.surface.vertices, skull).min())
     if nearest > MUSCLE_DISTANCE:
         yield Finding(
             "template-off",
@@ -334,7 +323,7 @@ def _check_course(muscle: MuscleSurface) -> Iterator[Finding]:
         return
     for number, line in enumerate(muscle.course):
         outside = body.winding_number(line) < 0.5
-        away = float(_distances(body, line)[outside].max(initial=0.0))
+        away = float(distances(line, body)[outside].max(initial=0.0))
         if away > COURSE_DISTANCE:
             yield Finding(
                 "template-off",

@@ -18,7 +18,7 @@ from cmfsim.registration import LandmarkAgreement, LandmarkMatch, leave_one_out,
 from cmfsim.values.checks import Floats, as_number
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import is_lower_site
-from cmfsim.values.musculature import MuscleSurface, Musculature, TemplateData
+from cmfsim.values.musculature import Musculature, TemplateData
 from cmfsim.values.surface_data import SurfaceData
 
 
@@ -301,11 +301,23 @@ def morph_template(
     warp = ThinPlateSpline(matched.source, matched.target, smoothing=smoothing)
     left_out, doubts = _agreement(matched)
     findings += doubts
-    folds, worst = _folds(template, warp)
+    folds, (smallest, name, place) = _folds(template, warp)
     if folds:
-        findings.append(_fold_finding(folds, worst))
+        where = ", ".join(f"{x:.1f}" for x in place)
+        folded = Finding(
+            "correspondence-folds",
+            f"the map turns {sum(folds.values())} vertices of {len(folds)} muscles inside out, "
+            f"most severely in {name} (Jacobian {smallest:.2g})",
+            where=f"template, at ({where}) mm",
+            why="muscles overlap themselves there, and their fibres point in wrong directions",
+            fix="check the landmarks nearby, or smooth the map",
+        )
+        findings.append(folded)
     return MorphedMusculature(
-        muscles=tuple(_morphed(muscle, warp) for muscle in template.muscles),
+        muscles=tuple(
+            replace(m, surface=_warped(m.surface, warp), course=tuple(map(warp, m.course)))
+            for m in template.muscles
+        ),
         findings=tuple(findings),
         template=template,
         warp=warp,
@@ -329,11 +341,11 @@ def without_lost(morphed: MorphedMusculature) -> MorphedMusculature:
     lower = np.array([is_lower_site(name) for name in names])
     known = np.array([name in morphed.landmarks for name in names])
     # A jaw turns and moves as a whole: three places of it say how.
-    short = []
-    for side, own in ((True, lower), (False, ~lower)):
-        all_of_it, there = int(np.count_nonzero(own)), int(np.count_nonzero(known & own))
-        if there < min(LEAST_OF_JAW, all_of_it):
-            short.append(side)
+    short = [
+        side
+        for side, own in ((True, lower), (False, ~lower))
+        if int((known & own).sum()) < min(LEAST_OF_JAW, int(own.sum()))
+    ]
     if not short:
         return morphed
     places = np.array(list(template.landmarks.values()))
@@ -366,13 +378,13 @@ def too_few(template: TemplateData, known: Collection[str]) -> Finding | None:
 
 def muscles_left_out(names: Sequence[str], reason: str) -> Finding:
     """The warning that muscles are left out."""
-    listed = ", ".join(names[:MOST_NAMES])
-    listed += f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-    return Finding(
-        "muscles-left-out",
-        f"{len(names)} muscles are left out: {listed}: {reason}",
-        where="landmarks",
-    )
+    what = f"{len(names)} muscles are left out: {_listed(names)}: {reason}"
+    return Finding("muscles-left-out", what, where="landmarks")
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(names[:MOST_NAMES]) + more
 
 
 def missing_landmarks(
@@ -385,14 +397,12 @@ def missing_landmarks(
     missing = [name for name in template.landmarks if name not in used]
     if not missing:
         return ()
-    listed = ", ".join(missing[:MOST_NAMES])
-    listed += f" and {len(missing) - MOST_NAMES} more" if len(missing) > MOST_NAMES else ""
     few = len(used) < FEW_LANDMARKS
     return (
         Finding(
             "template-landmarks-missing",
             f"{len(missing)} of the template's {len(template.landmarks)} landmarks are missing: "
-            f"{listed}; muscles are placed by the other {len(used)}",
+            f"{_listed(missing)}; muscles are placed by the other {len(used)}",
             where=where,
             why=f"fewer than {FEW_LANDMARKS} landmarks scale and rotate the muscles, but do not "
             "fit their shape"
@@ -424,11 +434,6 @@ def _agreement(matched: LandmarkMatch) -> tuple[LandmarkAgreement | None, list[F
     return left_out, [finding]
 
 
-def _morphed(muscle: MuscleSurface, warp: ThinPlateSpline) -> MuscleSurface:
-    course = tuple(warp(line) for line in muscle.course)
-    return replace(muscle, surface=_warped(muscle.surface, warp), course=course)
-
-
 def _warped(surface: SurfaceData, warp: ThinPlateSpline) -> SurfaceData:
     return replace(surface, vertices=warp(surface.vertices))
 
@@ -448,16 +453,3 @@ def _folds(
         if folds.smallest < worst[0]:
             worst = (folds.smallest, muscle.name, points[folds.worst])
     return found, worst
-
-
-def _fold_finding(folds: Mapping[str, int], worst: tuple[float, str, Floats]) -> Finding:
-    smallest, name, place = worst
-    where = ", ".join(f"{x:.1f}" for x in place)
-    return Finding(
-        "correspondence-folds",
-        f"the map turns {sum(folds.values())} vertices of {len(folds)} muscles inside out, most "
-        f"severely in {name} (Jacobian {smallest:.2g})",
-        where=f"template, at ({where}) mm",
-        why="muscles overlap themselves there, and their fibres point in wrong directions",
-        fix="check the landmarks nearby, or smooth the map",
-    )

@@ -22,6 +22,7 @@ from cmfsim.pipeline.building.case_checks import CaseLipContact, Head
 from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.surfaces.barycentric import barycentric
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import SurfaceOptions, contact_surface, surface_of_level
 from cmfsim.surfaces.topology import connected_labels, edges_of, tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
@@ -191,7 +192,7 @@ def lip_contact(
 def _touching(nodes: Floats, lip: LipRegion, other: LipRegion) -> TouchingData:
     """The nodes of a lip that may come to the other one, and that one."""
     ids = lip.nodes
-    away = _distances(nodes[ids], Surface(nodes, other.triangles))
+    away = distances(nodes[ids], Surface(nodes, other.triangles))
     return TouchingData(ids[away <= REACH], other.triangles)
 
 
@@ -224,7 +225,7 @@ def _obstacles(
         ids = region.nodes
         if not len(ids):
             continue
-        away = np.array([_distances(nodes[ids], bone) for bone in bones])
+        away = np.array([distances(nodes[ids], bone) for bone in bones])
         nearest = np.argmin(away, axis=0)
         for number, segment in enumerate(bearers):
             mine = ids[(nearest == number) & (away[number] <= REACH)]
@@ -247,7 +248,7 @@ def _sheet(segment: BoneSegment, walls: CaseContacts) -> SurfaceData:
 def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | None:
     """The part of a sheet that lies on bones and teeth, its largest piece; None if none does."""
     vertices, triangles = sheet.vertices, sheet.triangles
-    away = np.min([_distances(vertices, bone) for bone in bones], axis=0)
+    away = np.min([distances(vertices, bone) for bone in bones], axis=0)
     kept = triangles[(away[triangles] <= ON_TEETH).all(axis=1)]
     if not len(kept):
         return None
@@ -255,12 +256,6 @@ def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | Non
     kept = kept[label == np.argmax(np.bincount(label))]
     used, corners = used_nodes(kept)
     return SurfaceData(vertices[used], corners, sheet.crease_angle)
-
-
-def _distances(points: Floats, surface: Surface) -> Floats:
-    closest, _, _ = surface.closest(points)
-    distances: Floats = np.linalg.norm(closest - points, axis=1)
-    return distances
 
 
 def lip_summary(seam: LipSeam, lips: CaseLipContact) -> dict[str, Any]:

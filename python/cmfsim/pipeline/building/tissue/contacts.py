@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, SurfaceMotion, TetMesh
 from cmfsim.bones import ContactSheet, SheetOptions, contact_sheet, sheet_departure
 from cmfsim.meshing.node_kinds import DentalArches, KindOptions
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
@@ -124,7 +125,7 @@ def crushed_tets(
     for own, segment in zip(distance, segments, strict=True):
         surface = segment.surface.searched
         near = _in_box(nodes, surface, reach)
-        own[near] = _distances(nodes[near], surface)
+        own[near] = distances(nodes[near], surface)
         if segment.name in kinds.segments:
             own[kinds.segment == kinds.segments.index(segment.name)] = 0.0
     if len(segments) < 2:
@@ -208,7 +209,7 @@ def cleft_tets(
             ids = np.flatnonzero(
                 np.maximum(about[one], 0.0) + np.maximum(about[other], 0.0) < width
             )
-            both = [_distances(centroids[ids], surfaces[each]) for each in (one, other)]
+            both = [distances(centroids[ids], surfaces[each]) for each in (one, other)]
             inside[ids[both[0] + both[1] < width]] = True
     return inside
 
@@ -219,7 +220,7 @@ def _least_at_corners(
     """The distance of each tet's nearest corner from a surface; infinity beyond its box."""
     near = _in_box(nodes, surface, reach)
     distance = np.full(len(nodes), np.inf)
-    distance[near] = _distances(nodes[near], surface)
+    distance[near] = distances(nodes[near], surface)
     nearest: Floats = distance[tets].min(axis=1)
     return nearest
 
@@ -229,14 +230,6 @@ def _in_box(nodes: Floats, surface: Surface, reach: float) -> NDArray[np.int64]:
     vertices = surface.vertices
     low, high = vertices.min(axis=0) - reach, vertices.max(axis=0) + reach
     return np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
-
-
-def _distances(points: Floats, surface: Surface) -> Floats:
-    if not len(points):
-        return np.zeros(0)
-    closest, _, _ = surface.closest(points)
-    distances: Floats = np.linalg.norm(closest - points, axis=1)
-    return distances
 
 
 @dataclass(frozen=True, eq=False)
