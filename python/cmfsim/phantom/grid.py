@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.phantom.geometry.shapes import Level
+from cmfsim.phantom.shapes import Level
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
 

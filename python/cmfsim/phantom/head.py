@@ -6,7 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from cmfsim.phantom.geometry.shapes import (
+from cmfsim.phantom.grid import Field, to_surface
+from cmfsim.phantom.parameters import FaceWarp, HeadParameters, JawWarp
+from cmfsim.phantom.shapes import (
     Blend,
     Box,
     Egg,
@@ -20,8 +22,6 @@ from cmfsim.phantom.geometry.shapes import (
     smooth_curve,
     turn_about,
 )
-from cmfsim.phantom.grid import Field, to_surface
-from cmfsim.phantom.parameters import FaceWarp, HeadParameters, JawWarp
 from cmfsim.values.checks import Floats, frozen
 
 # The box of the head, mm, with the neck cut off below.

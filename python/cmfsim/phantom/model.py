@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.phantom.geometry.shapes import Level, Shape, Within, smooth_max
 from cmfsim.phantom.grid import (
     COUCH_FOAM,
     COUCH_GAP,
@@ -26,6 +25,7 @@ from cmfsim.phantom.grid import (
 from cmfsim.phantom.head import HEAD_BOX, find_skin_landmarks, find_skull_landmarks, skin_shape
 from cmfsim.phantom.muscles import Muscle, make_muscles
 from cmfsim.phantom.parameters import FaceWarp, HeadParameters, JawWarp, JawWarped
+from cmfsim.phantom.shapes import Level, Shape, Within, smooth_max
 from cmfsim.phantom.skull import (
     airway_shape,
     brain_shape,

@@ -6,7 +6,7 @@ from types import MappingProxyType
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.phantom.geometry.shapes import REACH, Box, Level, Shape, smooth_step
+from cmfsim.phantom.shapes import REACH, Box, Level, Shape, smooth_step
 from cmfsim.values.checks import Floats, as_number
 
 # Lowest and highest value of each parameter. Within them every part stays inside the skin.

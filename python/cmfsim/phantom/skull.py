@@ -7,8 +7,8 @@ encloses count as bone, as `Anatomy.bones` wants it; `brain_shape` and the like 
 
 import numpy as np
 
-from cmfsim.phantom.geometry.shapes import Blend, Box, Egg, Step, Tube, smooth_curve, turn_about
 from cmfsim.phantom.parameters import HeadParameters
+from cmfsim.phantom.shapes import Blend, Box, Egg, Step, Tube, smooth_curve, turn_about
 from cmfsim.values.checks import Floats
 
 # Centre of the left condyle, mm: the mandible opens about the axis through both.

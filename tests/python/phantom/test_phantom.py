@@ -10,8 +10,8 @@ import cmfsim
 from benches.scenes.angles import angle_between
 from cmfsim import HeadParameters, PhantomHead, make_head
 from cmfsim.phantom import BONES, LABELS, PARAMETER_RANGES
-from cmfsim.phantom.geometry.courses import COURSES
 from cmfsim.phantom.grid import HOUNSFIELD, gradient_at, level_grid
+from cmfsim.phantom.muscles import COURSES
 
 pytest.importorskip("skimage")
 

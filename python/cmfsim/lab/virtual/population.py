@@ -8,7 +8,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
-from cmfsim.phantom.geometry.courses import COURSES
+from cmfsim.phantom.muscles import COURSES
 from cmfsim.values.calibration import ADDED, PLAN
 from cmfsim.values.checks import as_number, check_one_of
 

@@ -24,9 +24,14 @@ from cmfsim.lab.virtual.mechanics.equilibrium import (
     EquilibriumOptions,
     find_equilibrium,
 )
-from cmfsim.lab.virtual.mechanics.lip_contact import ContactSum, LipContact, lips_of
+from cmfsim.lab.virtual.mechanics.lip_contact import (
+    ContactSum,
+    LipContact,
+    MouthSlit,
+    lips_of,
+    with_open_mouth,
+)
 from cmfsim.lab.virtual.mechanics.muscle_field import muscle_field, skin_share, thickened
-from cmfsim.lab.virtual.open_mouth import MouthSlit, with_open_mouth
 from cmfsim.lab.virtual.operation import (
     Operation,
     bone_distances,

@@ -9,8 +9,7 @@ from cmfsim import HeadParameters, make_head
 from cmfsim.errors import CaseInputError
 from cmfsim.lab.virtual.mechanics.body import FAT, HyperelasticBody, HyperelasticTissue
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions, find_equilibrium
-from cmfsim.lab.virtual.mechanics.lip_contact import ContactSum, Lip, LipContact
-from cmfsim.lab.virtual.open_mouth import MouthSlit
+from cmfsim.lab.virtual.mechanics.lip_contact import ContactSum, Lip, LipContact, MouthSlit
 
 SIDE = 6.0
 

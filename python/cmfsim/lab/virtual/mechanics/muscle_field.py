@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.phantom import Muscle, PhantomHead
-from cmfsim.phantom.geometry.shapes import Tube, smooth_max
 from cmfsim.phantom.muscles import MELT
+from cmfsim.phantom.shapes import Tube, smooth_max
 from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows, check_one_of
 
 # Barycentric places at which a tet is asked whether it is muscle: corners of the four smaller tets

@@ -1,1 +1,0 @@
-"""Curves and shapes that the synthetic head is made of."""
