@@ -101,16 +101,13 @@ def info(options: argparse.Namespace) -> int:
             for name, s in scene.segments.items()
         }
         answer = {
-            "sha256": scene.sha256(),
-            "n_nodes": scene.n_nodes,
-            "n_tets": scene.n_tets,
+            "sha256": scene.sha256(), "n_nodes": scene.n_nodes, "n_tets": scene.n_tets,
             "n_fixed": int(np.size(scene.fixed)),
             "lowest": nodes.min(axis=0).tolist() if len(nodes) else None,
             "highest": nodes.max(axis=0).tolist() if len(nodes) else None,
-            "tissue": scene.header()["tissue"],
-            "segments": counts,
+            "tissue": scene.header()["tissue"], "segments": counts,
             "solver": scene.options.header(),
-        }
+        }  # fmt: skip
         print(json.dumps(answer, allow_nan=False))
         return DONE
     print(f"mesh      {scene.n_nodes} nodes, {scene.n_tets} tets")

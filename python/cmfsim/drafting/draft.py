@@ -45,7 +45,6 @@ EXAMPLE = """[plan.{name}]
 translation = [0, -5, 0]  # mm, LPS: -y is forwards
 # or, as 3D Slicer saves it: transform = {{file = "{name}.h5", direction = "from-parent"}}"""
 
-
 # What the numbers of a typed motion are.
 TYPED_UNITS = {
     "translation": "mm, LPS: +x is left, -y forwards, +z up",

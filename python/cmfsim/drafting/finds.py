@@ -236,13 +236,9 @@ def listing(folder: Path) -> Listing:
             )
         name = path.name.lower()
         kinds = (
-            (LABELS, found.labels),
-            (MARKUPS, found.markups),
-            (SCENES, found.scenes),
-            (SURFACES, found.surfaces),
-            (IMAGES, found.images),
-            (TRANSFORMS, found.transforms),
-        )
+            (LABELS, found.labels), (MARKUPS, found.markups), (SCENES, found.scenes),
+            (SURFACES, found.surfaces), (IMAGES, found.images), (TRANSFORMS, found.transforms),
+        )  # fmt: skip
         kind = next((paths for endings, paths in kinds if name.endswith(endings)), None)
         if kind is not None:
             kind.append(path)

@@ -35,17 +35,11 @@ from cmfsim.values.checks import AnyPath, Floats, as_positive
 Picture = partial[None]
 SIZE = (1650, 820)
 # Where the camera stands, as a direction from the head, in LPS.
-DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
-    {
-        "front": (0.0, -1.0, 0.0),
-        "left": (1.0, 0.0, 0.0),
-        "right": (-1.0, 0.0, 0.0),
-        "left front": (0.7, -0.7, 0.1),
-        "behind": (0.35, 0.9, 0.1),
-        "above": (0.0, 0.0, 1.0),
-        "below": (0.0, 0.0, -1.0),
-    }
-)
+DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType({
+    "front": (0.0, -1.0, 0.0), "left": (1.0, 0.0, 0.0), "right": (-1.0, 0.0, 0.0),
+    "left front": (0.7, -0.7, 0.1), "behind": (0.35, 0.9, 0.1), "above": (0.0, 0.0, 1.0),
+    "below": (0.0, 0.0, -1.0),
+})  # fmt: skip
 MARGIN = 1.04
 TEXT_SIZE = 9
 LEGEND_ROW = 26  # pixels
@@ -63,7 +57,6 @@ NO_OPENGL = (
     "on a machine without a screen, install OpenGL for software rendering (Debian: libgl1, "
     "libegl1, libosmesa6)"
 )
-
 
 _may_crash: ContextVar[bool] = ContextVar("_may_crash", default=False)
 

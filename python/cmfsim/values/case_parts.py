@@ -36,14 +36,10 @@ FRAMES = ("LPS", "RAS")
 # where it goes, or the moved bone back.
 DIRECTIONS = ("to-parent", "from-parent")
 # Standard procedures, and the segments that each makes (paper 2.1, 3.1).
-PROCEDURES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "le_fort_1": ("maxilla",),
-        "le_fort_3": ("midface",),
-        "bsso": ("mandible_body", "ramus_left", "ramus_right"),
-        "genioplasty": ("chin",),
-    }
-)
+PROCEDURES: Mapping[str, tuple[str, ...]] = MappingProxyType({
+    "le_fort_1": ("maxilla",), "le_fort_3": ("midface",),
+    "bsso": ("mandible_body", "ramus_left", "ramus_right"), "genioplasty": ("chin",),
+})  # fmt: skip
 # The bone that a procedure cuts up, so that no segment has its name afterwards.
 CUT_UP: Mapping[str, str] = MappingProxyType({"bsso": "mandible"})
 # Edge length of the mesh where a case states none, mm: some 400 000 tets of a face with its neck,
@@ -77,7 +73,6 @@ COVERAGES = (0.001, 0.999)
 TISSUE_HU, METAL_HU = (-1024.0, 3071.0), (-1024.0, 4000.0)
 # Grid spacings that a head can be worked on at, mm.
 WORKING_SPACINGS = (0.2, 5.0)
-
 
 # A field that a case file states under its name (`Table.part`): any text, flag or file.
 PLAIN: Mapping[str, Any] = MappingProxyType({"unit": "", "range": (None, None), "choices": ()})

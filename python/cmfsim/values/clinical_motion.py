@@ -36,17 +36,13 @@ ON_SEGMENT = 3.0
 INCISORS = ("supradentale", "upper incisors")
 LOWER_INCISORS = ("infradentale", "lower incisors")
 POGONION = ("pogonion", "chin point")
-SITES: Mapping[str, tuple[tuple[str, str], ...]] = MappingProxyType(
-    {
-        "maxilla": (INCISORS,),
-        "midface": (INCISORS,),
-        "mandible": (LOWER_INCISORS, POGONION),
-        "mandible_body": (LOWER_INCISORS, POGONION),
-        "chin": (POGONION, ("menton", "lowest point of the chin")),
-        "ramus_left": (("gonion_L", "left angle of the mandible"),),
-        "ramus_right": (("gonion_R", "right angle of the mandible"),),
-    }
-)
+SITES: Mapping[str, tuple[tuple[str, str], ...]] = MappingProxyType({
+    "maxilla": (INCISORS,), "midface": (INCISORS,), "mandible": (LOWER_INCISORS, POGONION),
+    "mandible_body": (LOWER_INCISORS, POGONION),
+    "chin": (POGONION, ("menton", "lowest point of the chin")),
+    "ramus_left": (("gonion_L", "left angle of the mandible"),),
+    "ramus_right": (("gonion_R", "right angle of the mandible"),),
+})  # fmt: skip
 # A piece of a bone that was separated has the bone's name with a number.
 NUMBERED = re.compile(r"_\d+$")
 

@@ -61,7 +61,6 @@ MOST_VALUE = 2**16
 MOST_DEPTH = 16
 MOST_ELEMENTS = 3_000_000
 
-
 Tags = Mapping[str, str | int]
 
 

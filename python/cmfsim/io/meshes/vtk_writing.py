@@ -72,7 +72,6 @@ UNPACKERS: Mapping[str, Callable[[bytes, int], bytes]] = MappingProxyType(
     }
 )
 
-
 VTK_TETRA = 10
 VTK_TYPES = {
     "float64": "Float64", "float32": "Float32", "uint32": "UInt32", "int32": "Int32",

@@ -14,18 +14,12 @@ from cmfsim.values.prediction import MODELS
 CALIBRATION_FORMAT, CALIBRATION_VERSION = "cmfsim-calibration", 1
 
 _CASE = Closed({"case": str, "scores": {str: Span(0.0, 1e9)}, "group?": str})
-_CALIBRATION = Closed(
-    {
-        "format": frozenset({CALIBRATION_FORMAT}),
-        "version": Span(CALIBRATION_VERSION, CALIBRATION_VERSION, whole=True),
-        "model": frozenset(MODELS),
-        "settings": {str: object},
-        "settings_digest": str,
-        "cases": [_CASE],
-        "note?": str,
-        "coverage?": Maybe(Span(0.0, 1.0)),
-    }
-)
+_CALIBRATION = Closed({
+    "format": frozenset({CALIBRATION_FORMAT}),
+    "version": Span(CALIBRATION_VERSION, CALIBRATION_VERSION, whole=True),
+    "model": frozenset(MODELS), "settings": {str: object}, "settings_digest": str, "cases": [_CASE],
+    "note?": str, "coverage?": Maybe(Span(0.0, 1.0)),
+})  # fmt: skip
 
 
 def read_calibration(path: AnyPath) -> Calibration:

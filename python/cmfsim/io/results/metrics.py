@@ -42,25 +42,19 @@ _STATISTICS = {
     "count?": summaries.COUNT,
 }
 _ERRORS = {"regions": {"whole": _STATISTICS, summaries.SOME: _STATISTICS}}
+_DEPTHS = ("mean_depth_mm", "mean_before_mm", "mean_after_mm")
+_THICKNESS = {
+    "share_of_depth": summaries.Span(-1.0, 1.0), "vertices": summaries.COUNT,
+    **dict.fromkeys(_DEPTHS, _LENGTH), "mean_mm": {str: {str: _LENGTH}},
+}  # fmt: skip
 _EVALUATION = {
-    **dict.fromkeys(("case", "key", "case_key"), str),
-    "models": {frozenset(MODELS): _ERRORS},
-    "failed": {frozenset(MODELS): str},
-    "files": [EVALUATION_FILES],
-    "not_operated?": summaries.Maybe({"regions": {str: _STATISTICS}}),
-    "thickness?": {
-        "share_of_depth": summaries.Span(-1.0, 1.0),
-        "vertices": summaries.COUNT,
-        **dict.fromkeys(("mean_depth_mm", "mean_before_mm", "mean_after_mm"), _LENGTH),
-        "mean_mm": {str: {str: _LENGTH}},
-    },
-    "no_change?": _ERRORS,
-    "wilcoxon?": {str: {"p": summaries.Maybe(_SHARE)}},
-    "notes?": [str],
-    "warnings?": [str],
+    **dict.fromkeys(("case", "key", "case_key"), str), "models": {frozenset(MODELS): _ERRORS},
+    "failed": {frozenset(MODELS): str}, "files": [EVALUATION_FILES],
+    "not_operated?": summaries.Maybe({"regions": {str: _STATISTICS}}), "thickness?": _THICKNESS,
+    "no_change?": _ERRORS, "wilcoxon?": {str: {"p": summaries.Maybe(_SHARE)}},
+    "notes?": [str], "warnings?": [str], "findings?": [summaries.FINDING],
     "seconds?": {str: summaries.Span(0.0, 1e9)},
-    "findings?": [summaries.FINDING],
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,16 +16,11 @@ FORMAT = "cmfsim-population"
 STATES = MADE, FAILED, PENDING = "made", "failed", "pending"
 PARTS = TRAIN, CALIBRATION, TEST = "train", "calibration", "test"
 # A name of a patient is that of a folder.
+_ENTRY = Closed({"state": str, "part": str, "operation": str, "reason?": str})
 _POPULATION: Shape = {
-    "format": frozenset({FORMAT}),
-    "version": Span(FORMAT_VERSION, FORMAT_VERSION, whole=True),
-    "settings?": Maybe({str: object}),
-    "patients": {
-        re.compile(r"[\w-]*[^\W_][\w-]*"): Closed(
-            {"state": str, "part": str, "operation": str, "reason?": str}
-        )
-    },
-}
+    "format": frozenset({FORMAT}), "version": Span(FORMAT_VERSION, FORMAT_VERSION, whole=True),
+    "settings?": Maybe({str: object}), "patients": {re.compile(r"[\w-]*[^\W_][\w-]*"): _ENTRY},
+}  # fmt: skip
 
 
 def part_of(index: int) -> str:

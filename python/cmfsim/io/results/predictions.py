@@ -78,41 +78,27 @@ _SOLUTION = {
 _FIT = {
     **dict.fromkeys(("rms_mm", "worst_mm", "median_mm", "p95_mm", "slip_mm?"), _SIZE),
     "share": _SHARE,
-    "shape?": {
-        "scale": _SCALE,
-        "scale_interval": [_SCALE] * 2,
-        "eigenvalue_ratio": _SHARE,
-        "open": [object],
-    },
-}
+    "shape?": {"scale": _SCALE, "scale_interval": [_SCALE] * 2, "eigenvalue_ratio": _SHARE,
+               "open": [object]},
+}  # fmt: skip
 _YOUNG, _POISSON = Span(*YOUNG_RANGE), Span(-1.0, MOST_POISSON)
 _MUSCLE = {"young_along": _YOUNG, "young_across": _YOUNG, "poisson": _POISSON}
+_WIDTHS = ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm", "sd_mean_mm")
+_FACTOR = {
+    "factor": Span(0.0, 1e9), **dict.fromkeys(("n", "rank"), COUNT),
+    **dict.fromkeys(("coverage", "coverage_5_percent", "coverage_95_percent"), _SHARE),
+}  # fmt: skip
 _BAND_REGION = {
-    **dict.fromkeys(
-        ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm", "sd_mean_mm"), _SIZE
-    ),
-    "calibration": Maybe(
-        {
-            "factor": Span(0.0, 1e9),
-            **dict.fromkeys(("n", "rank"), COUNT),
-            **dict.fromkeys(("coverage", "coverage_5_percent", "coverage_95_percent"), _SHARE),
-        }
-    ),
-    "sources_rms_mm": {str: _SIZE},
-}
+    **dict.fromkeys(_WIDTHS, _SIZE), "calibration": Maybe(_FACTOR), "sources_rms_mm": {str: _SIZE},
+}  # fmt: skip
 _BAND = {
-    "state": frozenset({"calibrated", "uncalibrated"}),
-    "coverage": _SHARE,
-    "factor_uncalibrated": Maybe(Span(0.0, 1e3)),
-    "settings_digest": str,
-    "settings": {str: object},
-    "regions": {str: _BAND_REGION},
-    "sources": {str: {"sd": _SIZE, "unit": str, "reference": str}},
-    "not_covered": [str],
-    "notes": [str],
+    "state": frozenset({"calibrated", "uncalibrated"}), "coverage": _SHARE,
+    "factor_uncalibrated": Maybe(Span(0.0, 1e3)), "settings_digest": str, "settings": {str: object},
+    "regions": {str: _BAND_REGION}, "sources": {str: {"sd": _SIZE, "unit": str, "reference": str}},
+    "not_covered": [str], "notes": [str],
     "calibration": Maybe({"file": str, "note": str, "n": COUNT, "group?": Maybe(str)}),
     "seconds": _SECONDS,
-}
+}  # fmt: skip
 _PLACE = Span(-1e6, 1e6)
 _MEASURE = {
     **dict.fromkeys(("label", "unit", "norm", "source", "absent"), str),
@@ -122,46 +108,27 @@ _SITE = {
     **dict.fromkeys(("name", "moves_with"), str),
     **dict.fromkeys(("forwards_mm", "up_mm", "left_mm"), _PLACE),
 }
+_CONTACTS = {
+    "absent?": str, "n_contacts?": COUNT, "greatest_overlap_mm?": _SIZE, "least_gap_mm?": _PLACE,
+}  # fmt: skip
+_CLINICAL = {
+    "occlusion?": [_MEASURE], "cephalometry": [_MEASURE], "face": [_MEASURE], "sites": [_SITE],
+    "contacts?": _CONTACTS,
+}  # fmt: skip
+_MODULI = {
+    "fat": {"young": _YOUNG, "poisson": _POISSON}, "muscle": _MUSCLE, "muscles": {str: _MUSCLE},
+}  # fmt: skip
 PREDICTION = {
-    **dict.fromkeys(("case", "case_key", "note?", "plan_digits?"), str),
-    "model": frozenset(MODELS),
-    "versions": {str: str},
-    "inputs": {str: str},
-    "timings": {str: _SECONDS},
-    "skin": dict.fromkeys(("mean", "face_mean?", "p95", "largest"), _SIZE),
-    "plan": {str: _motion},
-    "segments": {str: {"joined": COUNT, "sliding": COUNT}},
-    "mesh": {str: object},
-    "solution": _SOLUTION,
-    "findings": [FINDING],
-    "parts": {frozenset({"bones", "muscles"}): [str]},
-    "files": [PREDICTION_FILES],
-    "left_out?": [str],
-    "clinical?": {
-        "occlusion?": [_MEASURE],
-        "cephalometry": [_MEASURE],
-        "face": [_MEASURE],
-        "sites": [_SITE],
-        "contacts?": {
-            "absent?": str,
-            "n_contacts?": COUNT,
-            "greatest_overlap_mm?": _SIZE,
-            "least_gap_mm?": _PLACE,
-        },
-    },
-    "achieved?": {"segments": {str: _FIT}},
-    "muscles?": {
-        "volumes?": {str: _LARGE},
-        "template?": str,
-        "moduli?": {
-            "fat": {"young": _YOUNG, "poisson": _POISSON},
-            "muscle": _MUSCLE,
-            "muscles": {str: _MUSCLE},
-        },
-    },
-    "refined?": bool,
-    "band?": _BAND,
-}
+    **dict.fromkeys(("case", "case_key", "note?", "plan_digits?"), str), "model": frozenset(MODELS),
+    "versions": {str: str}, "inputs": {str: str}, "timings": {str: _SECONDS},
+    "skin": dict.fromkeys(("mean", "face_mean?", "p95", "largest"), _SIZE), "plan": {str: _motion},
+    "segments": {str: {"joined": COUNT, "sliding": COUNT}}, "mesh": {str: object},
+    "solution": _SOLUTION, "findings": [FINDING],
+    "parts": {frozenset({"bones", "muscles"}): [str]}, "files": [PREDICTION_FILES],
+    "left_out?": [str], "clinical?": _CLINICAL, "achieved?": {"segments": {str: _FIT}},
+    "muscles?": {"volumes?": {str: _LARGE}, "template?": str, "moduli?": _MODULI},
+    "refined?": bool, "band?": _BAND,
+}  # fmt: skip
 
 
 def is_result_file(name: str) -> bool:

@@ -53,18 +53,11 @@ def _check(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Refuses arrays that no solve writes: other shapes, not finite, or of unknown nodes."""
     n, s = len(arrays["nodes"]), len(arrays["contact_nodes"])
     shapes: dict[str, tuple[int | None, ...]] = {
-        "nodes": (n, 3),
-        "tets": (None, 4),
-        "skin_triangles": (None, 3),
-        "displacements": (n, 3),
-        "forces": (n, 3),
-        "residual_history": (None,),
-        "contact_nodes": (s,),
-        "contact_points": (s, 3),
-        "contact_normals": (s, 3),
-        "contact_forces": (s,),
+        "nodes": (n, 3), "tets": (None, 4), "skin_triangles": (None, 3), "displacements": (n, 3),
+        "forces": (n, 3), "residual_history": (None,), "contact_nodes": (s,),
+        "contact_points": (s, 3), "contact_normals": (s, 3), "contact_forces": (s,),
         "contact_gaps": (s,),
-    }
+    }  # fmt: skip
     for name, shape in shapes.items():
         array = arrays[name]
         kinds = "iu" if name in {"tets", "skin_triangles", "contact_nodes"} else "f"
