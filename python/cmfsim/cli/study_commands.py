@@ -31,6 +31,8 @@ from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import expected_stages
 
+# What is printed of a solution.
+SOLVED = ("n_tets", "residual", "contact_iterations", "contact_gap")
 # What a study counts, and the typical time of one, s, until the first ends.
 COMPARING, ONE_CASE = "predicting and comparing the cases", 60.0
 
@@ -319,10 +321,7 @@ def _figures(entry: results.WrittenPrediction, output: Path) -> dict[str, Any]:
     solution = entry.summary["solution"]
     return {
         "model": entry.summary["model"],
-        "n_tets": solution["n_tets"],
-        "residual": solution["residual"],
-        "contact_iterations": solution["contact_iterations"],
-        "contact_gap": solution["contact_gap"],
+        **{key: solution[key] for key in SOLVED},
         "plan": {name: m["clinical"] for name, m in entry.summary["plan"].items()},
         "plan_digits": entry.summary.get("plan_digits", ""),
         "skin": dict(entry.summary["skin"]),

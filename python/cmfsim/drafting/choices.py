@@ -45,15 +45,9 @@ class Taken:
 
     def as_dict(self) -> dict[str, object]:
         """Plain values, ready for JSON."""
-        return {
-            "file": self.label,
-            "taken_for": self.taken_for,
-            "unit": self.unit,
-            "frame": self.frame,
-            "why": self.why,
-            "question": self.question,
-            **({"files": [path.name for path in self.paths]} if self.paths else {}),
-        }
+        own = ("taken_for", "unit", "frame", "why", "question")
+        values = {"file": self.label, **{name: getattr(self, name) for name in own}}
+        return {**values, "files": [p.name for p in self.paths]} if self.paths else values
 
 
 def clean(text: str) -> str:

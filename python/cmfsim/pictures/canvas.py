@@ -215,6 +215,12 @@ class Shown:
             self._actors[name] = make()
 
 
+def add_sizes(plotter: Any, shape: Any, name: str, largest: float, **more: Any) -> None:
+    """Adds a surface to a view, coloured by sizes at its vertices from 0 to the largest."""
+    looks = {"smooth_shading": True, "ambient": 0.3, "show_scalar_bar": False, **more}
+    plotter.add_mesh(shape, scalars=name, clim=(0.0, largest), cmap="viridis", **looks)
+
+
 def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: str) -> None:
     """Adds an upright scale in mm to a view.
 

@@ -8,7 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.pictures.canvas import SIZE, Picture, View, add_scale_bar, bounds, draw, polydata
+from cmfsim.pictures.canvas import (
+    SIZE,
+    Picture,
+    View,
+    add_scale_bar,
+    add_sizes,
+    bounds,
+    draw,
+    polydata,
+)
 from cmfsim.pictures.faces import SkinEnds, skin_ends, trimmed
 from cmfsim.values.checks import AnyPath, Floats, as_floats, as_positive
 from cmfsim.values.prediction import Prediction
@@ -265,16 +274,8 @@ def picture_half_width(
     def paint(plotter: Any, view: View) -> None:
         surface = polydata(vertices, skin.triangles)
         surface.point_data["band"] = np.ma.filled(half, np.nan)
-        plotter.add_mesh(
-            trimmed(surface, ends),
-            scalars="band",
-            clim=(0.0, largest),
-            cmap="viridis",
-            nan_color=NOT_EVALUATED,
-            smooth_shading=True,
-            ambient=0.3,
-            show_scalar_bar=False,
-        )
+        shape = trimmed(surface, ends)
+        add_sizes(plotter, shape, "band", largest, nan_color=NOT_EVALUATED)
         if view.direction == "left":
             add_scale_bar(plotter, (0.84, 0.27), 4, "%.1f")
 

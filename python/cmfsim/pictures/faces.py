@@ -148,15 +148,7 @@ def picture_faces(
         if not view.caption.startswith("movement"):
             add_skin(plotter, shape, colours)
             return
-        plotter.add_mesh(
-            shape,
-            scalars="movement",
-            clim=(0.0, largest),
-            cmap="viridis",
-            smooth_shading=True,
-            ambient=0.3,
-            show_scalar_bar=False,
-        )
+        canvas.add_sizes(plotter, shape, "movement", largest)
         if view.direction == "left":
             # Before the forehead: the head fills the other side.
             canvas.add_scale_bar(plotter, (0.03, 0.5), 4, "%.1f")

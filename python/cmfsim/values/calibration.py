@@ -134,10 +134,7 @@ class BandFactor:
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
         return {
-            "factor": self.factor,
-            "n": self.n,
-            "rank": self.rank,
-            "coverage": self.coverage,
+            **{name: getattr(self, name) for name in ("factor", "n", "rank", "coverage")},
             "coverage_5_percent": self.interval[0],
             "coverage_95_percent": self.interval[1],
         }

@@ -125,12 +125,8 @@ class ClinicalMotion:
         """Plain values, ready for JSON."""
         return {
             "text": self.text,
-            "forwards_mm": self.forwards,
-            "up_mm": self.up,
-            "left_mm": self.left,
-            "pitch_deg": self.pitch,
-            "yaw_deg": self.yaw,
-            "roll_deg": self.roll,
+            **{f"{name}_mm": getattr(self, name) for name in ("forwards", "up", "left")},
+            **{f"{name}_deg": getattr(self, name) for name in ("pitch", "yaw", "roll")},
             "place": self.place,
             "point": None if self.point is None else self.point.tolist(),
             "residual_mm": self.residual,
@@ -204,21 +200,11 @@ def clinical_motion(
         exact = turn.angle <= NOTHING and bool(np.abs(shift).max() <= NOTHING)
     else:
         exact = bool(np.abs(pairs[1] - pairs[0]).max(initial=0.0) <= NOTHING)
-    return ClinicalMotion(
-        segment,
-        # Zero without a sign.
-        forwards=float(-shift[1]) + 0.0,
-        up=float(shift[2]) + 0.0,
-        left=float(shift[0]) + 0.0,
-        pitch=float(-wx) + 0.0,
-        yaw=float(wz) + 0.0,
-        roll=float(-wy) + 0.0,
-        point=point,
-        place=place,
-        residual=residual,
-        source=source,
-        stays=exact,
-    )
+    # Zero without a sign.
+    forwards, up, left = (float(part) + 0.0 for part in (-shift[1], shift[2], shift[0]))
+    pitch, yaw, roll = (part + 0.0 for part in (-wx, wz, -wy))
+    shifts, turns = (forwards, up, left), (pitch, yaw, roll)
+    return ClinicalMotion(segment, *shifts, *turns, point, place, residual, source, stays=exact)
 
 
 def planned_motion(

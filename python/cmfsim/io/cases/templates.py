@@ -243,19 +243,10 @@ def _write_files(folder: Path, template: TemplateData) -> None:
     skull, landmarks = "skull.ply", "skull.mrk.json"
     write_surface(folder / skull, template.skull)
     write_landmarks(folder / landmarks, template.landmarks)
-    lines = [
-        f'format = "{TEMPLATE_FORMAT}"',
-        f"version = {FORMAT_VERSION}",
-        *(
-            f"{key} = {_toml_text(getattr(template, key))}"
-            for key in ("name", "licence", "attribution", "source")
-            if getattr(template, key)
-        ),
-        f'skull = "{skull}"',
-        "",
-        "[landmarks]",
-        f'file = "{landmarks}"',
-    ]
+    lines = [f'format = "{TEMPLATE_FORMAT}"', f"version = {FORMAT_VERSION}"]
+    about = {key: getattr(template, key) for key in ("name", "licence", "attribution", "source")}
+    lines += [f"{key} = {_toml_text(text)}" for key, text in about.items() if text]
+    lines += [f'skull = "{skull}"', "", "[landmarks]", f'file = "{landmarks}"']
     if template.definitions:
         lines += ["", "[landmarks.definitions]"]
         lines += [
@@ -264,14 +255,8 @@ def _write_files(folder: Path, template: TemplateData) -> None:
         ]
     for muscle in template.muscles:
         file, course = f"muscle-{muscle.name}.ply", f"course-{muscle.name}.mrk.json"
-        lines += [
-            "",
-            "[[muscles]]",
-            f'name = "{muscle.name}"',
-            f'side = "{muscle.side}"',
-            f'kind = "{muscle.kind}"',
-            f'file = "{file}"',
-        ]
+        own = {"name": muscle.name, "side": muscle.side, "kind": muscle.kind, "file": file}
+        lines += ["", "[[muscles]]", *(f'{key} = "{text}"' for key, text in own.items())]
         write_surface(folder / file, muscle.surface)
         if muscle.boxes is not None:
             lines.append(f"boxes = {muscle.boxes}")
