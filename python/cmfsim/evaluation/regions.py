@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -186,10 +185,15 @@ def _check_face(at: Mapping[str, Floats]) -> None:
 
 def _outlines(at: Mapping[str, Floats]) -> dict[str, list[Place]]:
     """Each region's outline in the view from the front: (left, up), mm."""
-    heights = _heights(at)
-    fold, bottom, lid, brow = heights.fold, heights.bottom, heights.lid, heights.brow
+    base_height, eyes = at["subnasale"][1], _eyes(at)
+    lip, pogonion = at["labiale_inferius"][1], at["pogonion"][1]
+    wings = 0.5 * (at["alare_L"][1] + at["alare_R"][1])
+    fold = float(lip + FOLD * (pogonion - lip))
+    bottom = float(pogonion + CHIN * (pogonion - lip))
+    lid = float(eyes + LID * (base_height - eyes))
+    brow = float(eyes - BROW * (base_height - eyes))
     root = _pair(at, "alare", NOSE_ROOT, float(at["nasion"][1]))
-    wing = _pair(at, "alare", NOSE_WIDTH, heights.wing)
+    wing = _pair(at, "alare", NOSE_WIDTH, float(wings + 0.4 * (wings - base_height)))
     base = _pair(at, "alare", NOSE_WIDTH, float(at["subnasale"][1]))
     cheilion = [at[f"cheilion_{side}"] for side in "LR"]
     corner = [(float(place[0]), float(place[1])) for place in cheilion]
@@ -213,31 +217,6 @@ def _outlines(at: Mapping[str, Floats]) -> dict[str, list[Place]]:
         "left cheek": cheeks[0],
         "right cheek": cheeks[1],
     }
-
-
-class _Heights(NamedTuple):
-    """Heights that bound regions, mm."""
-
-    fold: float
-    bottom: float
-    lid: float
-    brow: float
-    wing: float
-
-
-def _heights(at: Mapping[str, Floats]) -> _Heights:
-    """The heights of the fold below the lip, chin, lower lid, brow and wings of the nose."""
-    base = at["subnasale"][1]
-    eyes = _eyes(at)
-    lower, chin = at["labiale_inferius"][1], at["pogonion"][1]
-    wings = 0.5 * (at["alare_L"][1] + at["alare_R"][1])
-    return _Heights(
-        fold=float(lower + FOLD * (chin - lower)),
-        bottom=float(chin + CHIN * (chin - lower)),
-        lid=float(eyes + LID * (base - eyes)),
-        brow=float(eyes - BROW * (base - eyes)),
-        wing=float(wings + 0.4 * (wings - base)),
-    )
 
 
 def _eyes(at: Mapping[str, Floats]) -> float:

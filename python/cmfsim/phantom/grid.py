@@ -72,12 +72,8 @@ def gradient_at(field: Field, points: Floats, level: Level | None = None) -> Flo
     `level` is the level at the points, where it is known.
     """
     here = field(*points.T) if level is None else level
-    columns = []
-    for axis in range(3):
-        step = np.zeros(3)
-        step[axis] = DIFFERENCE
-        columns.append((field(*(points + step).T) - here) / DIFFERENCE)
-    return np.column_stack(columns)
+    steps = DIFFERENCE * np.eye(3)
+    return np.column_stack([(field(*(points + s).T) - here) / DIFFERENCE for s in steps])
 
 
 def to_surface(

@@ -154,17 +154,15 @@ class PhantomHead:
     def field(self, name: str) -> Field:
         """The level of a part or muscle as a function of x, y, z in the person's space, mm."""
         scale, warp = self.parameters.scale, self.warp
+        is_part = name in {*PARTS, "bone", "drawn_skin"}
 
         def level(x: Level, y: Level, z: Level) -> Level:
             places = warp.inverse(x, y, z)
-            if name in self.muscles:
-                return scale * self.muscles[name].drawn_level(*places)
-            return scale * self.drawn_level(name, *places)
+            if is_part:
+                return scale * self.drawn_level(name, *places)
+            return scale * self.muscles[name].drawn_level(*places)
 
-        def part(x: Level, y: Level, z: Level) -> Level:
-            return scale * self.drawn_level(name, *warp.inverse(x, y, z))
-
-        return part if name in {*PARTS, "bone", "drawn_skin"} else level
+        return level
 
     def skin_level(self, points: ArrayLike) -> Floats:
         """The level of the skin at points, (n,): positive inside, near the skin the distance in mm.

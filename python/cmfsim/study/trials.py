@@ -223,11 +223,8 @@ def _trial(
 
 def _apart(before: Musculature, after: Musculature) -> dict[str, float]:
     """Mean distance of each muscle's vertices from those of the same muscle, mm."""
-    return {
-        muscle.name: float(
-            np.linalg.norm(
-                after[muscle.name].surface.vertices - muscle.surface.vertices, axis=1
-            ).mean()
-        )
-        for muscle in before
-    }
+    found = {}
+    for muscle in before:
+        moved = after[muscle.name].surface.vertices - muscle.surface.vertices
+        found[muscle.name] = float(np.linalg.norm(moved, axis=1).mean())
+    return found

@@ -106,13 +106,8 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
             max_iterations=MOST_STEPS,
             tolerance=REST,
         )
-        found_matrix = found.matrix
-        fit = fit_shape(
-            segment,
-            bone,
-            _sized_start(segment, bone, found_matrix, options),
-            max_angle=options.max_angle,
-        )
+        start = _sized_start(segment, bone, found.matrix, options)
+        fit = fit_shape(segment, bone, start, max_angle=options.max_angle)
     except RegistrationError as error:
         raise RegistrationError(
             f"segment {name!r} cannot be registered to the post-operative bone: {error}"
@@ -138,9 +133,8 @@ def _sized_start(
     A bone of another size may be closest when it is rotated by some degrees, so the pose found at
     the same size competes with those that a quick fit finds from the place before the operation.
     """
-    starts = [matrix, *(_shifted(shift) for shift in _shifts(options))]
     best, least = matrix, np.inf
-    for start in starts:
+    for start in (matrix, *_starts(options)):
         try:
             fit = fit_shape(
                 segment, bone, start, max_angle=options.max_angle, most_points=SIZED_POINTS
@@ -154,18 +148,14 @@ def _sized_start(
     return best
 
 
-def _shifts(options: MatchOptions) -> list[Floats]:
-    """Starting positions of a search: at the segment's position, and to each side of it."""
+def _starts(options: MatchOptions) -> list[Floats]:
+    """Starts of a search, (4, 4) mm: at the segment's position, and to each side of it."""
     shifts = [np.zeros(3)]
     if options.reach > 0.0:
         shifts += [sign * options.reach * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
-    return shifts
-
-
-def _shifted(shift: Floats) -> Floats:
-    found = np.eye(4)
-    found[:3, 3] = shift
-    return found
+    starts = np.tile(np.eye(4), (len(shifts), 1, 1))
+    starts[:, :3, 3] = shifts
+    return list(starts)
 
 
 def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
@@ -174,11 +164,11 @@ def _start(vertices: Floats, bone: Surface, options: MatchOptions) -> Floats:
     order = np.random.default_rng(0).permutation(len(vertices))[:QUICK_POINTS]
     points = vertices[order]
     best: IcpFit | None = None
-    for shift in _shifts(options):
+    for start in _starts(options):
         fit = icp(
             points,
             bone,
-            initial=_shifted(shift),
+            initial=start,
             trim=options.trim,
             max_iterations=QUICK_STEPS,
             # Reaching the step limit is expected: the search continues from the best.

@@ -13,7 +13,7 @@ from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import clinical_motion
 from cmfsim.values.finding import Finding
-from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface
 
 # A bone whose vertices all move less than this was not moved, mm: rounding in a surface file.
 STILL = 1e-4
@@ -25,15 +25,11 @@ SCALED = 0.03
 UNIT_RATIOS = tuple(
     (one, other, ratio)
     for low, high, factor in (
-        ("mm", "cm", 10.0),
-        ("mm", "m", 1000.0),
-        ("cm", "m", 100.0),
-        ("mm", "inch", 25.4),
-        ("cm", "inch", 2.54),
-        ("mm", "um", 0.001),
+        ("mm", "cm", 10.0), ("mm", "m", 1000.0), ("cm", "m", 100.0), ("mm", "inch", 25.4),
+        ("cm", "inch", 2.54), ("mm", "um", 0.001),
     )
     for one, other, ratio in ((low, high, factor), (high, low, 1.0 / factor))
-)
+)  # fmt: skip
 # How near a scale must be to such a ratio, and the scale below which nothing is left of a bone.
 UNIT_TOLERANCE, LEAST_SCALE = 0.02, 0.01
 # Cosine between an edge before and after the bone's own turn, on average: 1 of a rigid bone, above
@@ -70,7 +66,14 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             )
             continue
         if not isinstance(moved, MovedSurface):
-            yield _remeshed(name, where, *moved)
+            before, after = moved
+            # The build finds its motion by its shape.
+            yield Finding(
+                "moved-remeshed",
+                f"{name} has {len(after.triangles)} triangles after and {len(before.triangles)} "
+                "before, or numbers them differently, so its rigid motion is found by its shape",
+                where=where,
+            )
             continue
         here, there = moved.surface.vertices, moved.moved_vertices
         wrong = list(check_pairs(name, where, moved))
@@ -88,16 +91,6 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
             f"every bone moves: {', '.join(least)}, by {min(least.values()):.1f} mm at least",
             where=case.where("plan"),
         )
-
-
-def _remeshed(name: str, where: str, before: SurfaceData, after: SurfaceData) -> Finding:
-    """A bone whose vertices cannot be followed: the build finds its motion by its shape."""
-    return Finding(
-        "moved-remeshed",
-        f"{name} has {len(after.triangles)} triangles after and {len(before.triangles)} before, "
-        "or numbers them differently, so its rigid motion is found by its shape",
-        where=where,
-    )
 
 
 def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]:

@@ -51,21 +51,15 @@ class SmoothDistance:
 
     def slope(self, points: Floats) -> Floats:
         """The gradients at points, (k, 3)."""
-        columns = []
-        for axis in range(3):
-            step = np.zeros(3)
-            step[axis] = DIFFERENCE
-            columns.append((self(points + step) - self(points - step)) / (2.0 * DIFFERENCE))
-        return np.column_stack(columns)
+        steps = DIFFERENCE * np.eye(3)
+        rises = [(self(points + step) - self(points - step)) / (2.0 * DIFFERENCE) for step in steps]
+        return np.column_stack(rises)
 
     def curvature(self, points: Floats) -> Floats:
         """The second derivatives at points, (k, 3, 3), symmetric."""
-        columns = []
-        for axis in range(3):
-            step = np.zeros(3)
-            step[axis] = DIFFERENCE
-            columns.append((self.slope(points + step) - self.slope(points - step)) / 2.0)
-        found = np.stack(columns, axis=2) / DIFFERENCE
+        steps = DIFFERENCE * np.eye(3)
+        rises = [(self.slope(points + step) - self.slope(points - step)) / 2.0 for step in steps]
+        found = np.stack(rises, axis=2) / DIFFERENCE
         return 0.5 * (found + found.transpose(0, 2, 1))
 
 

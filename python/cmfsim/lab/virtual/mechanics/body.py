@@ -3,7 +3,7 @@
 Arrays have the tet as their last axis, as scikit-fem's do: F (3, 3, m).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -161,14 +161,7 @@ class HyperelasticTissue:
     def of(self, tets: ArrayLike) -> "HyperelasticTissue":
         """The tissue of some of the tets."""
         rows = np.asarray(tets)
-        return HyperelasticTissue(
-            self.lambda_[rows],
-            self.mu[rows],
-            self.alpha[rows],
-            self.difference[rows],
-            self.beta[rows],
-            self.fibre[:, rows],
-        )
+        return HyperelasticTissue(*(getattr(self, f.name)[..., rows] for f in fields(self)))
 
     def energy(self, gradient: Floats) -> Floats:
         """ψ of each tet, (m,) MPa.

@@ -113,19 +113,16 @@ def with_muscles(
     >>> patient = cmfsim.with_muscles(patient, cmfsim.CaseMuscles())
     """
     begun = time.perf_counter()
-    if placed is None:
-        skull = patient.landmarks.get("skull", {}) if landmarks is None else landmarks
-        found = placed_muscles(given, skull, patient.anatomy)
-        if isinstance(found, NoMuscles):
-            return _without(patient, found)
-        timings = dict(found.seconds)
-    else:
-        found = placed()
-        if isinstance(found, NoMuscles):
-            return _without(patient, found)
-        step = "placing" if found.fit is None else "fitting"
+    skull = patient.landmarks.get("skull", {}) if landmarks is None else landmarks
+    found = placed_muscles(given, skull, patient.anatomy) if placed is None else placed()
+    if isinstance(found, NoMuscles):
+        findings = tuple(dict.fromkeys([*patient.findings, *found.findings]))
+        summary = {**patient.summary, "findings": [asdict(finding) for finding in findings]}
+        return replace(patient, findings=findings, summary=summary)
+    muscles, fit, timings = found.muscles, found.fit, dict(found.seconds)
+    if placed is not None:
+        step = "placing" if fit is None else "fitting"
         timings = {f"{step} the muscles": time.perf_counter() - begun}
-    muscles, fit = found.muscles, found.fit
     begun = time.perf_counter()
     scene = patient.scene
     mesh = TetMesh(scene.nodes, scene.tets) if mesh is None else mesh
@@ -163,10 +160,3 @@ def with_muscles(
         findings=findings,
         summary=summary,
     )
-
-
-def _without(patient: PatientModel, found: NoMuscles) -> PatientModel:
-    """The patient without muscles, and the findings that say so."""
-    findings = tuple(dict.fromkeys([*patient.findings, *found.findings]))
-    summary = {**patient.summary, "findings": [asdict(finding) for finding in findings]}
-    return replace(patient, findings=findings, summary=summary)
