@@ -57,6 +57,7 @@ def lower_jaw(head, anatomy, tmp_path_factory):
     """Only the mandible is operated: the upper teeth are the cranium's, which stays."""
 
     def change(text):
+        text = text.replace("edge_length = 7.0", "edge_length = 10.0")
         text = text.replace('[[osteotomies]]\nprocedure = "le_fort_1"\n', "")
         return text.replace("[plan.maxilla]\ntranslation = [0, -4, 0]\n", "") + LIPS
 
@@ -224,6 +225,7 @@ def test_a_face_without_a_mouth_is_not_separated_and_says_so(tmp_path, anatomy, 
     text = text[: text.index("[[osteotomies]]")] + "[plan.mandible]\ntranslation = [0, 3, 0]\n"
     marks = {n: p for n, p in head.skull_landmarks.items() if "m2" not in n}
     cmfsim.write_landmarks(path.parent / "skull.mrk.json", marks)
+    text = text.replace("edge_length = 7.0", "edge_length = 10.0")
     path.write_text(text + LIPS, encoding="utf-8")
     bare = cmfsim.Anatomy(anatomy.skin, anatomy.bones)
     model = cmfsim.build_model(cmfsim.Case.load(path), anatomy=bare, check=False)
@@ -271,12 +273,13 @@ def _deepest(model, result):
     tets, places = np.asarray(scene.tets), np.asarray(scene.nodes) + result.displacements
     corners = places[tets]
     middles = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - middles[:, None], axis=2).max()
+    reach = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
     nodes = np.unique(np.concatenate([touch.nodes for touch in scene.touching]))
-    near = cKDTree(middles).query_ball_point(places[nodes], reach)
+    near = cKDTree(middles).query_ball_point(places[nodes], reach.max())
     node, tet = np.repeat(nodes, [len(n) for n in near]), np.concatenate(near).astype(int)
-    foreign = (tets[tet] != node[:, None]).all(axis=1)
-    node, tet = node[foreign], tet[foreign]
+    inside = np.linalg.norm(places[node] - middles[tet], axis=1) <= reach[tet]
+    inside &= (tets[tet] != node[:, None]).all(axis=1)
+    node, tet = node[inside], tet[inside]
     ways = np.swapaxes(corners[tet, 1:] - corners[tet, :1], 1, 2)
     inverse = np.linalg.inv(ways)
     three = np.einsum("nij,nj->ni", inverse, places[node] - corners[tet, 0])
