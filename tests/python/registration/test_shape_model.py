@@ -8,7 +8,7 @@ import pytest
 import cmfsim
 from cmfsim.imaging.bones.model_seeds import bite_shifts
 from cmfsim.registration.proposed.average_head import average_head
-from cmfsim.registration.proposed.shape_model.fitted_head import fit_head
+from cmfsim.registration.proposed.shape_model.fitted_head import LYING, fit_head
 from cmfsim.registration.proposed.shape_model.model import HINGE
 from cmfsim.registration.proposed.shape_model.samples import samples_of
 from cmfsim.values.motion import rigid_motion
@@ -18,6 +18,11 @@ pytest.importorskip("scipy")
 
 OPENING = rigid_motion(angle=14.0, axis=(1, 0, 0), centre=HINGE)
 NOD = rigid_motion(angle=25.0, axis=(1, 0, 0), centre=(0, 0, 0))
+# LPS.
+TOWARDS = {
+    "left": (1, 0, 0), "right": (-1, 0, 0), "front": (0, -1, 0), "back": (0, 1, 0),
+    "up": (0, 0, 1), "down": (0, 0, -1),
+}  # fmt: skip
 
 
 def _moved(surface, matrix):
@@ -54,16 +59,27 @@ def test_a_known_site_moves_its_neighbours_and_lowers_their_errors(nodding):
     assert shift < np.linalg.norm(places[beside] - nodding.sites[beside])
 
 
-@pytest.mark.parametrize(
-    ("how", "axis", "angle"),
-    [("vertex to the front", (1, 0, 0), 90.0), ("face to the left", (0, 0, 1), 90.0)],
-)
-def test_a_head_that_lies_on_its_side_is_refused_with_how_it_lies(how, axis, angle):
+def test_a_head_that_lies_on_its_side_is_refused_with_how_it_lies():
     head = average_head()
-    turn = rigid_motion(angle=angle, axis=axis, centre=(0, 0, 0))
+    turn = rigid_motion(angle=90.0, axis=(0, 0, 1), centre=(0, 0, 0))
     bone = joined_surface([*head.bones.values()])
-    with pytest.raises(cmfsim.LandmarkError, match=f"the head lies with its {how}"):
+    with pytest.raises(cmfsim.LandmarkError, match="the head lies with its face to the left"):
         fit_head(samples_of(_moved(bone, turn), _moved(head.skin, turn)))
+
+
+@pytest.mark.parametrize("how", LYING)
+def test_a_head_is_turned_upright_from_where_its_name_says_that_it_lies(how):
+    turn = LYING[how]
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1.0)
+    lies = {"face": TOWARDS["front"], "vertex": TOWARDS["up"]}
+    for part, upright in lies.items():
+        for way in (way for way in TOWARDS if f"{part} to the {way}" in how):
+            np.testing.assert_allclose(turn @ TOWARDS[way], upright, atol=1e-12)
+    if "upside down" in how:
+        np.testing.assert_allclose(turn @ TOWARDS["down"], TOWARDS["up"], atol=1e-12)
+    else:
+        assert "to the" in how
 
 
 def _rows(tilt, gap=1.0):
