@@ -1,5 +1,6 @@
 """A head of ellipsoids and bars as a CT, with its parts known."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,7 @@ def _row(x, y, inner, outer, behind):
     return arch | sides
 
 
+@functools.cache
 def made_head(step: float = 2.5, *, couch: bool = True) -> Head:
     """A head with skull, separate but touching mandible, airway from nostrils to neck, couch."""
     low, high = np.array([-90.0, -115.0, -125.0]), np.array([90.0, 145.0, 140.0])
