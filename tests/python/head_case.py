@@ -1,6 +1,7 @@
 """A head of ellipsoids as a case on disk: clean, so that a test can put one defect into it."""
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -146,12 +147,20 @@ def landmarks(bodies):
     return skull, skin
 
 
+@functools.cache
+def _parts(rounds):
+    """What every head begins with, made once."""
+    bodies = surfaces(rounds)
+    return bodies, *landmarks(bodies)
+
+
 class HeadCase:
     """The files of the case in memory; `write` puts them on disk."""
 
     def __init__(self, rounds=3):
-        self.surfaces = surfaces(rounds)
-        self.skull, self.skin = landmarks(self.surfaces)
+        bodies, skull, skin = _parts(rounds)
+        self.surfaces = dict(bodies)
+        self.skull, self.skin = ({n: p.copy() for n, p in kind.items()} for kind in (skull, skin))
         self.toml = TOML
 
     def change(self, name, vertices=None, triangles=None):
