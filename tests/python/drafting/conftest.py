@@ -2,7 +2,19 @@
 
 import pytest
 
+import cmfsim
 import head_case
+from cmfsim.registration.proposed import proposal
+
+
+@pytest.fixture
+def no_landmarks(monkeypatch):
+    """Ellipsoids are refused as no head: at once, not after ten seconds in ten positions."""
+
+    def refuse(_):
+        raise cmfsim.LandmarkError("they are not a head")
+
+    monkeypatch.setattr(proposal, "fit_head", refuse)
 
 
 @pytest.fixture

@@ -85,6 +85,7 @@ def test_a_slicer_transform_is_inverted_and_stated_in_words(head):
     assert "4.0 mm backwards, 1.0 mm down" in text
 
 
+@pytest.mark.usefixtures("no_landmarks")
 def test_init_doctor_and_predict_state_one_plan_alike(head):
     """Without landmarks each stated it at a point of its own surface: three sets of numbers."""
     for name in ("skull", "skin"):
