@@ -1,5 +1,6 @@
 """The band around a prediction: what it adds up, what calibrates it, what is refused."""
 
+import functools
 import json
 import re
 
@@ -10,7 +11,7 @@ import cmfsim
 from cmfsim.cli import main
 from cmfsim.io.results.predictions import read_prediction
 from cmfsim.lab.virtual.demo import write_demo_case
-from cmfsim.pipeline import predicting
+from cmfsim.pipeline import banding, predicting
 from cmfsim.pipeline.outputs.results import write_results
 from cmfsim.surfaces.depth import tissue_depth
 from shared_values import COARSE_EDGE, coarse_demo_patient
@@ -24,6 +25,15 @@ def made(tmp_path_factory):
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
     return coarse_demo_patient(tmp_path_factory)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def solved_once():
+    """One solution of the patient for all bands, which differ by what calibrates them."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("solved_patient", "skin_rates"):
+            patch.setattr(banding, name, functools.cache(getattr(banding, name)))
+        yield
 
 
 @pytest.fixture(scope="module")
