@@ -59,14 +59,20 @@ def test_the_lower_jaw_goes_where_the_scans_have_it(scans):
     assert bite.overlap == contacts.greatest_overlap
 
 
+@pytest.fixture
+def few_points(monkeypatch):
+    """Fits of fewer points of each row: to tell that one is poor needs no hundredths of a mm."""
+    module = importlib.import_module("cmfsim.planning.occlusion.final_bite")
+    monkeypatch.setattr(module, "MOST_POINTS", 400)
+
+
 def mirrored(surface, *, turned=True):
     triangles = surface.triangles[:, ::-1] if turned else surface.triangles
     return cmfsim.SurfaceData(surface.vertices * [-1.0, 1.0, 1.0], np.ascontiguousarray(triangles))
 
 
-def test_a_mirrored_scan_is_refused_or_noticed_where_the_arch_is_symmetric(scans, monkeypatch):
-    module = importlib.import_module("cmfsim.planning.occlusion.final_bite")
-    monkeypatch.setattr(module, "MOST_POINTS", 400)
+@pytest.mark.usefixtures("few_points")
+def test_a_mirrored_scan_is_refused_or_noticed_where_the_arch_is_symmetric(scans):
     upper, lower = scans
     rows = heads.closed_rows()
     # The teeth of this head are its own mirror image: nothing in the shapes tells them apart.
@@ -84,6 +90,7 @@ def test_a_mirrored_scan_is_refused_or_noticed_where_the_arch_is_symmetric(scans
         cmfsim.final_bite(lean, rows[1], mirrored(own), mirrored(lower))
 
 
+@pytest.mark.usefixtures("few_points")
 def test_scans_of_another_shape_frame_or_unit_are_refused_by_name(scans):
     upper, lower = scans
     apart = FRAME @ cmfsim.rigid_motion((0, 0, -8)) @ np.linalg.inv(FRAME)
@@ -98,6 +105,7 @@ def test_scans_of_another_shape_frame_or_unit_are_refused_by_name(scans):
             cmfsim.final_bite(*heads.closed_rows(), *pair)
 
 
+@pytest.mark.usefixtures("few_points")
 def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
     scans, tmp_path, tmp_path_factory, capsys
 ):

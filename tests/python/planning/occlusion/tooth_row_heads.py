@@ -5,10 +5,11 @@ import functools
 import numpy as np
 
 import cmfsim
+from cmfsim.phantom.grid import level_grid
 from cmfsim.surfaces.levels import surface_of_level
 
-# Voxels of the levels, mm, and the box about the teeth.
-SPACING = 0.8
+# Voxels of the levels, where they are clipped, and the box about the teeth, mm.
+SPACING, CLIP = 0.8, 5.0
 LOWEST, HIGHEST = np.array([-46.0, -104.0, -62.0]), np.array([46.0, -28.0, -24.0])
 # The joint heads of the synthetic head, left and right.
 HINGE = ((49.0, -11.0, -3.0), (-49.0, -11.0, -3.0))
@@ -16,10 +17,11 @@ HINGE = ((49.0, -11.0, -3.0), (-49.0, -11.0, -3.0))
 
 def level(head, *names):
     """The level of bones together, mm near their surface."""
-    shape = np.ceil((HIGHEST - LOWEST) / SPACING).astype(int) + 1
-    grid = np.stack(np.indices(shape), axis=-1).reshape(-1, 3) * SPACING + LOWEST
-    values = np.max([head.bone_level(name, grid) for name in names], axis=0)
-    return cmfsim.ImageData(np.float32(values).reshape(shape), [SPACING] * 3, LOWEST)
+    sizes = np.ceil((HIGHEST - LOWEST) / SPACING).astype(int) + 1
+    axes = [low + SPACING * np.arange(n) for low, n in zip(LOWEST, sizes, strict=True)]
+    # Brick by brick, to each of which few shapes matter.
+    values = np.max([level_grid(head.field(name), axes, CLIP) for name in names], axis=0)
+    return cmfsim.ImageData(values, [SPACING] * 3, LOWEST)
 
 
 def rows_of(head, upper=("cranium", "upper_teeth"), lower=("mandible", "lower_teeth"), findings=()):
