@@ -1,5 +1,7 @@
 """Splints against VTK's measurements: closed, thick enough, and teeth seat in them."""
 
+import functools
+import importlib
 import shutil
 from dataclasses import replace
 
@@ -14,6 +16,8 @@ from cmfsim.planning.occlusion.splint import largest_piece
 pv = pytest.importorskip("pyvista")
 stencil = pytest.importorskip("vtkmodules.vtkImagingStencil")
 ndimage = pytest.importorskip("scipy.ndimage")
+spatial = pytest.importorskip("scipy.spatial")
+module = importlib.import_module("cmfsim.planning.occlusion.splint")
 modeling = pytest.importorskip("vtkmodules.vtkFiltersModeling")
 
 
@@ -45,6 +49,18 @@ def final():
     return cmfsim.splint_between(upper, lower, HINGE, opening=degrees)
 
 
+@functools.cache
+def coarse_splint():
+    return cmfsim.splint_between(*closed_rows(), HINGE, opening=3.0)
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """Voxels of 0.5 mm, and a splint of them: for what does not depend on their size."""
+    monkeypatch.setattr(module, "SPACING", 0.5)
+    return coarse_splint()
+
+
 @pytest.fixture(scope="module")
 def atlas():
     """The splint of a real skull whose upper jaw is moved by 4 mm, in its own coordinates."""
@@ -73,6 +89,10 @@ def phantom(tmp_path_factory):
 @pytest.fixture(params=["final", "atlas", pytest.param("phantom", marks=pytest.mark.slow)])
 def splint(request):
     return request.getfixturevalue(request.param)
+
+
+def crowns_of(splint):
+    return np.concatenate([r.surface.vertices[r.crowns] for r in (splint.upper, splint.lower)])
 
 
 def solid_of(surface, spacing):
@@ -135,7 +155,8 @@ def test_teeth_seat_within_a_tenth_of_a_millimetre(splint):
 def test_no_undercut_holds_a_splint(splint):
     """Pulled off either row along its axis, the splint never meets a crown more deeply."""
     for row, way in ((splint.upper, -1.0), (splint.lower, 1.0)):
-        crowns = row.surface.vertices[row.crowns]
+        # An undercut is wider than the millimetre between every fourth of these points.
+        crowns = row.surface.vertices[row.crowns][::4]
         for far in (0.3, 1.0, 2.0):
             # The row moves the other way.
             found = distance(crowns - way * far * splint.axis, splint.surface)
@@ -145,28 +166,28 @@ def test_no_undercut_holds_a_splint(splint):
 def test_walls_are_as_thick_as_asked_for(splint):
     """By VTK: between the imprints, and from either imprint to the outside of the splint."""
     least = 1.5
-    surface = splint.surface
     assert splint.thickness >= least
-    vertices = surface.vertices
-    centres = vertices[surface.triangles].mean(axis=1)
+    # Triangles are 0.3 mm wide: these points are less than a millimetre apart.
+    centres = splint.surface.vertices[splint.surface.triangles[::9]].mean(axis=1)
+    centres = centres[spatial.cKDTree(crowns_of(splint)).query(centres)[0] < 2.0]
     up = np.abs(distance(centres, splint.upper.surface))
     low = np.abs(distance(centres, splint.lower.surface))
     in_upper, in_lower = centres[up < 0.1], centres[low < 0.1]
-    assert min(len(in_upper), len(in_lower)) > 1000
+    assert min(len(in_upper), len(in_lower)) > 300
     # The points of one imprint from the other row.
     assert distance(in_upper, splint.lower.surface).min() >= least - 0.1
     assert distance(in_lower, splint.upper.surface).min() >= least - 0.1
 
 
-def test_cusps_that_are_narrower_than_voxels_are_held(final):
+def test_cusps_that_are_narrower_than_voxels_are_held(coarse):
     """Tips of a tenth of a millimetre, as those of surfaces of a CT, lie in no voxel's corner."""
-    lower = final.lower.surface
+    lower = coarse.lower.surface
     vertices = lower.vertices.copy()
-    tips = [*final.lower.cusps.values()][3:15:3]
-    vertices[tips] += 0.9 * final.axis
+    tips = [*coarse.lower.cusps.values()][3:15:3]
+    vertices[tips] += 0.9 * coarse.axis
     spiky = cmfsim.SurfaceData(vertices, lower.triangles)
-    row = replace(final.lower, surface=spiky)
-    made = cmfsim.splint_between(final.upper, row, HINGE, opening=1.0)
+    row = replace(coarse.lower, surface=spiky)
+    made = cmfsim.splint_between(coarse.upper, row, HINGE, opening=1.0)
     tips = made.lower.surface.vertices[tips]
     assert -distance(tips, made.surface).min() <= 0.1
 
@@ -194,21 +215,23 @@ def test_what_cannot_be_made_is_refused_with_its_remedy():
         cmfsim.splint_between(upper, deep, HINGE)
 
 
-def test_a_label_stands_out_of_the_front_alone(final):
+def test_a_label_stands_out_of_the_front_alone(coarse):
     matplotlib = pytest.importorskip("matplotlib")
     assert matplotlib
-    hinge = (HINGE[0], HINGE[1])
-    made = cmfsim.splint_between(final.upper, final.lower, hinge, label="AB$1")
-    away = distance(made.surface.vertices, final.surface)
-    raised = made.surface.vertices[away > 0.1]
+    made = cmfsim.splint_between(coarse.upper, coarse.lower, HINGE, label="AB$1")
+    vertices = made.surface.vertices
+    # Of all other vertices, which are those of the splint without a label, VTK need not say it.
+    new = spatial.cKDTree(coarse.surface.vertices).query(vertices)[0] > 1e-6
+    away = distance(vertices[new], coarse.surface)
+    raised = vertices[new][away > 0.1]
     # In front of the arch, about the midline, and by the height of the letters.
     assert len(raised) > 200
     assert away.max() < 0.7
-    assert raised[:, 1].max() < final.upper.arch.tip[1] + 8.0
+    assert raised[:, 1].max() < coarse.upper.arch.tip[1] + 8.0
     assert np.abs(raised[:, 0]).max() < 14.0
     assert shape_of(made.surface).is_manifold
     with pytest.raises(cmfsim.CaseError, match="splint-label"):
-        cmfsim.splint_between(final.upper, final.lower, hinge, label="a name that is too long")
+        cmfsim.splint_between(coarse.upper, coarse.lower, HINGE, label="a name that is too long")
 
 
 def test_a_jaw_without_teeth_has_no_row():
@@ -221,15 +244,15 @@ def test_a_jaw_without_teeth_has_no_row():
         cmfsim.tooth_rows(empty, [], {})
 
 
-def test_a_splint_follows_the_pose_of_the_head(final):
+def test_a_splint_follows_the_pose_of_the_head(coarse):
     """The grid is that of the bite: a turned head has the same splint, but for rounding."""
     motion = cmfsim.rigid_motion((50, -20, 1500), 20, (1, 1, 0))
-    rows = [row.moved(motion) for row in (final.upper, final.lower)]
+    rows = [row.moved(motion) for row in (coarse.upper, coarse.lower)]
     hinge = np.asarray(HINGE) @ motion[:3, :3].T + motion[:3, 3]
     turned = cmfsim.splint_between(*rows, (hinge[0], hinge[1]))
-    assert turned.thickness == pytest.approx(final.thickness, abs=1e-3)
-    np.testing.assert_allclose(turned.axis, motion[:3, :3] @ final.axis, atol=1e-6)
-    back = final.surface.vertices @ motion[:3, :3].T + motion[:3, 3]
+    assert turned.thickness == pytest.approx(coarse.thickness, abs=1e-3)
+    np.testing.assert_allclose(turned.axis, motion[:3, :3] @ coarse.axis, atol=1e-6)
+    back = coarse.surface.vertices @ motion[:3, :3].T + motion[:3, 3]
     assert np.abs(distance(back[::50], turned.surface)).max() < 0.05
 
 
