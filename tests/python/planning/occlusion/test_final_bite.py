@@ -11,6 +11,7 @@ import cmfsim
 import phantom_case
 import shared_values
 from cmfsim.cli import main
+from cmfsim.pipeline.building.case_model import planned_head
 from cmfsim.values.motion import carried
 
 pytest.importorskip("skimage")
@@ -107,8 +108,16 @@ def test_scans_of_another_shape_frame_or_unit_are_refused_by_name(scans):
 
 @pytest.mark.usefixtures("few_points")
 def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
-    scans, tmp_path, tmp_path_factory, capsys
+    scans, tmp_path, tmp_path_factory, capsys, monkeypatch
 ):
+    kept = []
+
+    def head_of(*given, **more):
+        """The head of the first run, for the second as well."""
+        kept[:] = kept or [planned_head(*given, **more)]
+        return kept[0]
+
+    monkeypatch.setattr("cmfsim.pipeline.outputs.splint.planned_head", head_of)
     levels = shared_values.drawn_levels(tmp_path_factory, 2.0)
     case = phantom_case.surface_case(tmp_path, cmfsim.make_head(), levels)
     words = ["bite", str(case), "--json", "-q", "--no-doctor"]
