@@ -1,42 +1,43 @@
-//! Sliding contact by the dense end of the factor: the flexibility of the sliding nodes and its normal part.
+//! Sliding contact by dense matrices: the flexibility of the sliding nodes and its normal part.
 
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
 use super::lifting::{Liftable, Lifted, LowRank};
-use super::symmetric::{DenseFactor, DenseSymmetric, Rough};
+use super::symmetric::{DenseSymmetric, Rough};
 use crate::algebra::simd::{Kernel, widest};
 use crate::error::{MtmError, Result};
 
-/// The flexibility of the tail nodes: the whole interaction of the sliding nodes.
+/// The flexibility of the sliding nodes: their whole interaction.
 pub struct TailFlexibility {
     /// S⁻¹ of the sliding nodes, while all nodes that may be lifted are held, mm/N.
     flexibility: Arc<DenseSymmetric>,
     /// The same in single precision, for intermediate displacements.
     rough: Arc<Rough>,
-    /// Row of the system of each tail node: sliding nodes, then those that may be lifted.
+    /// Row of the system of each node: sliding nodes, then those that may be lifted.
     rows: Arc<[u32]>,
     /// The latter, if there are any.
     lifted: Option<Lifted>,
 }
 
 impl TailFlexibility {
-    /// The flexibility of the tail from `lower`, the part of the factor of its sliding nodes; `rows` is the row of the
-    /// system of each tail node. `across` and `own`: the part of the nodes that may be lifted, row by row, in the columns
-    /// of the sliding nodes and in their own; of these nodes, those at the places `held`, ascending, are held.
+    /// From the `flexibility` of the sliding nodes while all that may be lifted are held; `rows`: the row of the system
+    /// of each, then of those. `carried` and `own`: how forces on sliding nodes are carried to those that may be
+    /// lifted, and the part of the factor of the latter, row by row; those at the places `held`, ascending, are held.
     ///
     /// # Errors
     /// `NotPositiveDefinite` if the body does not hold the others.
     pub(super) fn new(
-        lower: DenseFactor,
+        flexibility: DenseSymmetric,
         rows: Vec<u32>,
-        (across, own): (Vec<f64>, Vec<f64>),
+        (carried, own): (Vec<f64>, Vec<f64>),
         held: &[usize],
     ) -> Result<Self> {
-        let liftable = (!own.is_empty()).then(|| Arc::new(Liftable::new(&lower, across, &own)));
-        let flexibility = Arc::new(lower.inverse());
+        let width = flexibility.size();
+        let liftable = (!own.is_empty()).then(|| Arc::new(Liftable::new(width, carried, &own)));
         let rough = Arc::new(Rough::of(&flexibility));
+        let flexibility = Arc::new(flexibility);
         Self { flexibility, rough, rows: rows.into(), lifted: None }.with(liftable, held)
     }
 
@@ -61,7 +62,7 @@ impl TailFlexibility {
         self.flexibility.size() / 3
     }
 
-    /// Row of the system of each tail node.
+    /// Row of the system of each sliding node, then of those that may be lifted.
     pub fn rows(&self) -> &[u32] {
         &self.rows
     }
@@ -71,19 +72,26 @@ impl TailFlexibility {
         self.lifted.is_some()
     }
 
-    /// Displacements of all tail nodes under `forces` on them.
-    pub fn settled(&self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let (sliding, own) = forces.split_at(self.n_sliding());
-        let mut moved = self.flexibility.multiply(sliding.as_flattened());
-        if let Some(lifted) = &self.lifted {
-            let (own, sliding) = (own.as_flattened(), sliding.as_flattened());
-            let mut more = lifted.settled(own, sliding, &mut moved);
-            moved.append(&mut more);
+    /// Row of the system of each sliding node.
+    pub fn sliding_rows(&self) -> &[u32] {
+        &self.rows[..self.n_sliding()]
+    }
+
+    /// Displacements of the nodes that may be lifted, under `forces` on them.
+    pub fn lifted_by(&self, forces: &[f64]) -> Vec<f64> {
+        self.lifted.as_ref().map_or_else(Vec::new, |lifted| lifted.hold(forces))
+    }
+
+    /// Displacements of the sliding nodes from `moved`, those while all nodes that may be lifted are held, and from
+    /// those of these.
+    pub fn following(&self, mut moved: Vec<f64>, lifted: &[f64]) -> Vec<[f64; 3]> {
+        if let Some(own) = &self.lifted {
+            own.all.take_back(lifted, &mut moved);
         }
         vectors(&moved)
     }
 
-    /// Forces on the tail nodes that bring them from `moved`, their displacements without contact and with all liftable
+    /// Forces on all these nodes that bring them from `moved`, their displacements without contact and with all liftable
     /// nodes free, to those under `contact`, the forces on sliding nodes at given displacements.
     pub fn pushes(
         &self,
@@ -109,7 +117,7 @@ impl TailFlexibility {
         vectors(&moved)
     }
 
-    /// Row of the system of tail node `i`.
+    /// Row of the system of node `i`.
     pub fn row(&self, i: usize) -> usize {
         self.rows[i] as usize
     }
@@ -120,7 +128,7 @@ impl TailFlexibility {
         self.flexibility.bytes() + self.rough.bytes() + lifted
     }
 
-    /// Flexibility of tail node `i` on its own along the unit vector `axis`, mm/N, while all liftable nodes are held.
+    /// Flexibility of sliding node `i` on its own along the unit vector `axis`, mm/N, while all liftable nodes are held.
     pub fn own(&self, i: usize, axis: [f64; 3]) -> f64 {
         let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.column(3 * i + b));
         let [x, y, z] = axis;
@@ -130,7 +138,7 @@ impl TailFlexibility {
             + 2.0 * (x * y * c0[1] + x * z * c0[2] + y * z * c1[1])
     }
 
-    /// Displacements of the tail nodes under forces on them alone, S⁻¹ f.
+    /// Displacements of the sliding nodes under forces on them alone, S⁻¹ f.
     pub fn respond(&self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
         self.with_lifted(self.flexibility.multiply(forces.as_flattened()), forces)
     }
@@ -140,7 +148,7 @@ impl TailFlexibility {
         self.with_lifted(self.rough.multiply(forces.as_flattened()), forces)
     }
 
-    /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r constrains tail node i = `nodes[r]` along
+    /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r constrains node i = `nodes[r]` along
     /// the unit normal `normals[r]`; a node may have several rows. `softness[r]` (mm/N) is added to the
     /// diagonal.
     pub fn normal_flexibility(
@@ -150,7 +158,7 @@ impl TailFlexibility {
         softness: &[f64],
     ) -> DenseSymmetric {
         let directions: Vec<_> = nodes.iter().copied().zip(normals.iter().copied()).collect();
-        let more = self.more_along(&directions);
+        let more = self.more_along(&directions).map(|more| more.product());
         DenseSymmetric::from_columns(nodes.len(), |c, column| {
             let (j, n_j) = (nodes[c], normals[c]);
             // S⁻¹ n_j for node j and those after it. The columns begin on the diagonal, and the part of the
@@ -178,7 +186,7 @@ impl TailFlexibility {
             }
             if let Some(more) = &more {
                 for (r, out) in (c..).zip(column.iter_mut()) {
-                    *out += more.entry(r, c);
+                    *out += more[(r, c)];
                 }
             }
             column[0] += softness[c];
@@ -187,7 +195,7 @@ impl TailFlexibility {
 }
 
 impl TailFlexibility {
-    /// The flexibility between `directions` (tail node and unit vector, nodes ascending) in single precision,
+    /// The flexibility between `directions` (node and unit vector, nodes ascending) in single precision,
     /// with `softness` (mm/N) added to its diagonal, while all liftable nodes are held; `memory`: of an earlier one.
     pub fn rough_flexibility(
         &self,

@@ -1,8 +1,7 @@
 //! Rows at the end of the factor that each plan holds or frees, so that one factor serves all plans.
 //!
-//! The factor T Tᵀ ends with the sliding rows S and, after them, the rows L, of which a plan holds P and frees Q.
-//! G = (T_SS T_SSᵀ)⁻¹ is the flexibility of S while all of L is held, X = T_LS T_SS⁻¹ carries forces on S to L, and
-//! H = T_LL T_LLᵀ is the stiffness of L. Under forces f,
+//! The factor T Tᵀ ends with the rows L, of which a plan holds P and frees Q. G is the flexibility of the sliding rows
+//! S while all of L is held, X carries forces on S to L, and H = T_LL T_LLᵀ is the stiffness of L. Under forces f,
 //!
 //!   H_QQ u_Q = r_Q,   u_P = 0,   r = f_L − X f_S,   u_S = G f_S − Xᵀ u_L.
 //!
@@ -12,9 +11,7 @@
 use std::sync::Arc;
 
 use faer::linalg::matmul::matmul;
-use faer::linalg::triangular_solve::{
-    solve_lower_triangular_in_place, solve_upper_triangular_in_place,
-};
+use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 
 use super::symmetric::{DenseFactor, DenseSymmetric, add_scaled, dot};
@@ -32,15 +29,12 @@ pub(super) struct Liftable {
 }
 
 impl Liftable {
-    /// From the parts of the factor: T_SS; T_LS and T_LL, row by row.
-    pub fn new(end: &DenseFactor, mut carried: Vec<f64>, own: &[f64]) -> Self {
-        let (lower, width, size) = (end.lower(), end.lower().nrows(), own.len().isqrt());
-        if width > 0 {
-            let rows = MatMut::from_column_major_slice_mut(&mut carried, width, size);
-            solve_upper_triangular_in_place(lower.transpose(), rows, parallelism(width));
-        }
-        let row = |l: usize| &own[l * size..(l + 1) * size];
-        let stiffness = (0..size * size).map(|at| dot(row(at / size), row(at % size))).collect();
+    /// From X, and from T_LL, row by row.
+    pub fn new(width: usize, carried: Vec<f64>, own: &[f64]) -> Self {
+        let (size, mut stiffness) = (own.len().isqrt(), vec![0.0; own.len()]);
+        let to = MatMut::from_column_major_slice_mut(&mut stiffness, size, size);
+        let rows = MatRef::from_column_major_slice(own, size, size);
+        matmul(to, Accum::Replace, rows.transpose(), rows, 1.0, parallelism(size));
         Self { width, size, carried, stiffness }
     }
 
@@ -60,7 +54,7 @@ impl Liftable {
     }
 
     /// y ← y − Xᵀ u.
-    fn take_back(&self, u: &[f64], y: &mut [f64]) {
+    pub fn take_back(&self, u: &[f64], y: &mut [f64]) {
         u.iter().enumerate().for_each(|(l, &u)| add_scaled(self.row(l), -u, y));
     }
 }
@@ -88,7 +82,7 @@ impl Lifted {
             }
         });
         let factor = matrix.factor().map_err(|at| free[at] / 3)?;
-        let rank = free.len();
+        let (rank, count) = (free.len(), all.width);
         let mut columns: Vec<f64> = (0..all.width)
             .flat_map(|s| free.iter().map(move |&l| (l, s)))
             .map(|(l, s)| all.row(l)[s])
@@ -97,23 +91,13 @@ impl Lifted {
             let rows = MatMut::from_column_major_slice_mut(&mut columns, rank, all.width);
             solve_lower_triangular_in_place(factor.lower(), rows, parallelism(all.width));
         }
-        Ok(Self { all, free, held, factor, more: LowRank { rank, columns } })
+        Ok(Self { all, free, held, factor, more: LowRank { rank, count, columns } })
     }
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         let Liftable { carried, stiffness, .. } = &*self.all;
         8 * (self.more.columns.len() + carried.len() + stiffness.len()) + self.factor.bytes()
-    }
-
-    /// Displacements of L under forces `own` on it and `sliding` on S, and `moved`, those of S while L is held, with
-    /// what they add.
-    pub fn settled(&self, own: &[f64], sliding: &[f64], moved: &mut [f64]) -> Vec<f64> {
-        let mut r = own.to_vec();
-        self.all.take_carried(sliding, &mut r);
-        let found = self.hold(&r);
-        self.all.take_back(&found, moved);
-        found
     }
 
     /// Forces on S and L that bring the body from a state in which all of L is free, with displacements `sliding`
@@ -139,7 +123,7 @@ impl Lifted {
     }
 
     /// Displacements of L under forces r, those of P 0.
-    fn hold(&self, r: &[f64]) -> Vec<f64> {
+    pub fn hold(&self, r: &[f64]) -> Vec<f64> {
         let mut free: Vec<f64> = self.free.iter().map(|&l| r[l]).collect();
         self.factor.solve(&mut free);
         let mut out = vec![0.0; r.len()];
@@ -151,6 +135,8 @@ impl Lifted {
 /// Vᵀ V, for the columns of V one after the other.
 pub struct LowRank {
     rank: usize,
+    /// Number of columns.
+    count: usize,
     columns: Vec<f64>,
 }
 
@@ -159,14 +145,17 @@ impl LowRank {
         &self.columns[c * self.rank..(c + 1) * self.rank]
     }
 
+    fn matrix(&self) -> MatRef<'_, f64> {
+        MatRef::from_column_major_slice(&self.columns, self.rank, self.count)
+    }
+
     /// y ← y + Vᵀ V x.
     pub fn add_product(&self, x: &[f64], y: &mut [f64]) {
-        let v = MatRef::from_column_major_slice(&self.columns, self.rank, x.len());
         let (x, rows) = (MatRef::from_column_major_slice(x, x.len(), 1), y.len());
         let y = MatMut::from_column_major_slice_mut(y, rows, 1);
         let mut sum = Mat::zeros(self.rank, 1);
-        matmul(sum.as_mut(), Accum::Replace, v, x, 1.0, Par::Seq);
-        matmul(y, Accum::Add, v.transpose(), sum.as_ref(), 1.0, Par::Seq);
+        matmul(sum.as_mut(), Accum::Replace, self.matrix(), x, 1.0, Par::Seq);
+        matmul(y, Accum::Add, self.matrix().transpose(), sum.as_ref(), 1.0, Par::Seq);
     }
 
     /// The same between directions: a node of S and a unit vector each.
@@ -176,11 +165,14 @@ impl LowRank {
             let [a, b, c] = [0, 1, 2].map(|axis| self.column(3 * node + axis));
             columns.extend((0..self.rank).map(|r| x * a[r] + y * b[r] + z * c[r]));
         }
-        Self { rank: self.rank, columns }
+        Self { rank: self.rank, count: directions.len(), columns }
     }
 
-    /// Entry of Vᵀ V.
-    pub fn entry(&self, r: usize, c: usize) -> f64 {
-        dot(self.column(r), self.column(c))
+    /// Vᵀ V itself.
+    pub fn product(&self) -> Mat<f64> {
+        let v = self.matrix();
+        let mut out = Mat::zeros(v.ncols(), v.ncols());
+        matmul(out.as_mut(), Accum::Replace, v.transpose(), v, 1.0, parallelism(v.ncols()));
+        out
     }
 }

@@ -7,6 +7,7 @@ mod grid;
 mod lifting;
 mod normal;
 mod numeric;
+mod spread;
 mod structure;
 mod sweep;
 mod symmetric;
@@ -24,8 +25,9 @@ pub use normal::{
     FactorPreconditioner, NormalFactor, ProductAccuracy, Progress, ROUGH, RowForces, RowKey,
     conjugate_gradients, hopeless,
 };
-use structure::{minimum_degree, supernodal_structure};
-use sweep::Sweep;
+use spread::Spread;
+use structure::{minimum_degree, positions, supernodal_structure};
+use sweep::{Supernode, Sweep};
 pub use symmetric::{DenseFactor, DenseSymmetric, Rough};
 use workspace::{out_of_memory, parallelism};
 
@@ -42,6 +44,8 @@ pub type Tail<'a> = &'a [u32];
 pub struct Symbolic {
     /// Row of the system at each position.
     order: Vec<u32>,
+    /// Position of each row.
+    position: Vec<u32>,
     /// Number of rows kept last.
     n_tail: usize,
     structure: supernodal::SymbolicSupernodalCholesky<usize>,
@@ -89,7 +93,8 @@ impl Symbolic {
 
         let structure = supernodal_structure(matrix, &order)?;
         let tree = numeric::Tree::new(&structure, 3 * n_inner);
-        Ok(Self { order, n_tail: tail.len(), structure, tree })
+        let position = positions(&order);
+        Ok(Self { order, position, n_tail: tail.len(), structure, tree })
     }
 
     /// Bytes that a factor takes.
@@ -109,7 +114,8 @@ impl Symbolic {
             .try_reserve_exact(self.structure.len_val())
             .map_err(|_| out_of_memory("the Cholesky factor", bytes))?;
         let mut values = vec![0.0; self.structure.len_val()];
-        numeric::factor(&self.structure, &self.tree, matrix, &self.order, &mut values).map_err(
+        let order = (&self.order[..], &self.position[..]);
+        numeric::factor(&self.structure, &self.tree, matrix, order, &mut values).map_err(
             |index| MtmError::NotPositiveDefinite {
                 node: self.order[index / 3] as usize,
                 detail:
@@ -255,53 +261,95 @@ impl Factor {
         Sweep::new((&self.symbolic.structure, &self.values), &self.symbolic.tree)
     }
 
-    /// Forces on the tail rows to which `b` reduces once all others are eliminated, and the remaining data of
-    /// the elimination for [`Self::above_tail`].
-    pub fn on_tail(&self, b: &[[f64; 3]]) -> (Vec<[f64; 3]>, Vec<f64>) {
-        let (mut x, first) = (self.symbolic.permuted(b), self.symbolic.first_of_tail());
-        self.sweep().forward_to(first, &mut x);
-        (x[first..].chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect(), x)
+    /// `b` in elimination order, after all rows but those of the tail are eliminated: what is left on these are the
+    /// forces to which `b` reduces.
+    pub fn swept(&self, b: &[[f64; 3]]) -> Vec<f64> {
+        let mut x = self.symbolic.permuted(b);
+        self.sweep().forward_to(self.symbolic.first_of_tail(), &mut x);
+        x
     }
 
-    /// Displacements of all rows, given those of the tail rows.
-    pub fn above_tail(&self, mut x: Vec<f64>, tail: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    /// Adds `forces` on `rows` to what [`Self::swept`] returned.
+    pub fn push(&self, rows: &[u32], forces: &[[f64; 3]], swept: &mut [f64]) {
+        let mut x = vec![0.0; swept.len()];
+        for (&row, force) in rows.iter().zip(forces) {
+            x[3 * self.symbolic.position[row as usize] as usize..][..3].copy_from_slice(force);
+        }
+        self.sweep().forward_to(self.symbolic.first_of_tail(), &mut x);
+        swept.iter_mut().zip(x).for_each(|(to, v)| *to += v);
+    }
+
+    /// The part of `swept` on the tail.
+    pub fn on_tail<'s>(&self, swept: &'s [f64]) -> &'s [f64] {
+        &swept[self.symbolic.first_of_tail()..]
+    }
+
+    /// Displacements of `rows` while the tail is held.
+    pub fn of_rows(&self, mut swept: Vec<f64>, rows: &[u32]) -> Vec<f64> {
+        let position = |&row: &u32| 3 * self.symbolic.position[row as usize] as usize;
+        let needed = self.symbolic.tree.above(&self.symbolic.structure, rows.iter().map(position));
         let first = self.symbolic.first_of_tail();
-        x[first..].copy_from_slice(tail.as_flattened());
-        self.sweep().backward_from(first, &mut x);
-        self.symbolic.unpermuted(&x)
+        swept[first..].fill(0.0);
+        self.sweep().through(&needed).backward_from(first, &mut swept);
+        rows.iter().flat_map(|row| swept[position(row)..][..3].iter().copied()).collect()
     }
 
-    /// Flexibility S⁻¹ of the tail rows, S = L_SS L_SSᵀ their Schur complement, mm/N, of which the last `liftable`
-    /// are free except for those `held`, by their places among them.
+    /// Displacements of all rows, given those of the tail.
+    pub fn above_tail(&self, mut swept: Vec<f64>, tail: &[f64]) -> Vec<[f64; 3]> {
+        let first = self.symbolic.first_of_tail();
+        swept[first..].copy_from_slice(tail);
+        self.sweep().backward_from(first, &mut swept);
+        self.symbolic.unpermuted(&swept)
+    }
+
+    /// Flexibility of `rows`, mm/N, where the rows of the tail are free except for those `held`, by their places
+    /// among them.
     ///
     /// # Errors
-    /// `NotPositiveDefinite` if the rows that may be lifted are not held by the body.
-    pub fn tail_flexibility(&self, liftable: usize, held: &[usize]) -> Result<TailFlexibility> {
-        let first = self.symbolic.first_of_tail();
-        let (size, more) = (3 * (self.symbolic.n_tail - liftable), 3 * liftable);
-        let mut lower = vec![0.0; size * size];
-        let (mut across, mut own) = (vec![0.0; more * size], vec![0.0; more * more]);
-        let mut put = |row: usize, column: usize, value: f64| match row.checked_sub(size) {
-            None => lower[column * size + row] = value,
-            Some(row) if column < size => across[row * size + column] = value,
-            Some(row) => own[row * more + column - size] = value,
-        };
-        let l = supernodal::SupernodalLltRef::new(&self.symbolic.structure, &self.values);
-        for s in 0..self.symbolic.structure.n_supernodes() {
-            let node = l.supernode(s);
-            let (start, val, pattern) = (node.start(), node.val(), node.pattern());
-            let width = val.ncols();
-            for c in (0..width).filter(|c| start + c >= first) {
-                let column = start + c - first;
-                for r in c..width {
-                    put(start + r - first, column, val[(r, c)]);
-                }
-                for (r, &row) in pattern.iter().enumerate() {
-                    put(row - first, column, val[(width + r, c)]);
+    /// `NotPositiveDefinite` if the rows of the tail are not held by the body.
+    pub fn flexibility(&self, rows: &[u32], held: &[usize]) -> Result<TailFlexibility> {
+        let Symbolic { order, position, n_tail, structure, tree } = &*self.symbolic;
+        let (first, more) = (self.symbolic.first_of_tail(), 3 * n_tail);
+        let at = |&row: &u32| (0..3).map(move |axis| 3 * position[row as usize] as usize + axis);
+        let places: Vec<usize> = rows.iter().flat_map(at).collect();
+        let mut unknowns = places.clone();
+        unknowns.sort_unstable();
+        let l = (structure, &self.values[..]);
+        let spread = Spread { l, tree, unknowns: &unknowns, first_of_tail: first };
+        let (square, carried) = spread.square();
+        // Back in the order of the rows.
+        let size = places.len();
+        let sorted: Vec<usize> =
+            places.iter().map(|place| unknowns.partition_point(|at| at < place)).collect();
+        let flexibility = DenseSymmetric::from_columns(size, |c, column| {
+            for (to, &r) in column.iter_mut().zip(&sorted[c..]) {
+                *to = square[r.min(sorted[c]) * size + r.max(sorted[c])];
+            }
+        });
+        drop(square);
+        let mut across = vec![0.0; more * size];
+        for (s, &c) in sorted.iter().enumerate() {
+            (0..more).for_each(|l| across[l * size + s] = -carried[c * more + l]);
+        }
+        let all = [rows, &order[order.len() - n_tail..]].concat();
+        TailFlexibility::new(flexibility, all, (across, self.of_tail()), held)
+    }
+
+    /// The part of L in rows and columns of the tail, row by row.
+    fn of_tail(&self) -> Vec<f64> {
+        let (first, size) = (self.symbolic.first_of_tail(), 3 * self.symbolic.n_tail);
+        let mut own = vec![0.0; size * size];
+        for s in self.symbolic.tree.tail..self.symbolic.structure.n_supernodes() {
+            let node = Supernode::new((&self.symbolic.structure, &self.values), s);
+            let (end, rows) = (node.begin + node.width, node.rows());
+            for c in (0..node.width).filter(|c| node.begin + c >= first) {
+                let column = &node.values[c * rows..(c + 1) * rows];
+                let below = (node.begin + c..end).chain(node.pattern.iter().copied());
+                for (row, v) in below.zip(&column[c..]) {
+                    own[(row - first) * size + node.begin + c - first] = *v;
                 }
             }
         }
-        let rows = self.symbolic.order[self.symbolic.order.len() - self.symbolic.n_tail..].to_vec();
-        TailFlexibility::new(DenseFactor::from_lower(size, lower), rows, (across, own), held)
+        own
     }
 }

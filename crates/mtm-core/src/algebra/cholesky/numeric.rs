@@ -14,7 +14,6 @@ use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 use faer::{Accum, MatMut, Par};
 
-use super::structure::positions;
 use crate::algebra::blocks::BlockMatrix;
 
 /// Multiplications below which a subtree is not worth another thread.
@@ -22,7 +21,7 @@ const LEAST_WORK_FOR_A_THREAD: f64 = 2e7;
 /// Minimum share of the work on the smaller side: it bounds the depth of the sharing.
 const LEAST_SHARE_FOR_A_THREAD: f64 = 0.05;
 /// Number of rows from which the dense kernels of a front benefit from threads.
-const LEAST_ROWS_FOR_THREADS: usize = 384;
+pub(super) const LEAST_ROWS_FOR_THREADS: usize = 384;
 
 /// Elimination tree of the supernodes.
 pub struct Tree {
@@ -68,6 +67,21 @@ impl Tree {
         }
         Self { children, first, work, roots, tail }
     }
+
+    /// Which supernodes hold one of the `unknowns`, or are an ancestor of one that does.
+    pub fn above(
+        &self,
+        structure: &SymbolicSupernodalCholesky<usize>,
+        unknowns: impl Iterator<Item = usize>,
+    ) -> Vec<bool> {
+        let begin = structure.supernode_begin();
+        let mut needed = vec![false; begin.len()];
+        unknowns.for_each(|at| needed[begin.partition_point(|&b| b <= at) - 1] = true);
+        for s in 0..needed.len() {
+            needed[s] |= self.children[s].iter().any(|&child| needed[child]);
+        }
+        needed
+    }
 }
 
 /// The update that a supernode passes to its parent: the lower triangle of a square by columns, rows of its
@@ -79,7 +93,7 @@ struct Work<'a> {
     tree: &'a Tree,
     matrix: &'a BlockMatrix,
     order: &'a [u32],
-    position: Vec<u32>,
+    position: &'a [u32],
 }
 
 /// Fills `values` (zeros) with the factor; on failure, the column of the first pivot that is not positive.
@@ -87,10 +101,10 @@ pub fn factor(
     structure: &SymbolicSupernodalCholesky<usize>,
     tree: &Tree,
     matrix: &BlockMatrix,
-    order: &[u32],
+    (order, position): (&[u32], &[u32]),
     values: &mut [f64],
 ) -> Result<(), usize> {
-    let work = Work { structure, tree, matrix, order, position: positions(order) };
+    let work = Work { structure, tree, matrix, order, position };
     let start = structure.col_ptr_for_val();
     let (inner, tail) = values.split_at_mut(start[tree.tail]);
     let alone = rayon::current_num_threads() > 1;
@@ -281,7 +295,7 @@ impl Work<'_> {
 }
 
 /// Positions of the rows of a child's pattern in its parent's front, as runs of neighbours.
-struct Runs {
+pub(super) struct Runs {
     /// First row of the child, first row of the front, length.
     runs: Vec<(usize, usize, usize)>,
     /// Rows of the child's pattern.
@@ -291,7 +305,8 @@ struct Runs {
 }
 
 impl Runs {
-    fn new(child: &[usize], begin: usize, end: usize, pattern: &[usize]) -> Self {
+    /// Of the rows `child`, in the front of the columns `begin..end` with the rows `pattern` below.
+    pub fn new(child: &[usize], begin: usize, end: usize, pattern: &[usize]) -> Self {
         let mut runs: Vec<(usize, usize, usize)> = Vec::new();
         let mut next = 0;
         for (i, &row) in child.iter().enumerate() {
@@ -309,6 +324,13 @@ impl Runs {
             }
         }
         Self { runs, size: child.len(), own: child.partition_point(|&row| row < end) }
+    }
+
+    /// Copies a column with the child's rows to one of the front.
+    pub fn copy(&self, child: &[f64], front: &mut [f64]) {
+        for &(from, to, length) in &self.runs {
+            front[to..to + length].copy_from_slice(&child[from..from + length]);
+        }
     }
 
     /// Adds columns `columns` of the child's update to a target of `height` rows whose first row and column

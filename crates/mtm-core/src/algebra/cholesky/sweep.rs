@@ -151,13 +151,20 @@ pub struct Sweep<'a> {
     tree: &'a Tree,
     /// Entries of the factor from which a subtree is worth a thread.
     least: usize,
+    /// Which supernodes the backward sweep goes through, if not through all.
+    needed: Option<&'a [bool]>,
 }
 
 impl<'a> Sweep<'a> {
     /// Sweeps through `l`, whose elimination tree is `tree`.
     pub fn new(l: Columns<'a>, tree: &'a Tree) -> Self {
         let share = LEAST_SHARE_FOR_A_THREAD * l.1.len() as f64;
-        Self { l, tree, least: LEAST_ENTRIES_FOR_A_THREAD.max(share as usize) }
+        Self { l, tree, least: LEAST_ENTRIES_FOR_A_THREAD.max(share as usize), needed: None }
+    }
+
+    /// The same, backward through some supernodes alone: with each, all of its ancestors.
+    pub fn through(self, needed: &'a [bool]) -> Self {
+        Self { needed: Some(needed), ..self }
     }
 
     /// x ← L⁻¹ x.
@@ -265,8 +272,10 @@ impl<'a> Sweep<'a> {
         let mut next = last + 1;
         while next > first {
             let s = next - 1;
-            let mut x = Split { own: &mut *own, origin, above, base };
-            Supernode::new(self.l, s).backward(&mut x, &mut front);
+            if self.needed.is_none_or(|needed| needed[s]) {
+                let mut x = Split { own: &mut *own, origin, above, base };
+                Supernode::new(self.l, s).backward(&mut x, &mut front);
+            }
             next = s;
             if shared == Some(s) {
                 // Siblings between the run and the base are not ancestors of any column in the run.
@@ -325,6 +334,7 @@ mod tests {
 
     use super::super::{Symbolic, grid::grid};
     use super::Sweep;
+    use crate::vector::add;
 
     /// One column shared by 1, 2 and 3 threads: bitwise identical, and equal to the result for several columns
     /// at once; for dense and sparse right-hand sides, with and without rows kept last.
@@ -360,21 +370,48 @@ mod tests {
         }
     }
 
-    /// The forward sweep to the rows kept last, their flexibility, and the backward sweep give the whole
-    /// solution.
+    /// Rows anywhere in the order, and rows kept last that are free: what both do under forces, and with more forces
+    /// on the former, equals whole solutions.
     #[test]
-    fn sweeps_to_the_tail_and_back_equal_whole_ones() {
+    fn responses_of_some_rows_equal_whole_solutions() {
         let n = 40;
         let matrix = grid(n);
         let tail: Vec<u32> = (0..n as u32).map(|i| n as u32 * i + 7).collect();
-        let symbolic = Arc::new(Symbolic::new(&matrix, &tail).unwrap());
-        let factor = symbolic.factor(&matrix).unwrap();
-        let b: Vec<[f64; 3]> =
-            (0..n * n).map(|j| [(j as f64).cos(), 1.0, (2.0 * j as f64).sin()]).collect();
-        let (forces, swept) = factor.on_tail(&b);
-        let there = factor.tail_flexibility(0, &[]).unwrap().respond(&forces);
-        let found = factor.above_tail(swept, &there);
-        let whole = factor.solve(&b);
+        let chosen: Vec<u32> = (0..n as u32).rev().map(|i| n as u32 * i + 2 * (i % 3)).collect();
+        for tail in [&tail[..], &[]] {
+            let symbolic = Arc::new(Symbolic::new(&matrix, tail).unwrap());
+            let factor = symbolic.factor(&matrix).unwrap();
+            let flexibility = factor.flexibility(&chosen, &[]).unwrap();
+            let mut b: Vec<[f64; 3]> =
+                (0..n * n).map(|j| [(j as f64).cos(), 1.0, (2.0 * j as f64).sin()]).collect();
+            let forces: Vec<[f64; 3]> = (0..n).map(|j| [0.0, j as f64, -1.0]).collect();
+            let mut swept = factor.swept(&b);
+            let moved = factor.of_rows(swept.clone(), &chosen);
+            let lifted = flexibility.lifted_by(factor.on_tail(&swept));
+            let mut at_chosen = flexibility.following(moved, &lifted);
+            same(&at_chosen, &of(&chosen, &factor.solve(&b)));
+            factor.push(&chosen, &forces, &mut swept);
+            let lifted = flexibility.lifted_by(factor.on_tail(&swept));
+            let found = factor.above_tail(swept, &lifted);
+            for ((to, more), (&row, f)) in at_chosen
+                .iter_mut()
+                .zip(flexibility.respond(&forces))
+                .zip(chosen.iter().zip(&forces))
+            {
+                *to = add(*to, more);
+                b[row as usize] = add(b[row as usize], *f);
+            }
+            let whole = factor.solve(&b);
+            same(&found, &whole);
+            same(&at_chosen, &of(&chosen, &whole));
+        }
+    }
+
+    fn of(rows: &[u32], all: &[[f64; 3]]) -> Vec<[f64; 3]> {
+        rows.iter().map(|&row| all[row as usize]).collect()
+    }
+
+    fn same(found: &[[f64; 3]], whole: &[[f64; 3]]) {
         let largest = whole.as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));
         for (v, w) in found.as_flattened().iter().zip(whole.as_flattened()) {
             assert!((v - w).abs() <= 1e-12 * largest, "{v:e} {w:e}");

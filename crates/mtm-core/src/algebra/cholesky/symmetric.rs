@@ -266,11 +266,6 @@ impl Rough {
 }
 
 impl DenseFactor {
-    /// The lower triangle of `values`, `size` columns of `size` entries.
-    pub(super) fn from_lower(size: usize, values: Vec<f64>) -> Self {
-        Self { size, values }
-    }
-
     /// A⁻¹ = L⁻ᵀ L⁻¹: for many products, each of which reads it once, whereas a solution reads L twice.
     pub fn inverse(self) -> DenseSymmetric {
         let Self { size, mut values } = self;

@@ -126,12 +126,12 @@ impl System {
                 body.sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
             // If a part is constrained by sliding nodes alone, there is no flexibility without them.
             let (liftable, held) = body.liftable;
-            let (n_sliding, tail) = (slide_rows.len(), [&slide_rows[..], liftable].concat());
-            let kept = body.held == Support::ByPrescribed && tail.len() <= MAX_KEPT_SLIDING;
+            let (n_sliding, n_tail) = (slide_rows.len(), slide_rows.len() + liftable.len());
+            let kept = body.held == Support::ByPrescribed && n_tail <= MAX_KEPT_SLIDING;
             if !kept && !liftable.is_empty() {
-                return Err(not_liftable("sliding and liftable nodes", tail.len().to_string()));
+                return Err(not_liftable("sliding and liftable nodes", n_tail.to_string()));
             }
-            let symbolic = Arc::new(Symbolic::new(&matrix, if kept { &tail } else { &[] })?);
+            let symbolic = Arc::new(Symbolic::new(&matrix, liftable)?);
             clock.lap("ordering", true);
             if interrupted() {
                 return Err(MtmError::Interrupted);
@@ -147,7 +147,7 @@ impl System {
                 let factor = Arc::new(symbolic.factor(&matrix)?);
                 clock.lap("factor", true);
                 let normals = body.sliding.map_or(&[][..], Sliding::rest_normals);
-                let contact = ContactFactor::new(&factor, normals, (liftable.len(), held))?;
+                let contact = ContactFactor::new(&factor, (&slide_rows, normals), held)?;
                 clock.lap("contact_factor", body.sliding.is_some());
                 return Ok((with(Kept::Factor { factor, contact }), method));
             }

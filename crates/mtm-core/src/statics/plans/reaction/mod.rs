@@ -54,14 +54,14 @@ pub(crate) struct ContactFactor {
 }
 
 impl ContactFactor {
-    /// The flexibility of the sliding nodes, which are last in the elimination order, with those that may be lifted
-    /// after them: `liftable` of them, `held` by their places. `normals`: of each sliding node, at rest.
+    /// The flexibility of the sliding nodes: their rows, and their normals at rest. Those that may be lifted are last
+    /// in the elimination order; `held` are their places.
     pub fn new(
         factor: &Factor,
-        normals: &[[f64; 3]],
-        (liftable, held): (usize, &[usize]),
+        (sliding, normals): (&[u32], &[[f64; 3]]),
+        held: &[usize],
     ) -> Result<Self> {
-        let flexibility = factor.tail_flexibility(liftable, held)?;
+        let flexibility = factor.flexibility(sliding, held)?;
         let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
         let rows: Vec<ContactRow> = normals.iter().enumerate().map(row).collect();
         let offsets = vec![0.0; rows.len()];
@@ -98,15 +98,15 @@ impl ContactFactor {
 
     /// The responses to the constraints of one plan, with forces `b`.
     pub fn answers<'a>(&'a self, factor: &'a Factor, b: &[[f64; 3]]) -> Answers<'a> {
-        let (forces, swept) = factor.on_tail(b);
-        let mut free = self.flexibility.settled(&forces);
-        free.truncate(self.flexibility.n_sliding());
+        let swept = factor.swept(b);
+        let lifted = self.flexibility.lifted_by(factor.on_tail(&swept));
+        let moved = factor.of_rows(swept.clone(), self.flexibility.sliding_rows());
+        let free = self.flexibility.following(moved, &lifted);
         let (moved, pushed) = (vec![[0.0; 3]; free.len()], vec![[0.0; 3]; free.len()]);
         Answers {
             contact: self,
             factor,
             swept,
-            carried: forces,
             free,
             pushed,
             moved,
@@ -126,10 +126,8 @@ impl ContactFactor {
 pub(crate) struct Answers<'a> {
     contact: &'a ContactFactor,
     factor: &'a Factor,
-    /// The forces after the forward sweep to the sliding nodes, in elimination order.
+    /// The forces after the forward sweep, in elimination order.
     swept: Vec<f64>,
-    /// Their part on the tail.
-    carried: Vec<[f64; 3]>,
     /// Displacements of the sliding nodes without contact forces, mm.
     free: Vec<[f64; 3]>,
     /// Forces on each node in the last response, N.
@@ -340,12 +338,10 @@ impl<'a> Answers<'a> {
 
     /// Displacements of all rows of the system with `forces` on the sliding nodes.
     pub fn of_all(self, forces: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let mut carried = self.carried;
-        for (to, force) in carried.iter_mut().zip(forces) {
-            *to = add(*to, *force);
-        }
-        let there = self.contact.flexibility.settled(&carried);
-        self.factor.above_tail(self.swept, &there)
+        let mut swept = self.swept;
+        self.factor.push(self.contact.flexibility.sliding_rows(), forces, &mut swept);
+        let lifted = self.contact.flexibility.lifted_by(self.factor.on_tail(&swept));
+        self.factor.above_tail(swept, &lifted)
     }
 }
 
