@@ -29,12 +29,6 @@ CONTACT_TOLERANCE = 0.01
 Motions = Mapping[str, ArrayLike]
 
 
-# Tets up to which plans that lift other nodes share a factor. With those nodes last it costs more
-# on larger meshes: a page of 188,000 tets takes 50 instead of 75 s, but the desk 232 instead of
-# 115 s of processor time on the 434,000 of a CT.
-MOST_SHARED = 300_000
-
-
 @dataclass(frozen=True, eq=False)
 class PlanningModel:
     """The face of one patient under any rigid plan.
@@ -131,9 +125,8 @@ class PlanningModel:
         """The prediction of `predict` under a plan, solved exactly, contact included.
 
         Tissue is lifted off the bone as by this plan, with the factor of the reference; where that
-        does not hold and free nodes (more than 300,000 tets, quadratic ones, another method, more
-        sliding and lifted nodes than fit into memory), the equations are set up again, and solved
-        as a single plan is.
+        does not hold and free nodes (quadratic tets, another method, more sliding and lifted nodes
+        than fit into memory), the equations are set up again, and solved as a single plan is.
 
         Raises
         ------
@@ -242,8 +235,7 @@ def _solver(scene: Scene, lifted: LiftedTissue | None) -> StaticSolver:
     """The solver of a scene, and where it can of those of all plans, whatever they lift."""
     tensors = scene_tensors(scene)
     options = scene.options
-    small = len(scene.tets) <= MOST_SHARED
-    if lifted is not None and small and options.method == "cholesky" and options.element != "p2":
+    if lifted is not None and options.method == "cholesky" and options.element != "p2":
         # Too many nodes, or too little memory: plans that lift others are then solved on their own.
         with contextlib.suppress(SolverError):
             return solver_of(scene, tensors, (lifted.nodes, lifted.segment))
