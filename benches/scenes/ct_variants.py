@@ -243,13 +243,15 @@ class _Opening:
         return np.asarray(1.0 / (1.0 + np.exp(behind)))
 
 
-def _opening(place: Mapping[str, np.ndarray], degrees: float) -> _Opening:
+def opening(place: Mapping[str, np.ndarray], degrees: float) -> _Opening:
+    """How the lower jaw turns about the joints of a head with these landmarks."""
     joint = 0.5 * (place["supraglenoid_L"] + place["supraglenoid_R"]) + [0.0, 3.0, -12.0]
     turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
-    return _Opening(joint, turn, *_occlusal_plane(place))
+    return _Opening(joint, turn, *occlusal_plane(place))
 
 
-def _occlusal_plane(place: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def occlusal_plane(place: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """A point of the occlusal plane at the incisors, and its normal upwards."""
     bite = 0.5 * (place["supradentale"] + place["infradentale"])
     left, right = place["occlusal_line_L"], place["occlusal_line_R"]
     up = np.cross(left - right, bite - 0.5 * (left + right))
@@ -260,7 +262,7 @@ def opened(
     points: np.ndarray, landmarks: Mapping[str, np.ndarray], degrees: float = 15.0
 ) -> np.ndarray:
     """Where `with_mouth_open` moves points of the face, mm."""
-    by = _opening(landmarks, degrees)
+    by = opening(landmarks, degrees)
     turned_points = (points - by.joint) @ by.turn.T + by.joint
     low = ((points - by.bite) @ by.up < 0.0)[:, None]
     share = by.front(turned_points) * low
@@ -275,7 +277,7 @@ def with_mouth_open(
     What is below the occlusal plane in front of the spine turns; between it and the rest, tissue is
     stretched over a few millimetres beside the mouth.
     """
-    by = _opening(landmarks, degrees)
+    by = opening(landmarks, degrees)
     step, origin = np.asarray(image.spacing), np.asarray(image.lowest)
     middle, back = float(landmarks["nasion"][0]), float(landmarks["occlusal_line_L"][1])
     points = origin + step * np.moveaxis(np.indices(image.values.shape), 0, -1)
@@ -302,7 +304,7 @@ def with_mouth_open(
 
 def without_teeth(image: ImageData, landmarks: Mapping[str, np.ndarray]) -> ImageData:
     """Crowns and necks of both rows replaced by soft tissue."""
-    bite, up = _occlusal_plane(landmarks)
+    bite, up = occlusal_plane(landmarks)
     left = landmarks["occlusal_line_L"]
     x, y, z = (a - b for a, b in zip(image.axes(), bite, strict=True))
     height = x * up[0] + y * up[1] + z * up[2]

@@ -65,7 +65,7 @@ def warped(head: KnownHead) -> Iterator[tuple[str, KnownHead]]:
         "narrow": lambda p: p + (p - [middle, 0.0, 0.0]) * [-0.12, 0.0, 0.0],
         "asymmetric, chin 6 mm aside": lambda p: p + side(p) * [1.0, 0.0, 0.0],
         "long skull": lambda p: p + (p - bite) * [-0.05, 0.10, 0.0],
-        **{f"bumps, seed {s}": _bumps(head, s) for s in (1, 2, 3)},
+        **{f"bumps, seed {s}": bumps(head, s) for s in (1, 2, 3)},
         **{
             f"size {size:g}, turned by {axis}": _turned(size, angles)
             for size, axis, angles in (
@@ -80,16 +80,16 @@ def warped(head: KnownHead) -> Iterator[tuple[str, KnownHead]]:
     yield "bone 1 mm thicker", _thicker(head, 1.0)
     yield "bone 1 mm thinner", _thicker(head, -1.0)
     yield "rough by 0.7 mm", head.mapped(_rough)
-    yield "3000 triangles each", head.mapped(lambda s: _fewer(s, 3000))
-    yield "10000 triangles each", head.mapped(lambda s: _fewer(s, 10_000))
+    yield "3000 triangles each", head.mapped(lambda s: fewer(s, 3000))
+    yield "10000 triangles each", head.mapped(lambda s: fewer(s, 10_000))
     behind = float(skull["supraglenoid_L"][1]) + 15.0
-    yield "front half", head.mapped(lambda s: _where(s, lambda p: p[:, 1] < behind))
+    yield "front half", head.mapped(lambda s: where(s, lambda p: p[:, 1] < behind))
     spine = float(skull["gonion_L"][1]) + 12.0
     yield (
         "no spine",
-        head.mapped(lambda s: _where(s, lambda p: (p[:, 2] > bite[2] + 15.0) | (p[:, 1] < spine))),
+        head.mapped(lambda s: where(s, lambda p: (p[:, 2] > bite[2] + 15.0) | (p[:, 1] < spine))),
     )
-    yield "holes", head.mapped(_holed)
+    yield "holes", head.mapped(holed)
 
 
 def _turned(size: float, angles: tuple[float, float, float]) -> Move:
@@ -97,21 +97,21 @@ def _turned(size: float, angles: tuple[float, float, float]) -> Move:
     return lambda p: np.asarray(p @ turn.T)
 
 
-def _bumps(head: KnownHead, seed: int) -> Move:
+def bumps(head: KnownHead, seed: int) -> Move:
     """A smooth random deformation, at the skin of a given size along each axis."""
     rng = np.random.default_rng(seed)
     skin = head.skin.vertices
     centres, weights = skin[rng.integers(0, len(skin), 40)], rng.normal(0.0, 1.0, (40, 3))
 
-    def bumps(points: np.ndarray) -> np.ndarray:
+    def shifts(points: np.ndarray) -> np.ndarray:
         total = np.zeros_like(points)
         for centre, weight in zip(centres, weights, strict=True):
             away = ((points - centre) ** 2).sum(axis=1) / (2.0 * BUMP_REACH**2)
             total += np.exp(-away)[:, None] * weight
         return total
 
-    factor = BUMPS / np.sqrt((bumps(skin) ** 2).mean())
-    return lambda points: np.asarray(points + factor * bumps(points))
+    factor = BUMPS / np.sqrt((shifts(skin) ** 2).mean())
+    return lambda points: np.asarray(points + factor * shifts(points))
 
 
 def _normals(surface: SurfaceData) -> np.ndarray:
@@ -133,19 +133,19 @@ def _rough(surface: SurfaceData) -> SurfaceData:
     return replace(surface, vertices=surface.vertices + noise[:, None] * _normals(surface))
 
 
-def _fewer(surface: SurfaceData, count: int) -> SurfaceData:
+def fewer(surface: SurfaceData, count: int) -> SurfaceData:
+    """The surface with about so many triangles."""
     return SurfaceData(*_core.decimated(surface.vertices, surface.triangles, count))
 
 
-def _holed(surface: SurfaceData) -> SurfaceData:
+def holed(surface: SurfaceData) -> SurfaceData:
+    """The surface with 25 holes, 6 mm wide from the middle."""
     rng = np.random.default_rng(0)
     places = surface.vertices[rng.integers(0, len(surface.vertices), 25)]
-    return _where(
-        surface, lambda p: (np.linalg.norm(p[:, None] - places, axis=2) > 6.0).all(axis=1)
-    )
+    return where(surface, lambda p: (np.linalg.norm(p[:, None] - places, axis=2) > 6.0).all(axis=1))
 
 
-def _where(surface: SurfaceData, kept: Callable[[np.ndarray], np.ndarray]) -> SurfaceData:
+def where(surface: SurfaceData, kept: Callable[[np.ndarray], np.ndarray]) -> SurfaceData:
     """The triangles all of whose vertices are kept."""
     inside = np.concatenate([kept(part) for part in np.array_split(surface.vertices, 8)])
     triangles = surface.triangles[inside[surface.triangles.astype(np.int64)].all(axis=1)]

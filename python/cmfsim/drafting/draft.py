@@ -130,7 +130,9 @@ def draft_case(
         _write_surfaces(draft)
     else:
         _write_image(draft)
-        if draft.anatomy.skin is not None and draft.anatomy.bones:
+        if _labelled(draft):
+            _write_labelled(draft)
+        elif draft.anatomy.skin is not None and draft.anatomy.bones:
             text.lines.append("")
             text.comment("The same head as surfaces, instead of the CT:")
             _write_surfaces(draft, lead="# ")
@@ -245,10 +247,26 @@ def _without(taken: list[Taken], find: ImageFind | LandmarkFind, why: str) -> li
 def _beside_image(draft: Draft, taken: Taken) -> Taken:
     if "after the operation" in taken.taken_for or taken.taken_for == "not used":
         return taken
+    if taken.taken_for.removeprefix("part of ") in {"cranium", "mandible"} and _labelled(draft):
+        return taken
     kept = f"would be the {taken.taken_for}" if taken.taken_for else "not clear what it is"
     ct = draft.images.ct.label if draft.images.ct is not None else "an image"
     why = f"a case has a CT or surfaces, and {ct} is there; {kept}; {taken.why}"
     return replace(taken, taken_for="not used", why=why, question=False)
+
+
+def _labelled(draft: Draft) -> bool:
+    """Whether both bones beside the CT are those of labels: the image's own are not needed."""
+    bones = draft.anatomy.bones
+    return set(bones) == {"cranium", "mandible"} and all(b.is_made for b in bones.values())
+
+
+def _write_labelled(draft: Draft) -> None:
+    """Adds the bones of labels, which are not segmented in the CT again."""
+    draft.text.table("image.bones", "of the labels; the skin is the CT's")
+    place = place_before(draft)
+    for name, find in draft.anatomy.bones.items():
+        draft.text.value(name, quoted(surface_path(draft, find, name, place)))
 
 
 def _write_image(draft: Draft) -> None:

@@ -224,7 +224,7 @@ def surface_path(draft: Draft, find: SurfaceFind, name: str, place: Place) -> st
     else:
         path = f"{EXTRACTED}/{name}.ply"
         surface = SurfaceData(vertices, find.surface.triangles)
-        if not draft.by_image or find.role.is_after:
+        if not draft.by_image or find.role.is_after or find.is_made:
             draft.files[path] = lambda target: write_surface(target, surface)
     if known and (draft.anatomy.asks("frame") is None or not find.is_silent):
         draft.shown.surfaces[path] = vertices

@@ -168,6 +168,8 @@ class CaseImage:
     working_spacing: mm.
     series: UID or number of the DICOM series that is meant, where the folder holds several.
     rescale: Slope and intercept from the image's values to HU, where they are not HU.
+    bones: Closed surfaces of the bones in mm, instead of those that the image shows, such as those
+        of a label image; the skin is the image's.
     """
 
     file: Path = field(metadata=PLAIN)
@@ -177,6 +179,10 @@ class CaseImage:
     metal_threshold: float | None = stated(None, "HU", *METAL_HU)
     series: str | None = None
     rescale: tuple[float, float] | None = None
+    bones: Mapping[str, Path] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,8 @@ def output_folder(table: Table, folder: Path) -> Path:
 def image_of(table: Table, folder: Path) -> case_parts.CaseImage:
     """The image of [image], with how its values become HU."""
     series, rescale = _dicom_series(table), _rescale(table)
-    image = table.part(case_parts.CaseImage, folder, series=series, rescale=rescale)
+    bones = _bones(table, folder)
+    image = table.part(case_parts.CaseImage, folder, series=series, rescale=rescale, bones=bones)
     for low, high in (("skin", "bone"), ("bone", "metal")):
         small, large = (getattr(image, f"{name}_threshold") for name in (low, high))
         if small is not None and large is not None and small >= large:

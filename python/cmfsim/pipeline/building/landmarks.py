@@ -328,7 +328,11 @@ def landmark_summary(found: ProposedLandmarks) -> dict[str, Any]:
         "source": "found automatically" if is_all else "placed by hand and filled in",
         **{
             kind: {
-                name: {"error": round(site.error, 2), "doubt": site.doubt}
+                name: {
+                    "point": np.round(site.point, 3).tolist(),
+                    "error": round(site.error, 2),
+                    "doubt": site.doubt,
+                }
                 for name, site in sites.items()
             }
             for kind, sites in (("skull", found.skull), ("skin", found.skin))
