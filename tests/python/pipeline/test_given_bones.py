@@ -1,12 +1,14 @@
-"""Bones of a label image beside a CT: the skin is the CT's, and bones must lie where it has bone."""
+"""Bones of a label image beside a CT: the skin is the CT's, and both must lie in one place."""
+
+import json
 
 import numpy as np
 import pytest
-from label_images import ORIGIN, SPACING, labels, masks
 
 import cmfsim
 from cmfsim.cli import main
 from cmfsim.pipeline.building.inputs import input_hashes, read_anatomy
+from label_images import ORIGIN, SPACING, labels, masks
 
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
@@ -22,8 +24,7 @@ def folder(tmp_path_factory):
         values[mask] = 1000.0
     cmfsim.write_image(cmfsim.ImageData(values.astype(np.int16), SPACING, ORIGIN), path / "ct.nrrd")
     (path / "dataset.json").write_text(
-        '{"labels": {"Maxilla & Upper Skull": 1, "Mandible": 2, "Upper Teeth": 3, "Lower Teeth": 4}}',
-        encoding="utf-8",
+        json.dumps({"labels": {name: n for n, name in enumerate(head, start=1)}}), encoding="utf-8"
     )
     cmfsim.write_image(cmfsim.ImageData(labels(head), SPACING, ORIGIN), path / "labels.nrrd")
     assert main(["init", str(path)]) == 0
