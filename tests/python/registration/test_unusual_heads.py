@@ -9,6 +9,9 @@ import cmfsim
 import real_heads
 from benches.scenes.warped_heads import KnownHead, warped
 from cmfsim.pipeline.proposing import read_template_head
+from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.proposed.definitions import detection
+from cmfsim.registration.proposed.pose import Pose
 from cmfsim.registration.proposed.shape_model.fitted_head import FIRST
 from cmfsim.registration.proposed.shape_model.fitting import refined
 from cmfsim.registration.proposed.shape_model.model import SITES, head_model
@@ -44,3 +47,14 @@ def test_the_pose_of_a_head_of_another_size_is_found_from_every_start_that_is_ke
         state = refined(model, few, start.state(model), FIRST, still_jaw=True).state
         places = state.out(state.sites(model)[0])
         assert np.linalg.norm(places - truth, axis=1).mean() < 10.0 * size
+
+
+def test_a_site_that_a_surface_with_holes_does_not_show_is_left_out(monkeypatch):
+    """A cut chin gave a place of NaN, and the fit of all sites ended in "SVD did not converge"."""
+    sites = {"nasion": np.zeros(3), "pogonion": np.array([0.0, np.nan, -90.0])}
+    monkeypatch.setattr(detection, "find_skull_sites", lambda _: dict(sites))
+    head = average_head()
+    parts = detection.HeadSurfaces(head.bones["cranium"], head.bones["mandible"])
+    pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
+    found = detection.detect(parts, pose, detection.HeadBuild(np.eye(4), 1.0))
+    assert set(found.skull) == {"nasion"}

@@ -99,7 +99,11 @@ def detect(head: HeadSurfaces, pose: Pose, build: HeadBuild, *, skin: bool = Tru
     if head.skin is not None and skin:
         front = depth_map(placed(head.skin_points), (0, 2, 1), 1.0, FRONT_REACH)
         of_skin = find_skin_sites(front, skull)
-    wide = ({n: broad * place for n, place in sites.items()} for sites in (skull, of_skin))
+    # What a definition looks up where a cut or holed surface has nothing is not known.
+    wide = (
+        {n: broad * place for n, place in sites.items() if np.isfinite(place).all()}
+        for sites in (skull, of_skin)
+    )
     return Detected(*wide)
 
 
