@@ -15,6 +15,7 @@ from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.registration.proposed import TemplateHead, landmarks_from
 from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.proposed.proposal import DOUBTFUL
 from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
     SiteDistribution,
@@ -348,6 +349,7 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
         site: ProposedSite | None
         if key in given:
             site = _given_site(key, *given[key], surfaces)
+            site = _compared(site, key, before, points, stds)
         else:
             site = _following(head.landmarks, key, mean, float(error), float(share))
             site = site if shift > STILL or site is None else _as_found(head.landmarks, key, site)
@@ -402,6 +404,26 @@ def _given_site(
         doubt = f"it lies on the {other}, {distance:.0f} mm from the {own}"
     place = closest if distance <= DRAWN else point
     return ProposedSite(place, state.error, doubt, state.origin)
+
+
+def _compared(
+    site: ProposedSite,
+    key: SiteKey,
+    before: SiteDistribution,
+    points: Mapping[SiteKey, Floats],
+    stds: Mapping[SiteKey, float],
+) -> ProposedSite:
+    """A site of a person, doubtful if it lies far from where the image and the other ones put it.
+
+    This is how a click on another tooth, on the other side or on the other jaw shows.
+    """
+    others = before.given({k: p for k, p in points.items() if k != key}, stds)
+    row = others.names.index(key)
+    gap = float(np.linalg.norm(site.point - others.mean[row]))
+    if gap <= DOUBTFUL * float(np.hypot(others.errors[row], np.sqrt(3.0) * stds[key])):
+        return site
+    reason = f"the image and the other sites place it {gap:.0f} mm away"
+    return replace(site, doubt="; ".join(filter(None, (site.doubt, reason))))
 
 
 def _following(

@@ -211,6 +211,24 @@ def test_clicks_where_the_other_jaw_was_found_are_refused(found, case):
         found(points, case, wrong)
 
 
+def test_a_wrong_click_is_doubted_by_name_and_right_ones_are_not(found, case):
+    """10 mm off, on the other side, and on the other jaw."""
+    points = landmarks("ct_phantom")
+    right = {name: points[name] + [0.9, -0.9, 0.9] for name in UPPER_ROW}
+    assert not {f.code for f in found(points, case, right)[1]} & {"landmark-doubtful"}
+    left, mirrored = "supra_m2_L", "supra_m2_R"
+    for wrong in (
+        {left: points[left] + [0.0, -10.0, 0.0]},
+        {left: points[mirrored], mirrored: points[left]},
+        {"supradentale": points["infradentale"]},
+    ):
+        try:
+            told = [f.what for f in found(points, case, {**right, **wrong})[1]]
+        except cmfsim.LandmarkError as error:
+            told = [str(error)]
+        assert any(name in what for name in wrong for what in told)
+
+
 def test_a_mandible_that_is_none_is_left_out_where_the_plan_does_not_need_it(found, case):
     points = landmarks("ct_phantom")
     head, findings = found(points, case, {}, "its incisors are 102 mm above the upper ones")

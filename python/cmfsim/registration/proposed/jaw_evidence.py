@@ -35,6 +35,7 @@ VOLUMES, POSSIBLE_VOLUMES = (33.0, 100.0), (15.0, 140.0)
 WEAK_ERROR, WEAK_FRONT_ERROR = 10.0, 5.0
 BACK_SITES = ("sub_m2", "supra_m2", "occlusal_line", "gonion")
 FRONT_SITES = ("infradentale", "supradentale", "mid_philtrum", "supramentale", "pogonion", "menton")
+MOUTH_SITES = ("labiale_inferius", "cheilion")
 # Sites of the average head that separate jaws whose own sites are not known.
 USUAL_SITES = ("supradentale", "infradentale", "occlusal_line_L", "occlusal_line_R", "menton")
 # The end of the tooth rows beside and behind the incisors, average-head mm.
@@ -153,15 +154,20 @@ def _volume(surface: SurfaceData) -> float:
 
 
 def weakened(
-    sites: Mapping[str, ProposedSite], evidence: JawEvidence, size: float
+    sites: Mapping[str, ProposedSite], evidence: JawEvidence, size: float, kind: str = "skull"
 ) -> dict[str, ProposedSite]:
-    """The sites of the skull, doubtful and with a large error where they rest on weak evidence."""
-    if not evidence.reason:
+    """The sites, doubtful and with a large error where they rest on weak evidence.
+
+    Those of the skin rest on the jaw where the mouth is open: its corners and the lower lip are
+    looked for where a closed one has them.
+    """
+    if not evidence.reason or (kind == "skin" and not evidence.is_open):
         return dict(sites)
+    weak = (*BACK_SITES, *FRONT_SITES) if kind == "skull" else MOUTH_SITES
     result = {}
     for name, site in sites.items():
         least = WEAK_ERROR if name.startswith(BACK_SITES) else WEAK_FRONT_ERROR
-        if name.startswith((*BACK_SITES, *FRONT_SITES)):
+        if name.startswith(weak):
             doubt = "; ".join(filter(None, (site.doubt, f"its jaw: {evidence.reason}")))
             site = replace(site, error=max(site.error, size * least), doubt=doubt)  # noqa: PLW2901
         result[name] = site

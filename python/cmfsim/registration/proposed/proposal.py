@@ -43,6 +43,8 @@ from cmfsim.values.surface_data import SurfaceData, joined_surface
 # Deviations from which a site is doubtful, and from which it is the model's: of normal errors along
 # three axes 3 % and 0.03 % are larger.
 DOUBTFUL, REPLACED = 1.75, 2.5
+# Share of its distance from the model's that adds to the expected error of a site.
+GAP_SHARE = 0.3
 # Error of a site that is not doubtful, and how far from its surface
 # a site of the model may lie, mm of the average head.
 KNOWN, FARTHEST = 2.5, 8.0
@@ -90,7 +92,7 @@ def with_model(
         gap = float(np.linalg.norm(site.point - model))
         deviations = gap / float(np.hypot(error, site.error))
         if deviations < DOUBTFUL:
-            sites[name] = site
+            sites[name] = replace(site, error=float(np.hypot(site.error, GAP_SHARE * gap)))
             continue
         doubt = f"the shape of the whole head places it {gap:.1f} mm away"
         doubt = "; ".join(filter(None, (site.doubt, doubt)))
@@ -185,7 +187,8 @@ def landmarks_from(
     of_skull = SitesOfKind("skull", weakened(sites, evidence, pose.size), gone.skull, surface)
     by_skin = {} if skin is None else {False: skin}
     lost = gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given")
-    of_skin = SitesOfKind("skin", judged("skin", on_skin, pose, max(likeness)), lost, by_skin)
+    of_mouth = weakened(judged("skin", on_skin, pose, max(likeness)), evidence, pose.size, "skin")
+    of_skin = SitesOfKind("skin", of_mouth, lost, by_skin)
     all_skull, missing_skull = with_model(of_skull, fitted, pose.size)
     added = {name: site for name, site in all_skull.items() if name not in of_skull.sites}
     all_skull |= weakened(added, evidence, pose.size)
