@@ -36,7 +36,7 @@ MOVES, NEAR, CLOSE = 0.5, 4.0, 4.0
 FORWARDS = "forwards=4"
 # How far a click is off, and a wrong one, mm.
 CLICK, WRONG = 1.5, 10.0
-SECONDS = 900
+SECONDS = 3600
 QUIET = {"landmarks-proposed", "jaws-parted-by-shape", "jaws-separated-again"}
 
 

@@ -43,7 +43,8 @@ from cmfsim.values.surface_data import SurfaceData, joined_surface
 # Deviations from which a site is doubtful, and from which it is the model's: of normal errors along
 # three axes 3 % and 0.03 % are larger.
 DOUBTFUL, REPLACED = 1.75, 2.5
-# Share of its distance from the model's that adds to the expected error of a site.
+# Share of its distance from the model's that adds to the expected error of a site: the least with
+# which 95 % of the sites of five unseen scans lie within twice the error; of four, 0.15 to 0.3.
 GAP_SHARE = 0.3
 # Error of a site that is not doubtful, and how far from its surface
 # a site of the model may lie, mm of the average head.

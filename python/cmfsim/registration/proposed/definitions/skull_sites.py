@@ -19,6 +19,7 @@ from cmfsim.registration.proposed.definitions.side_sites import (
     find_side_sites,
 )
 from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import REFERENCE_PLACES
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +169,7 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
         start = _run_end(teeth, top)
         if top - start >= longest:
             edge, longest = start, top - start
-    height = _to_nasal_floor(front, lean, edge)
-    crown = UPPER_CROWN if height > LEAST_WITH_TEETH else BARE_RIDGE
+    crown = BARE_RIDGE if _is_bare(front, lean, edge) else UPPER_CROWN
     neck = int(np.argmin(np.abs(z - z[edge] - crown)))
     if not np.isfinite(line[neck]):
         return
@@ -186,6 +186,19 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
     half = z[neck] + 0.38 * (z[spine] - z[neck])
     at = int(np.argmin(np.abs(z - half)))
     found["mid_philtrum"] = np.array([lean, line[at], z[at]])
+
+
+def _is_bare(front: DepthMap, lean: float, edge: int) -> bool:
+    """Whether the upper jaw has lost its incisors: its edge is near the floor of the nose.
+
+    And where, below the rest of the face, an average head has a ridge and not crowns: a short
+    upper jaw with teeth is as near to the floor as a long one without.
+    """
+    ridge, crowns = (
+        abs(front.columns[edge] + above - REFERENCE_PLACES["skull"]["supradentale"][2])
+        for above in (BARE_RIDGE, UPPER_CROWN)
+    )
+    return bool(ridge < crowns) and _to_nasal_floor(front, lean, edge) <= LEAST_WITH_TEETH
 
 
 def _to_nasal_floor(front: DepthMap, lean: float, edge: int) -> float:
