@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, rigid_fit
-from cmfsim.bones.motion import RemovedBone, missing_patches
+from cmfsim.bones.motion import RemovedBone, missing_patches, triangle_areas
 from cmfsim.bones.pairs.shape_fit import (
     LEAST_SIGMA,
     TO_SIGMA,
@@ -136,8 +136,7 @@ def stray_patches(
     ends = edges_of(triangles).ends
     label = connected_labels(ends[stray[ends].all(axis=1)], len(here))
     whole = triangles[stray[triangles].all(axis=1)]
-    a, b, c = (here[whole[:, i]] for i in range(3))
-    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    areas = triangle_areas(here, whole)
     sums = np.bincount(label[whole[:, 0]], weights=areas, minlength=len(here))
     found = []
     for number in np.flatnonzero(sums >= LEAST_STRAY):

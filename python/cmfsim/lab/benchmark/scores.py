@@ -93,7 +93,11 @@ def calibrated_band(
             check_own(method, prediction, patient)
             prediction.check_vertices(patient.skin)
             _check_settings(prediction, settings)
-            cases.append(CalibrationCase(patient.name, _scores(patient, prediction), GROUP))
+            off = prediction.displacement - patient.truth
+            along = np.einsum("vi,vi->v", off, patient.normals)
+            # The largest error along the normal over the standard deviation, by region.
+            found = region_scores(along, prediction.sd, patient.regions)
+            cases.append(CalibrationCase(patient.name, found, GROUP))
         except CaseInputError as error:
             raise CaseInputError(f"{file}: {error}") from error
     if not cases:
@@ -112,14 +116,6 @@ def _check_settings(prediction: SkinPrediction, settings: str) -> None:
             f"its settings, {prediction.settings[:200]}, are not those of the patients before it: "
             "predict all patients with the same settings"
         )
-
-
-def _scores(patient: BenchmarkPatient, prediction: SkinPrediction) -> dict[str, float]:
-    """The largest error along the normal over the standard deviation, by region."""
-    assert prediction.sd is not None  # noqa: S101 (the caller looked)
-    off = prediction.displacement - patient.truth
-    along = np.einsum("vi,vi->v", off, patient.normals)
-    return region_scores(along, prediction.sd, patient.regions)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Ways to predict a face: how fine, with which element and kinematics; and sweeps of them."""
 
 import hashlib
+import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -214,22 +215,14 @@ def sweep_choices(
     for name in factors:
         if name not in known:
             raise CaseInputError(f"factor {name!r} is unknown: use one of {', '.join(known)}")
+    grid = itertools.product(sorted(edges, reverse=True), elements, kinematics)
     choices = [
         base,
-        *_grid(base, edges, elements, kinematics),
+        *(replace(base, edge_length=edge, element=of, kinematics=by) for edge, of, by in grid),
         *(choice for name, values in factors.items() for choice in _varied(base, name, values)),
         *(_early(base, kinematics) if "tolerance" in factors else ()),
     ]
     return list(dict.fromkeys(choices))
-
-
-def _grid(
-    base: Choice, edges: Sequence[float], elements: Sequence[str], kinematics: Sequence[str]
-) -> Iterator[Choice]:
-    for edge_length in sorted(edges, reverse=True):
-        for element in elements:
-            for name in kinematics:
-                yield replace(base, edge_length=edge_length, element=element, kinematics=name)
 
 
 def _varied(base: Choice, name: str, values: Sequence[Any]) -> Iterator[Choice]:

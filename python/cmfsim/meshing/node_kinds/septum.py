@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.meshing.node_kinds.options import KindOptions
+from cmfsim.surfaces.depth import distances
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.finding import Finding
@@ -80,14 +81,28 @@ def septum(
     if not pieces:
         return Septum(kinds, none)
     if skull.name in by_vertex:
-        return Septum(kinds, none, (_by_vertex(skull.name),))
+        followed = Finding(
+            "septum-left-out",
+            f"the nasal septum is not modelled: {skull.name} is followed vertex by vertex",
+            where=f"segment {skull.name}",
+            why="the septum lies too far from the bone for that; without its support, the tip of "
+            "the nose follows the maxilla too far, mostly upwards",
+            fix="if the skull did not move, leave it out of the plan",
+        )
+        return Septum(kinds, none, (followed,))
     marks: dict[str, Floats] = {}
     for kind_of, names in (("skull", SKULL_LANDMARKS), ("skin", SKIN_LANDMARKS)):
         given = landmarks.get(kind_of, {})
         marks |= {name: np.asarray(given[name], dtype=float) for name in names if name in given}
     missing = [n for n in (*SKULL_LANDMARKS, *SKIN_LANDMARKS) if n not in marks]
     if missing:
-        return Septum(kinds, none, (_left_out(missing),))
+        unknown = Finding(
+            "septum-left-out",
+            f"the nasal septum is not modelled: {', '.join(missing)} "
+            f"{'is' if len(missing) == 1 else 'are'} not among the landmarks",
+            where="[landmarks]",
+        )
+        return Septum(kinds, none, (unknown,))
     # What was cut off must be the floor of the nose, and not its bridge.
     if _nearest(marks["mid_philtrum"], segments) not in pieces:
         return Septum(kinds, none)
@@ -96,9 +111,7 @@ def septum(
     places = as_rows("nodes", nodes, 3)
     inside = np.flatnonzero(_inside(places, marks))
     for piece in pieces:
-        closest, _, _ = piece.surface.searched.closest(places[inside])
-        away = np.linalg.norm(closest - places[inside], axis=1)
-        inside = inside[away > CLEARANCE]
+        inside = inside[distances(places[inside], piece.surface.searched) > CLEARANCE]
     number = kinds.segments.index(skull.name)
     kind, owner = np.array(kinds.kind), np.array(kinds.segment)
     free = inside[kind[inside] == NODE_KINDS.index("free")]
@@ -155,32 +168,7 @@ def _spacing(places: Floats) -> float:
 
 def _nearest(place: Floats, segments: Sequence[BoneSegment]) -> BoneSegment:
     """The segment that a landmark lies on."""
-
-    def distance(segment: BoneSegment) -> float:
-        closest, _, _ = segment.surface.searched.closest(place[np.newaxis])
-        return float(np.linalg.norm(closest[0] - place))
-
-    return min(segments, key=distance)
-
-
-def _by_vertex(skull: str) -> Finding:
-    return Finding(
-        "septum-left-out",
-        f"the nasal septum is not modelled: {skull} is followed vertex by vertex",
-        where=f"segment {skull}",
-        why="the septum lies too far from the bone for that; without its support, the tip of the "
-        "nose follows the maxilla too far, mostly upwards",
-        fix="if the skull did not move, leave it out of the plan",
-    )
-
-
-def _left_out(missing: Sequence[str]) -> Finding:
-    return Finding(
-        "septum-left-out",
-        f"the nasal septum is not modelled: {', '.join(missing)} "
-        f"{'is' if len(missing) == 1 else 'are'} not among the landmarks",
-        where="[landmarks]",
-    )
+    return min(segments, key=lambda s: float(distances(place[None], s.surface.searched)[0]))
 
 
 def lifted_tissue(
@@ -228,9 +216,7 @@ def lifted_tissue(
     held = kinds.nodes("joined" if is_joined else "fixed")
     on_skull = held[kinds.segment[held] == kinds.segments.index(skull.name)]
     places = as_rows("nodes", nodes, 3)[on_skull]
-    away = np.array(
-        [np.linalg.norm(s.surface.searched.closest(places)[0] - places, axis=1) for s in pieces]
-    )
+    away = np.array([distances(places, s.surface.searched) for s in pieces])
     near = away.min(axis=0) < reach
     if not near.any():
         return None
