@@ -117,7 +117,7 @@ def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
         kept[:] = kept or [planned_head(*given, **more)]
         return kept[0]
 
-    monkeypatch.setattr("cmfsim.pipeline.outputs.splint.planned_head", head_of)
+    monkeypatch.setattr("cmfsim.pipeline.planning.planned_head", head_of)
     levels = shared_values.drawn_levels(tmp_path_factory, 2.0)
     case = phantom_case.surface_case(tmp_path, cmfsim.make_head(), levels)
     words = ["bite", str(case), "--json", "-q", "--no-doctor"]
