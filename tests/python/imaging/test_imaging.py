@@ -88,8 +88,6 @@ def test_no_voxel_is_both_bone_and_outside_or_two_bones(anatomy):
 
 
 def test_no_level_comes_near_zero_away_from_its_surface(anatomy):
-    from scipy import ndimage  # noqa: PLC0415
-
     cube = np.ones((3, 3, 3))
     levels = {"skin": anatomy.skin, "cranium": anatomy.bones["cranium"], "air": anatomy.air}
     for level in levels.values():
