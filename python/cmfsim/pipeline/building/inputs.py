@@ -24,7 +24,7 @@ from cmfsim.io.slicer.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces, signed_level
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.anatomy import Anatomy
-from cmfsim.values.case_parts import CaseMesh, CaseMotion
+from cmfsim.values.case_parts import CaseImage, CaseMesh, CaseMotion
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.progress import Progress
@@ -107,7 +107,7 @@ def read_anatomy(
             kept[key] = opened, noticed
         refuse_errors(anatomy, case.where("image"))
         if case.image.bones:
-            anatomy = _with_given_bones(case, anatomy, progress)
+            anatomy = _with_given_bones(case, case.image, anatomy, progress)
         return anatomy, (*noticed, *anatomy.findings)
     given_surfaces = case.surfaces
     if given_surfaces is None:  # a Case has the one or the other
@@ -128,15 +128,18 @@ def read_anatomy(
     return anatomy, (*findings, *anatomy.findings)
 
 
-def _with_given_bones(case: Case, anatomy: Anatomy, progress: Progress) -> Anatomy:
+def _with_given_bones(
+    case: Case, image: CaseImage, anatomy: Anatomy, progress: Progress
+) -> Anatomy:
     """The anatomy of a CT with the bones of the case's files, which must lie where it shows bone.
 
     Raises `CaseError`: They are those of another scan, or in another frame.
     """
-    files = {} if case.image is None else case.image.bones
     shown = np.maximum.reduce([level.values for level in anatomy.bones.values()]) > 0.0
-    surfaces, levels, findings = {}, {}, list(anatomy.findings)
-    for name, path in files.items():
+    surfaces: dict[str, SurfaceData] = {}
+    levels: dict[str, ImageData] = {}
+    findings = list(anatomy.findings)
+    for name, path in image.bones.items():
         progress(f"reading surface {name}")
         given = read_surface_file(path)
         surfaces[name], repaired = repair_surface(given.surface, name)
@@ -149,9 +152,8 @@ def _with_given_bones(case: Case, anatomy: Anatomy, progress: Progress) -> Anato
         if share < LEAST_SHOWN:
             raise CaseInputError(
                 f"{case.where(f'image.bones.{name}')}: {share:.0%} of {path.name} lies where "
-                f"{case.image.file.name if case.image else 'the image'} shows bone (bones-not-of-"
-                f"image), {LEAST_SHOWN:.0%} at least is needed: check that both are of one scan, "
-                "in mm and in one frame (LPS)"
+                f"{image.file.name} shows bone (bones-not-of-image), {LEAST_SHOWN:.0%} at least "
+                "is needed: check that both are of one scan, in mm and in one frame (LPS)"
             )
     return replace(
         anatomy, bones=levels, surfaces={**anatomy.surfaces, **surfaces}, findings=tuple(findings)
