@@ -68,6 +68,7 @@ class View:
     direction: str
     caption: str
     bare: bool = False
+    text_size: int = TEXT_SIZE
 
 
 def draw(
@@ -133,7 +134,7 @@ def drawn(
                     paint(plotter, view)
                     plotter.reset_camera_clipping_range()
                     caption = plotter.add_text(
-                        view.caption, position=(10, 10), font_size=TEXT_SIZE, color="black"
+                        view.caption, position=(10, 10), font_size=view.text_size, color="black"
                     )
                     # Legible where the head lies behind it.
                     caption.prop.background_color = "white"
@@ -221,11 +222,14 @@ def add_sizes(plotter: Any, shape: Any, name: str, largest: float, **more: Any) 
     plotter.add_mesh(shape, scalars=name, clim=(0.0, largest), cmap="viridis", **looks)
 
 
-def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: str) -> None:
+def add_scale_bar(
+    plotter: Any, place: tuple[float, float], labels: int, form: str, letters: int = 14
+) -> None:
     """Adds an upright scale in mm to a view.
 
     place: Its lower left corner, as shares of the view.
     form: Of their numbers, as printf has it.
+    letters: Their height, pixels.
     """
     bar = plotter.add_scalar_bar(
         title="mm",
@@ -237,8 +241,8 @@ def add_scale_bar(plotter: Any, place: tuple[float, float], labels: int, form: s
         width=0.1,
         height=0.45,
         color="black",
-        title_font_size=16,
-        label_font_size=14,
+        title_font_size=letters + 2,
+        label_font_size=letters,
     )
     bar.SetUnconstrainedFontSize(True)  # noqa: FBT003 (VTK's own signature)
     bar.SetVerticalTitleSeparation(TITLE_GAP)

@@ -71,6 +71,8 @@ def trimmed(shape: Any, ends: SkinEnds) -> Any:
 
 # Of six views in two rows, pixels.
 TWO_ROWS = (1650, 1240)
+# Of its letters, so that they are legible where the chart has it small: 6 points.
+LETTERS = 18
 # The same in a notebook.
 NOTEBOOK = (990, 744)
 # Skin shines a little.
@@ -140,21 +142,23 @@ def picture_faces(
     largest = max(float(moved.max()), LEAST_SCALE)
 
     def paint(plotter: Any, view: canvas.View) -> None:
-        surface = before if view.caption.startswith("before") else after
+        surface = before if view.caption == "before" else after
         shape = canvas.polydata(surface.vertices, surface.triangles)
         shape.point_data["movement"] = moved
         if is_trimmed:
             shape = trimmed(shape, ends)
-        if not view.caption.startswith("movement"):
+        if view.caption != "movement":
             add_skin(plotter, shape, colours)
             return
         canvas.add_sizes(plotter, shape, "movement", largest)
         if view.direction == "left":
             # Before the forehead: the head fills the other side.
-            canvas.add_scale_bar(plotter, (0.03, 0.5), 4, "%.1f")
+            canvas.add_scale_bar(plotter, (0.03, 0.5), 4, "%.1f", 2 * LETTERS)
 
     names = ("before", "after", "movement")
-    views = tuple(canvas.View(d, f"{name}, {d}") for d in ("front", "left") for name in names)
+    views = tuple(
+        canvas.View(d, name, text_size=LETTERS) for d in ("front", "left") for name in names
+    )
     corners = ends.within(canvas.bounds([before.vertices, after.vertices]))
     canvas.draw(path, views, corners, size, paint, columns=len(names))
 

@@ -35,6 +35,10 @@ CHIN = "pogonion (skin)"
 # Pictures in the order of a report, with what they show. The names are those of the files.
 PICTURES: Mapping[str, str] = {
     "prediction": "The face before the operation, the predicted face, and how far the skin moves.",
+    "lateral": "Profile tracing in the midsagittal plane over a synthetic lateral view: before "
+    "(blue), and as planned (red). The view is computed from the surfaces of skin and bones, as "
+    "thin shells, in parallel projection without enlargement; it is no radiograph. Planes are "
+    "drawn where their sites are known.",
     "band": "Half the width of the band around the predicted skin, mm; grey where no calibration "
     "case has data.",
     "plan": "The plan: bone segments in their planned positions, with outlines of their "
@@ -239,7 +243,8 @@ def _prediction_section(
     turned = [View(*view, f"{VIEW} Model {shown['model']}.")] if view else []
     drawn: Sequence[Figure | Note] = [
         Figure(figure.image, f"{figure.caption} Model {shown['model']}.")
-        for figure in _picture("prediction", pictures)
+        for name in ("prediction", "lateral")
+        for figure in _picture(name, pictures)
     ]
     return Section("Prediction", (*turned, *(drawn or (Note(NO_PICTURES, "warning"),)), table))
 

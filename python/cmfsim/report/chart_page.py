@@ -117,10 +117,13 @@ class _Page:
             y += ROW
         return y
 
-    def picture(self, x: float, y: float, image: bytes, room: tuple[float, float]) -> float:
-        """Draws a PNG as large as there is room; where it ends."""
+    def picture(
+        self, x: float, y: float, image: bytes, room: tuple[float, float], share: float = 1.0
+    ) -> float:
+        """Draws this share of a PNG, from its right, as large as there is room; where it ends."""
         images = third_party("matplotlib.image", "pages are drawn", "report")
         pixels = images.imread(io.BytesIO(image), format="png")
+        pixels = pixels[:, round((1.0 - share) * pixels.shape[1]) :]
         scale = min(room[0] / pixels.shape[1], room[1] / pixels.shape[0])
         wide, high = scale * pixels.shape[1] / WIDTH, scale * pixels.shape[0] / HEIGHT
         axes = self._figure.add_axes((x / WIDTH, 1.0 - y / HEIGHT - high, wide, high))
@@ -134,8 +137,8 @@ def draw_chart_page(
 ) -> None:
     """Draws the page of one plan onto an empty figure of matplotlib, of the size `A4`.
 
-    The prediction is what `prediction.json` holds; pictures are PNG files, "prediction" and "plan";
-    findings are those of all stages.
+    The prediction is what `prediction.json` holds; pictures are PNG files, "prediction" and
+    "lateral" or, without that, "plan"; findings are those of all stages.
     """
     page, y = _Page(figure), MARGIN
     page.line(MARGIN, y, f"{prediction['case']}: predicted face", TITLE, weight="bold")
@@ -148,9 +151,11 @@ def draw_chart_page(
     y = page.paragraph((MARGIN, y), words, TEXT, PLAN_LINES) + APART
     found = prediction.get("clinical", {"cephalometry": (), "face": (), "sites": ()})
     high = min(PICTURES, FOOT - APART - _height_below(found) - y)
+    # The panel of the tracing that shows both; results of earlier versions have none.
+    beside = ("lateral", 0.5) if "lateral" in pictures else ("plan", 1.0)
     ends = [
-        page.picture(x, y, pictures[name], (room, high))
-        for name, x, room in (("prediction", MARGIN, LEFT), ("plan", COLUMN, RIGHT))
+        page.picture(x, y, pictures[name], (room, high), share)
+        for (name, share), x, room in ((("prediction", 1.0), MARGIN, LEFT), (beside, COLUMN, RIGHT))
         if name in pictures
     ]
     y = max([y, *ends]) + APART

@@ -94,7 +94,7 @@ def test_texts_stay_on_the_page_and_apart(many, drawn):
     ]
     figure = figures.Figure(figsize=A4, dpi=360)
     renderer = agg.FigureCanvasAgg(figure).get_renderer()
-    pictures = {"prediction": png(1240, 1650), "plan": png(820, 1650)} if drawn else {}
+    pictures = {"prediction": png(1240, 1650), "lateral": png(700, 1400)} if drawn else {}
     draw_chart_page(figure, full(many), pictures, findings)
     scale = 72.0 / figure.dpi
     page, *shown = figure.axes

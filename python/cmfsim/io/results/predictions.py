@@ -44,7 +44,7 @@ from cmfsim.values.surface_data import SurfaceData
 
 PREDICTION_FILES = re.compile(
     r"prediction\.(vtp|stl|vtu|npz|png|json|mrb)|face\.(vtp|stl)|face_before\.vtp|(bones|muscles)\.vtp"
-    r"|(plan|muscles|band|contacts)\.png|timings\.json"
+    r"|(plan|muscles|band|contacts|lateral)\.png|timings\.json"
 )
 PREDICTION_FILE = "prediction.json"
 TIMINGS_FILE = "timings.json"

@@ -59,11 +59,13 @@ from cmfsim.pictures.canvas import Painter
 from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.faces import animate_face
 from cmfsim.pipeline.banding import face_motion
+from cmfsim.pictures.lateral import LateralView, lateral_picture
 from cmfsim.pipeline.building.inputs import input_hash
 from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.planning import PAGE_FILE, page_state
 from cmfsim.planning.face_measures import clinical_figures
+from cmfsim.planning.face_measures.clinical_figures import lateral_sites
 from cmfsim.planning.face_view import face_view
 from cmfsim.planning.occlusion import ContactMap, planned_contacts
 from cmfsim.report import Document, Figure, case_document, findings_of, render_page
@@ -74,7 +76,7 @@ from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import Progress
-from cmfsim.values.surface_data import joined_surface
+from cmfsim.values.surface_data import SurfaceData, joined_surface
 
 _log = logging.getLogger(__name__)
 
@@ -82,7 +84,7 @@ _log = logging.getLogger(__name__)
 Predictions = Iterable[Prediction] | Callable[[BuildKeywords], Iterable[Prediction]]
 
 # Pictures of a case's report, in the folder of its prediction and in its own.
-PREDICTION_PICTURES = ("prediction", "band", "plan", "contacts", "muscles")
+PREDICTION_PICTURES = ("prediction", "lateral", "band", "plan", "contacts", "muscles")
 MUSCLES = "muscles.png"
 REPORT_STAGE = "writing the report"
 BOXES_CAPTION = (
@@ -377,6 +379,25 @@ def _pictures_of(
         yield "contacts.png", contacts_picture(upper, (contacts.lower.surface, contacts.lower_gaps))
     if prediction is not None and prediction.band is not None:
         yield "band.png", band_picture(prediction)
+    # The last: it alone needs matplotlib, and those after one that cannot be drawn are left out.
+    if prediction is not None and patient.landmarks.get("skull"):
+        yield "lateral.png", _lateral(prediction)
+
+
+def _lateral(prediction: Prediction) -> Picture:
+    """The profile tracing before the operation and as planned."""
+    before, planned, frame = lateral_sites(prediction)
+    bones = prediction.bones
+    at_rest = {segment.name: segment.surface for segment in prediction.patient.segments}
+    moved = {n: SurfaceData(vertices, s.triangles) for n, (s, vertices) in bones.items()}
+    middle = frame.middle
+    if middle is None:
+        middle = float(prediction.skin_before.vertices.mean(axis=0) @ frame.left)
+    plane = np.stack([frame.forwards, frame.up, frame.left]), middle
+    return lateral_picture(
+        LateralView(at_rest, prediction.face_before, before, *plane),
+        LateralView(moved, prediction.face, planned, *plane),
+    )
 
 
 def _muscles_picture(muscles: Musculature, segments: Sequence[BoneSegment]) -> Picture:

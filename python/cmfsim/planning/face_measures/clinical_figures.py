@@ -15,17 +15,21 @@ from cmfsim.planning.face_measures.cephalometry import (
     CEPHALOMETRIC_MEASURES,
     cephalometry,
     missing_sites,
+    projected,
 )
 from cmfsim.planning.face_measures.definitions import MEASURES, Measure, measure_sites
 from cmfsim.planning.face_measures.occlusion import (
     FOUND_MOLARS,
     OCCLUSAL_MEASURES,
+    BiteFrame,
+    bite_frame,
     missing_for_occlusion,
     occlusion,
 )
 from cmfsim.planning.occlusion import bite_sites, first_molars, patient_rows
 from cmfsim.values.anatomy import BoneSegment
-from cmfsim.values.landmark_sites import profile_sites, tooth_of
+from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import profile_sites, short_name, tooth_of
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 
@@ -91,6 +95,23 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
             for x, y, z in [shift.tolist()]
         ],
     }
+
+
+def lateral_sites(prediction: Prediction) -> tuple[dict[str, Floats], dict[str, Floats], BiteFrame]:
+    """The sites of bone and skin in the lateral view before and as planned, and its frame.
+
+    Returns: (2,) mm each, forwards and up, by abbreviation.
+    """
+    bone, skin = bone_sites(prediction.patient), prediction.patient.landmarks.get("skin", {})
+    at_rest = {name: site.place for name, site in bone.items()}
+    before = projected(at_rest)
+    planned = projected(face.moved_bone_sites(prediction, bone), at_rest)
+    frame = bite_frame(at_rest)
+    places = np.array([*skin.values()]).reshape(-1, 3)
+    for sites, points in ((before, places), (planned, places + prediction.carried(places))):
+        flat = points @ np.stack([frame.forwards, frame.up]).T
+        sites.update(zip((short_name("skin", name) for name in skin), flat, strict=True))
+    return before, planned, frame
 
 
 def bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:

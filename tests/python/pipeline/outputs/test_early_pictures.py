@@ -45,6 +45,6 @@ def test_the_plan_is_drawn_before_its_solution_and_once(tmp_path):
         assert prediction.patient is told[0]
         motions = planned_motions(told[0], told[0].scene)
         assert prediction.summary["plan"] == motions
-        assert {"plan.png", "prediction.png"} <= set(drawing.begin(prediction))
+        assert {"plan.png", "prediction.png", "lateral.png"} <= set(drawing.begin(prediction))
     drawn = [(folder, name) for folder, name, _ in painter.begun]
-    assert len(drawn) == len(set(drawn)) == 2 * (len(early) + 1)
+    assert len(drawn) == len(set(drawn)) == 2 * (len(early) + 2)
