@@ -143,7 +143,9 @@ def demo(options: argparse.Namespace) -> int:
         progress.stage("making a head")
         made = write_demo_case(options.folder, edge_length=options.edge_length)
         prepare(made.case, report=True, evaluation=made.truth is not None)
-        name = _work(made, models, progress, notices).report
+        written = _work(made, models, progress, notices)
+    notices.found(written.findings)
+    name = written.report
     if name is None:
         return FAILED
     page = made.case.output / name

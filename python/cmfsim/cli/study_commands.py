@@ -75,6 +75,7 @@ def predict(options: argparse.Namespace) -> int:
             with_report=not options.no_report,
             slicer=options.slicer,
         )
+    notices.found(written.findings)
     failed = {model: str(error) for model, error in notices.failures.items()}
     if options.json:
         entries = [_figures(entry, case.output) for entry in written.predictions]
@@ -139,6 +140,7 @@ def evaluate(options: argparse.Namespace) -> int:
             with_report=not options.no_report,
             slicer=options.slicer,
         )
+    notices.found(written.findings)
     values = found.as_dict()
     code = FAILED if found.failed else DONE
     if options.json:

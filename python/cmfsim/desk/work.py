@@ -149,6 +149,7 @@ def report(case_file: str) -> dict[str, Any]:
         return predictions_of(case, (MODEL,), options, built=built)
 
     written = write_results(case.output, predicted, (MODEL,), stage=_stage)
+    told.found(written.findings)
     _stage("drawing the page for the chart")
     names = filter(None, (written.report, write_chart_page(case.output)))
     return {

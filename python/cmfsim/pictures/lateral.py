@@ -146,7 +146,7 @@ def _planes(sites: Mapping[str, Floats]) -> dict[str, Floats]:
     if "FH" not in found and "Or" in sites:
         # Forwards is along the Frankfort plane of the average head, registered to this one.
         found["FH, estimated"] = sites["Or"] + np.array([[-48.0, 0.0], [0.0, 0.0]])
-    return found.astype(np.float64)
+    return found
 
 
 def _section(surface: SurfaceData, axes: Floats, middle: float) -> Floats:

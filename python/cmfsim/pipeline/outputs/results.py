@@ -9,7 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -66,12 +66,14 @@ from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.planning import PAGE_FILE, page_state
 from cmfsim.planning.face_measures import clinical_figures
 from cmfsim.planning.face_measures.clinical_figures import lateral_sites
+from cmfsim.planning.face_measures.occlusion import poor_bite
 from cmfsim.planning.face_view import face_view
 from cmfsim.planning.occlusion import ContactMap, planned_contacts
 from cmfsim.report import Document, Figure, case_document, findings_of, render_page
 from cmfsim.report.chart_page import A4, draw_chart_page
 from cmfsim.solving.models import planned_motions
 from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.finding import Finding
 from cmfsim.values.musculature import Musculature
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
@@ -120,6 +122,12 @@ class WrittenResults:
     files: list[str] = field(default_factory=list)
     report: str | None = None
     left_out: list[str] = field(default_factory=list)
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Those of all predictions, with what their figures showed."""
+        entries = [f for entry in self.predictions for f in entry.summary["findings"]]
+        return [Finding.from_values(entry) for entry in entries]
 
 
 @dataclass
@@ -299,7 +307,9 @@ def _fill_model(
     skin = {**summary["skin"], **face_motion(prediction)}
     clinical, contacts = clinical_figures(prediction), drawing.contacts(prediction.patient)
     clinical["contacts"] = contacts if isinstance(contacts, dict) else contacts.as_dict()
-    figures = {"skin": skin, "clinical": clinical}
+    own = [asdict(finding) for finding in poor_bite(clinical["occlusion"])]
+    findings = [*summary.get("findings", ()), *own]
+    figures = {"skin": skin, "clinical": clinical, "findings": findings}
     prediction = replace(prediction, summary={**summary, **figures})
     place = drawing.place(prediction.model)
     (fresh / place).mkdir(exist_ok=True)

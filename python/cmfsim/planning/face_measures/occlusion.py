@@ -7,8 +7,9 @@ to, in their middle.
 """
 
 import itertools
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike
 from cmfsim.planning.face_measures.cephalometry import FORMULAS, OCCLUSAL, head_axes, occlusal_plane
 from cmfsim.planning.face_measures.definitions import Measure
 from cmfsim.values.checks import Floats
+from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, profile_sites, tooth_of
 
 # Between the central incisors, and at the molars, on the bone: where the teeth are not given.
@@ -52,6 +54,44 @@ OCCLUSAL_MEASURES = (
               "0 ± 2: class I; above: II, below: III", "Angle 1899")
       for side in ("left", "right")),
 )  # fmt: skip
+# Beyond these a bite or a face is not wanted, mm and degrees: overjets and open bites in great need
+# of treatment, grades 4 and 5 (Brook and Shaw 1989, Eur J Orthod 11:309–320; reverse overjets and
+# open bites of grade 4); midlines that laypersons notice (Kokich, Kiyak and Shapiro 1999, J Esthet
+# Dent 11:311–324); cants that nine of ten observers notice (Padwa, Kaiser and Kaban 1997, J Oral
+# Maxillofac Surg 55:811–816).
+_BROOK, _KOKICH = "Brook and Shaw 1989", "Kokich et al. 1999"
+BITE_LIMITS: Mapping[str, tuple[float, float, str]] = {
+    "overjet": (-3.5, 9.0, _BROOK),
+    "overbite": (-4.0, np.inf, _BROOK),
+    "upper_midline": (-4.0, 4.0, _KOKICH),
+    "lower_midline": (-4.0, 4.0, _KOKICH),
+    "cant": (-4.0, 4.0, "Padwa et al. 1997"),
+}
+# How far edges may lie off where they are found on bone, and what a plan must make worse to be its
+# fault: mm and degrees.
+EDGE_ERROR = WORSE = 1.0
+
+
+def poor_bite(rows: Iterable[Mapping[str, Any]]) -> list[Finding]:
+    """A finding with what a plan takes out of `BITE_LIMITS`, or further out; empty if nothing.
+
+    rows: "before" and "planned" of each of `OCCLUSAL_MEASURES`, as `clinical_figures` has them.
+    """
+    texts = []
+    for measure, row in zip(OCCLUSAL_MEASURES, rows, strict=True):
+        was, now = row["before"], row["planned"]
+        if measure.key not in BITE_LIMITS or was is None or now is None:
+            continue
+        low, high, source = BITE_LIMITS[measure.key]
+        out, out_before = (max(low - value, value - high) for value in (now, was))
+        if out > EDGE_ERROR and out > out_before + WORSE:
+            limits = f"{low:g} or more" if np.isinf(high) else f"{low:g} to {high:g}"
+            unit = measure.unit if measure.unit == "°" else f" {measure.unit}"
+            texts.append(
+                f"{measure.label.lower()} is {now:.1f}{unit}, {was:.1f} before (limits: "
+                f"{limits}, {source})"
+            )
+    return [Finding("plan-bite-poor", f"as planned, {'; '.join(texts)}")] if texts else []
 
 
 def occlusion(

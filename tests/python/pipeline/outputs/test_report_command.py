@@ -12,6 +12,8 @@ import shared_values
 from cmfsim.cli import main
 from cmfsim.io.results.predictions import read_face_colours
 from cmfsim.pictures import faces
+from cmfsim.pipeline.outputs.results import write_results
+from cmfsim.values.progress import no_progress
 
 pytest.importorskip("jinja2")
 pytest.importorskip("pyvista")
@@ -48,3 +50,20 @@ def test_page_and_animation_have_the_colours(folder, capsys, monkeypatch):
     assert len(page) < 4e6
     assert main(["report", str(folder), "--animation", "face.avi"]) == 2
     assert "an animation is written as .gif or .mp4" in capsys.readouterr().err
+
+
+def test_a_poor_bite_stands_in_summary_and_report_and_goes_with_the_plan(
+    tmp_path, tmp_path_factory
+):
+    patient = shared_values.coarse_demo_patient(tmp_path_factory)
+    apart = cmfsim.predict_patient(
+        patient.with_plan({"maxilla": cmfsim.rigid_motion(translation=(0, -12, 0))}), "H"
+    )
+    closed = apart.replan({"maxilla": cmfsim.rigid_motion(translation=(0, -1, 0))})
+    for prediction, is_poor in ((apart, True), (closed, False)):
+        written = write_results(
+            tmp_path / "out", [prediction], ["H"], stage=no_progress, pictures=lambda _: False
+        )
+        page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+        assert ("plan-bite-poor" in {finding.code for finding in written.findings}) == is_poor
+        assert ("as planned, overjet is" in page) == is_poor

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.planning.face_measures.occlusion import poor_bite
 
 # Teeth in a head with an upright face: a flat occlusal plane that rises by 10° to the front.
 SLOPE = np.radians(10.0)
@@ -118,3 +119,34 @@ def test_bone_stands_in_for_teeth_and_one_incisor_is_no_midline(skull):
     }
     assert cmfsim.occlusion(mixed)["molar_left"] is None
     assert set(cmfsim.occlusion({}).values()) == {None}
+
+
+def bite_rows(**values):
+    """Rows of all measures: (before, planned) by key, both nought where they are not given."""
+    pairs = [values.get(measure.key, (0.0, 0.0)) for measure in cmfsim.OCCLUSAL_MEASURES]
+    return [{"before": before, "planned": planned} for before, planned in pairs]
+
+
+def test_a_plan_that_leaves_a_bad_bite_is_stated_with_values_limits_and_source():
+    (found,) = poor_bite(bite_rows(overjet=(6.2, 13.3), overbite=(1.0, -6.0), cant=(0.0, -6.5)))
+    assert (found.code, found.severity) == ("plan-bite-poor", "warning")
+    assert "overjet is 13.3 mm, 6.2 before (limits: -3.5 to 9, Brook and Shaw 1989)" in found.what
+    assert "overbite is -6.0 mm, 1.0 before (limits: -4 or more" in found.what
+    assert "cant of the upper molars is -6.5°" in found.what
+    assert "midline" not in found.what
+    assert "cmfsim bite" in found.fix
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"overjet": (6.2, 2.5), "overbite": (-5.0, 1.0)},
+        # The patient came with it, and it became no worse; within what edges are found to.
+        {"overjet": (13.0, 13.3), "upper_midline": (7.0, 5.2)},
+        {"overjet": (2.0, 9.9), "lower_midline": (0.0, 4.9)},
+        # A class III that is closed to an edge-to-edge bite, and what has no value.
+        {"overjet": (-9.0, -3.0), "cant": (None, None), "overbite": (2.0, None)},
+    ],
+)
+def test_a_sensible_plan_has_no_poor_bite(values):
+    assert not poor_bite(bite_rows(**values))
