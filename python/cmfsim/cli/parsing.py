@@ -320,7 +320,7 @@ def _add_bite(commands: Any, named: Parser) -> None:
     )
     bite = _command(commands, "bite", plan_command.bite_case, words, named, epilog=epilog)
     for jaw in JAWS:
-        file(bite, f"--{jaw} SCAN", f"{jaw} teeth, such as STL", required=True)
+        file(bite, f"--{jaw} SCAN", f"{jaw} teeth (default: of [bite])")
     _add_plan_and_file(bite, "bite.toml")
 
 

@@ -199,7 +199,14 @@ def bite_case(options: argparse.Namespace) -> int:
     """Finds the final bite and writes the plan."""
     case = case_of(options)
     path = _free_path(case, options.out, "bite.toml")
-    scans = read_surface(options.upper), read_surface(options.lower)
+    # One of each would be in two frames.
+    given = case.bite if options.upper is options.lower is None else options
+    if given is None or given.upper is None or given.lower is None:
+        raise CaseInputError(
+            "scans of both jaws are needed: give --upper and --lower, or name both in [bite] of "
+            "the case file"
+        )
+    scans = read_surface(given.upper), read_surface(given.lower)
     notices, findings = checked(options, case)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         bite, plan = import_module("cmfsim.pipeline.planning").plan_for_bite(

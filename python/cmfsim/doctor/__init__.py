@@ -25,6 +25,7 @@ from cmfsim.doctor.surfaces import (
 from cmfsim.doctor.surgery.moved_bones import check_moved
 from cmfsim.doctor.surgery.operation import (
     check_after,
+    check_bite,
     check_cuts,
     check_photo,
     check_plan,
@@ -105,7 +106,7 @@ def examine(case: CaseOrPath, models: Sequence[str] | None = None) -> Examinatio
     case = as_case(case)
     evidence = gather(case)
     findings = [*evidence.findings, *check_cuts(evidence), *check_lips(evidence)]
-    findings += check_photo(case)
+    findings += [*check_photo(case), *check_bite(case)]
     findings += check_automatic(evidence)
     placement = check_placement(evidence)
     findings += placement

@@ -45,7 +45,6 @@ from cmfsim.planning.replanning import (
 )
 from cmfsim.values.anatomy import JAWS, BoneSegment
 from cmfsim.values.checks import Floats, check_one_of
-from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.progress import BUILDING, PLANNING
 from cmfsim.values.skin_band import BandOptions
@@ -393,16 +392,9 @@ def plan_for_bite(
                     f"the plan bends {name} (bite-plan-bends): a rigid motion is needed"
                 )
             plan[name] = np.asarray(motion, dtype=np.float64)
-        if upper.segment == lower.segment:
-            raise CaseInputError(
-                f"both rows are on {upper.segment} (bite-one-segment): separate the jaws"
-            )
         asked.observer.stage("finding the final bite")
         bite = final_bite(upper, lower, upper_scan, lower_scan)
-        if bite.mirrored:
-            jaws = " and ".join(bite.mirrored)
-            what = f"the mirror image of the {jaws} scan fits the teeth as well"
-            asked.observer.found([Finding("bite-scan-symmetric", what)])
+        asked.observer.found(bite.findings)
         plan[lower.segment] = bite.following(plan.get(upper.segment, np.eye(4)))
         return bite, plan
 

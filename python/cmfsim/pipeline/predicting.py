@@ -2,20 +2,21 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from cmfsim._core import MassTensors
 from cmfsim.errors import CaseInputError, ContactError, SolverError
-from cmfsim.io import Case, CaseOrPath, as_case
+from cmfsim.io import Case, CaseOrPath, as_case, read_surface
 from cmfsim.io.results.predictions import is_prediction_file
 from cmfsim.pipeline.building.case_checks import cut_segments
 from cmfsim.pipeline.building.case_model import model_of, replanned
 from cmfsim.pipeline.building.inputs import case_key, check_output, input_hashes, plan_key
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, build_options
+from cmfsim.planning.occlusion import final_bite, patient_rows
 from cmfsim.solving.models import solved_patient
-from cmfsim.values.case_parts import CaseMuscles
+from cmfsim.values.case_parts import CaseBite, CaseMuscles
 from cmfsim.values.checks import check_one_of
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
@@ -300,4 +301,19 @@ def build_patient(
                 f"{name}: changed while the case was running; run the case again when no other "
                 "program writes to this file"
             )
+    if case.bite is not None:
+        patient = _with_bite(patient, case.bite, options)
     return replace(patient, summary={**patient.summary, "inputs_key": key, "plan_key": about})
+
+
+def _with_bite(patient: PatientModel, scans: CaseBite, options: BuildOptions) -> PatientModel:
+    """The patient with the bite of the case's scans: the motion into it, and three of its teeth."""
+    options.observer.stage("finding the final bite")
+    upper, lower = patient_rows(patient)
+    bite = final_bite(upper, lower, read_surface(scans.upper), read_surface(scans.lower))
+    options.observer.found(bite.findings)
+    findings = [*patient.summary.get("findings", ()), *map(asdict, bite.findings)]
+    places = [getattr(lower.arch, name).tolist() for name in ("tip", "left", "right")]
+    target = {**bite.as_dict(), "upper": upper.segment, "lower": lower.segment, "places": places}
+    summary = {**patient.summary, "findings": findings, "target_bite": target}
+    return replace(patient, findings=(*patient.findings, *bite.findings), summary=summary)

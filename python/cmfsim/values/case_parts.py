@@ -434,6 +434,17 @@ class CasePhoto:
 
 
 @dataclass(frozen=True)
+class CaseBite:
+    """Intraoral scans of the teeth in the bite that a plan is meant to give.
+
+    upper, lower: In occlusion, in one frame: any; mm.
+    """
+
+    upper: Path = field(metadata=PLAIN)
+    lower: Path = field(metadata=PLAIN)
+
+
+@dataclass(frozen=True)
 class CasePostoperative:
     """The post-operative data.
 

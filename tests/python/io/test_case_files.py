@@ -450,6 +450,7 @@ DOCUMENTED = {
     "band": case_parts.CaseBand,
     "muscles": case_parts.CaseMuscles,
     "photo": case_parts.CasePhoto,
+    "bite": case_parts.CaseBite,
     "postoperative": case_parts.CasePostoperative,
 }
 # What a reader of the page would have no use for.

@@ -19,6 +19,7 @@ from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.meshes.photos import read_photo
 from cmfsim.io.meshes.surfaces import surface_as_stored
 from cmfsim.io.slicer.transforms import motion_in_lps
+from cmfsim.values.anatomy import JAWS
 from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion
@@ -62,6 +63,16 @@ def check_photo(case: Case) -> Iterator[Finding]:
     except (CmfsimError, OSError) as error:
         why = "the skin cannot get its colours, and the case is not built"
         yield _unreadable(case.where("photo"), error, why)
+
+
+def check_bite(case: Case) -> Iterator[Finding]:
+    """A scan of the wanted bite that cannot be read; whether it fits is known on the teeth."""
+    for jaw in JAWS if case.bite is not None else ():
+        try:
+            read_surface(getattr(case.bite, jaw))
+        except (CmfsimError, OSError) as error:
+            why = "the bite of the scans is not known, and the case is not built"
+            yield _unreadable(case.where(f"bite.{jaw}"), error, why)
 
 
 def _unreadable(

@@ -25,7 +25,7 @@ CASE_FILE = "case.toml"
 TABLES = (
     "format", "version", "name", "note", "image", "surfaces", "landmarks", "region", "mesh", "lips",
     "osteotomies", "plan", "node_kinds", "tissue", "muscles", "solver", "band", "postoperative",
-    "photo", "output",
+    "photo", "bite", "output",
 )  # fmt: skip
 
 
@@ -64,6 +64,8 @@ class Case:
     band : CaseBand
     postoperative : CasePostoperative or None
     photo : CasePhoto or None
+    bite : CaseBite or None
+        Scans of the bite that results are compared with; `cmfsim bite` makes a plan of them.
     note : str
         A remark for readers of the report, such as that the patient is synthetic.
     places : mapping of str to str
@@ -94,6 +96,7 @@ class Case:
     band: case_parts.CaseBand = field(default_factory=case_parts.CaseBand)
     postoperative: case_parts.CasePostoperative | None = None
     photo: case_parts.CasePhoto | None = None
+    bite: case_parts.CaseBite | None = None
     note: str = ""
     places: Mapping[str, str] = field(default_factory=dict)
 
@@ -252,6 +255,7 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
         ),
         postoperative=given("postoperative", case_tables.postoperative_of),
         photo=given("photo", case_tables.photo_of),
+        bite=given("bite", lambda table, folder: table.part(case_parts.CaseBite, folder)),
         note=document.text("note") if "note" in document else "",
         places=document.all_places(),
     )

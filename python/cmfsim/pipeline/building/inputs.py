@@ -265,7 +265,14 @@ def plan_key(case: Case) -> str:
     Raises `OSError`: A file that the case names cannot be read.
     """
     about = replace(
-        case, plan={}, achieved=False, muscles=None, postoperative=None, photo=None, mesh=CaseMesh()
+        case,
+        plan={},
+        achieved=False,
+        muscles=None,
+        postoperative=None,
+        photo=None,
+        bite=None,
+        mesh=CaseMesh(),
     )
     folder = case.file.parent
     parts = ("image", "surfaces", "landmarks", "osteotomies")
@@ -335,6 +342,8 @@ def _files(case: Case) -> Iterator[Path]:
         optional += [after.skin, after.image, after.landmarks, *after.bones.values()]
     if case.photo is not None:
         optional += [*photo_files(case.photo.file), case.photo.landmarks]
+    if case.bite is not None:
+        optional += [case.bite.upper, case.bite.lower]
     for motion in case.plan.values():
         optional += [motion.transform, motion.surface, motion.moved_surface]
     yield from (path for path in optional if path is not None)

@@ -26,15 +26,17 @@ from cmfsim.planning.face_measures.occlusion import (
     missing_for_occlusion,
     occlusion,
 )
-from cmfsim.planning.occlusion import bite_sites, first_molars, patient_rows
+from cmfsim.planning.occlusion import bite_sites, first_molars, patient_rows, rigid_of
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import profile_sites, short_name, tooth_of
+from cmfsim.values.motion import carried
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 
 Values = Mapping[str, float | None]
 # Sites that only locate the occlusal plane.
+TARGET = "Lower teeth off the target bite"
 BITE = frozenset(itertools.chain(*BITES[1]))
 
 
@@ -76,7 +78,8 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
             occlusion(before),
             occlusion(after, before),
             missing_for_occlusion(before, unfound_molars(patient)),
-        ),
+        )
+        + _off_target(prediction),
         "cephalometry": _rows(
             CEPHALOMETRIC_MEASURES,
             cephalometry(before),
@@ -157,6 +160,22 @@ def unfound_molars(patient: PatientModel) -> dict[str, str]:
         )
         for side in ("left", "right")
     }
+
+
+def _off_target(prediction: Prediction) -> list[dict[str, Any]]:
+    """How far the lower teeth are from the bite of the case's scans; nothing without scans."""
+    target = prediction.patient.summary.get("target_bite")
+    if target is None:
+        return []
+    places, into = np.array(target["places"]), np.array(target["motion"])
+    plan = prediction.scene.plan
+    upper, lower = (rigid_of(plan.get(target[jaw])) for jaw in ("upper", "lower"))
+    before, planned = (
+        float(np.linalg.norm(carried(up @ into, places) - carried(low, places), axis=1).max())
+        for up, low in ((np.eye(4), np.eye(4)), (upper, lower))
+    )
+    text = {"label": TARGET, "unit": "mm", "norm": "0", "source": "scans of [bite]"}
+    return [{**text, "before": before, "planned": planned, "absent": ""}]
 
 
 def _with_error(measure: Measure, sites: Collection[str]) -> Measure:

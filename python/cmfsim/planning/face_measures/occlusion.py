@@ -75,10 +75,11 @@ EDGE_ERROR = WORSE = 1.0
 def poor_bite(rows: Iterable[Mapping[str, Any]]) -> list[Finding]:
     """A finding with what a plan takes out of `BITE_LIMITS`, or further out; empty if nothing.
 
-    rows: "before" and "planned" of each of `OCCLUSAL_MEASURES`, as `clinical_figures` has them.
+    rows: "before" and "planned" of each of `OCCLUSAL_MEASURES`, as `clinical_figures` has them; of
+        others after them nothing is asked.
     """
     texts = []
-    for measure, row in zip(OCCLUSAL_MEASURES, rows, strict=True):
+    for measure, row in zip(OCCLUSAL_MEASURES, rows, strict=False):
         was, now = row["before"], row["planned"]
         if measure.key not in BITE_LIMITS or was is None or now is None:
             continue

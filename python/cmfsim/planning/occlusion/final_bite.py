@@ -16,6 +16,7 @@ from cmfsim.errors import CaseInputError, RegistrationError
 from cmfsim.planning.occlusion.contacts import contact_map
 from cmfsim.planning.occlusion.rows import ToothRow
 from cmfsim.values.checks import Floats
+from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
@@ -66,6 +67,12 @@ class FinalBite:
         """The motion of the lower jaw if the upper one moves by `upper`, (4, 4) mm."""
         return np.asarray(np.asarray(upper, dtype=np.float64) @ self.motion)
 
+    @property
+    def findings(self) -> list[Finding]:
+        """What a person should check before trusting it."""
+        what = f"the mirror image of the {' and '.join(self.mirrored)} scan fits the teeth as well"
+        return [Finding("bite-scan-symmetric", what)] if self.mirrored else []
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
         return {
@@ -107,6 +114,10 @@ def final_bite(
     towards = upper_scan.vertices.mean(axis=0) - lower_scan.vertices.mean(axis=0)
     upper_fit, upper_mirrored = _fitted(upper, upper_scan, towards)
     lower_fit, lower_mirrored = _fitted(lower, lower_scan, -towards)
+    if upper.segment == lower.segment:
+        raise CaseInputError(
+            f"both rows are on {upper.segment} (bite-one-segment): separate the jaws"
+        )
     motion = np.asarray(np.linalg.inv(upper_fit.matrix) @ lower_fit.matrix, dtype=np.float64)
     contacts = contact_map(upper, lower.moved(motion))
     overlap, gap = contacts.greatest_overlap, max(0.0, contacts.least_gap)

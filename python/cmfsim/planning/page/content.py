@@ -155,6 +155,7 @@ def page_content(
         ],
         **profile,
         **teeth,
+        "target_bite": _target_bite(planning),
         "expected_error": errors.as_dict(),
         "correction": _correction(planning),
         "band": band_values,
@@ -398,6 +399,20 @@ def _profile(
     arrays["profile_ends"] = _indices(profile.ends[shown])
     arrays["profile_share"] = _singles(profile.share[shown])
     return {"has_profile": True, "profile_absent": ""}
+
+
+def _target_bite(planning: PlanningModel) -> dict[str, Any] | None:
+    """The motion of the lower jaw into the bite of the case's scans, by numbers of segments."""
+    target = planning.patient.summary.get("target_bite")
+    if target is None:
+        return None
+    number = {name: index for index, name in enumerate(planning.segments)}
+    return {
+        "upper": number.get(target["upper"]),
+        "lower": number.get(target["lower"]),
+        "motion": np.ravel(target["motion"]).tolist(),
+        "places": target["places"],
+    }
 
 
 def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,3 +143,43 @@ def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
     assert main([*exchanged, "-o", out]) == 2
     assert "bite-scan-poor" in json.loads(capsys.readouterr().out)["error"]["text"]
     assert not (tmp_path / "exchanged.toml").exists()
+
+
+def test_a_case_states_how_far_its_plan_is_from_the_bite_of_its_scans(
+    scans, tmp_path, tmp_path_factory, capsys
+):
+    levels = shared_values.drawn_levels(tmp_path_factory, 2.0)
+    case = phantom_case.surface_case(tmp_path, cmfsim.make_head(), levels)
+    text = case.read_text(encoding="utf-8")
+    for jaw, scan in zip(("upper", "lower"), scans, strict=True):
+        cmfsim.write_surface(tmp_path / f"{jaw}_scan.stl", scan)
+    named = '[bite]\nupper = "upper_scan.stl"\nlower = "lower_scan.stl"\n'
+    case.write_text(f"{text}\n{named}", encoding="utf-8")
+    # One scan beside the other of the case would be in another frame.
+    words = ["bite", str(case), "--json", "-q", "--no-doctor"]
+    assert main([*words, "--upper", str(tmp_path / "upper_scan.stl")]) == 2
+    assert "scans of both jaws" in capsys.readouterr().out
+    assert main(words) == 0
+    file = json.loads(capsys.readouterr().out)["file"]
+    given = cmfsim.Case.load(case)
+    given = replace(given, mesh=replace(given.mesh, edge_length=14.0))
+    first = cmfsim.predict(given, model="H", check=False)
+    target = first.patient.summary["target_bite"]
+    places = np.array(target["places"])
+    into = np.array(target["motion"])
+    planned = first.scene.plan["maxilla"] @ into, first.scene.plan["mandible_body"]
+    off = [np.linalg.norm(carried(m, places) - places, axis=1).max() for m in (into, BITE)]
+    assert abs(off[0] - off[1]) < 0.3
+    row = cmfsim.clinical_figures(first)["occlusion"][-1]
+    assert row["label"] == "Lower teeth off the target bite"
+    assert row["before"] == pytest.approx(off[0])
+    apart = np.linalg.norm(carried(planned[0], places) - carried(planned[1], places), axis=1)
+    assert row["planned"] == pytest.approx(apart.max())
+    second = first.replan(
+        {name: motion.matrix for name, motion in given.with_plan(file).plan.items()}
+    )
+    assert cmfsim.clinical_figures(second)["occlusion"][-1]["planned"] < 1e-6
+    # A scan that is gone is found before anything is built.
+    (tmp_path / "lower_scan.stl").unlink()
+    found = [f for f in cmfsim.diagnose(case) if f.code == "input-unreadable"]
+    assert ["bite.lower" in finding.where for finding in found] == [True]

@@ -5,6 +5,7 @@ import pytest
 from planning_steps import settle
 
 from browser_page import serious_faults, until
+from cmfsim.values.motion import carried, rigid_motion
 
 pytest.importorskip("skimage")
 pytest.importorskip("meshio")
@@ -148,3 +149,45 @@ def test_a_photo_whose_points_do_not_fit_gets_no_lines(opened, tmp_path):
 
 def test_the_page_has_no_serious_fault_of_accessibility(opened):
     assert serious_faults(opened) == []
+
+
+def test_the_button_moves_the_lower_jaw_into_the_target_bite(opened, planning):
+    names = list(planning.segments)
+    numbers = [names.index(name) for name in ("maxilla", "mandible_body")]
+    motion = rigid_motion((0.5, -2.0, 1.0), 2.0, (0.0, 0.0, 1.0))
+    upper = rigid_motion((0.0, -4.0, 1.0), 3.0, (1.0, 0.0, 0.0))
+    target = {
+        "upper": numbers[0],
+        "lower": numbers[1],
+        "motion": motion.ravel().tolist(),
+        "places": [[0.0, -90.0, -50.0], [30.0, -50.0, -50.0], [-30.0, -50.0, -50.0]],
+    }
+    assert not opened.locator("#target-bite").is_visible()
+    opened.evaluate(
+        """([target, upper]) => {
+          cmfsimPage.page.target_bite = target;
+          const panel = new cmfsimPage.panel.constructor(cmfsimPage);
+          cmfsimPage.panel.root.replaceWith(panel.root);
+          cmfsimPage.panel = panel;
+          cmfsimPage.preview({segment: target.upper, motion: upper});
+          cmfsimPage.commit();
+        }""",
+        [target, upper.ravel().tolist()],
+    )
+    settle(opened)
+    now = np.array(opened.evaluate("cmfsimPage.motions")).reshape(-1, 4, 4)[numbers[1]]
+    places = np.array(target["places"])
+    off = np.linalg.norm(carried(upper @ motion, places) - carried(now, places), axis=1).max()
+    assert f"{off:.1f} mm off the target bite" in opened.locator("#target-bite").inner_text()
+    opened.get_by_role("button", name="Move the lower jaw into the target bite").click()
+    settle(opened)
+    now = np.array(opened.evaluate("cmfsimPage.motions")).reshape(-1, 4, 4)[numbers[1]]
+    np.testing.assert_allclose(now, upper @ motion, atol=1e-9)
+    assert "are 0.0 mm off the target bite" in opened.locator("#target-bite").inner_text()
+    opened.get_by_role("button", name="Undo").click()
+    settle(opened)
+    # A bite that no operation gives is refused, and the plan stays.
+    opened.evaluate("cmfsimPage.page.target_bite.motion[3] = 300")
+    opened.get_by_role("button", name="Move the lower jaw into the target bite").click()
+    assert "at most 30 mm are allowed" in opened.locator("#message").inner_text()
+    assert "0.0 mm off" not in opened.locator("#target-bite").inner_text()

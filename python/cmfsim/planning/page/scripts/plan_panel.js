@@ -3,7 +3,7 @@
 import { NUMBERS, clinicalNumbers, withNumber } from "./clinical.js";
 import { button, element, numberField, signed, table, typedNumber } from "./elements.js";
 import { LIMITS, beyondLimits } from "./plans.js";
-import { STAYS, moved } from "./rigid.js";
+import { STAYS, moved, product } from "./rigid.js";
 
 const STEP = 0.1;
 // How far sliders reach, mm or degrees; what is further is typed.
@@ -45,9 +45,40 @@ export class PlanPanel {
         this.redo = button("Redo", () => this.app.redo(), { title: "Ctrl+Y" }),
         button("Reset segment to the case's plan", () => this.set(page.segments[this.segment].reference)),
         button("No movement", () => this.set(STAYS))),
+      this.bite = element("p", { className: "state", id: "target-bite", role: "status" }),
+      page.target_bite && page.target_bite.lower !== null
+        ? button("Move the lower jaw into the target bite", () => this.intoBite(), { id: "into-bite" }) : null,
       this.table,
     );
     this.fill();
+  }
+
+  /** The motion of the lower jaw that brings it into the bite of the scans, by that of the upper one. */
+  get intoTarget() {
+    const { upper, motion } = this.app.page.target_bite;
+    return product(upper === null ? STAYS : this.app.motions[upper], motion);
+  }
+
+  intoBite() {
+    const { lower } = this.app.page.target_bite;
+    const motion = this.intoTarget;
+    const why = beyondLimits(motion, this.app.plans.active.motions[lower], this.app.page.segments[lower].points[0].place, NUMBERS);
+    if (why) {
+      this.app.report(`${why}. The plan was not changed.`);
+      return;
+    }
+    this.app.preview({ segment: lower, motion });
+    this.app.commit();
+  }
+
+  showBite() {
+    const { target_bite: bite } = this.app.page;
+    this.bite.hidden = !bite;
+    if (!bite) return;
+    const now = bite.lower === null ? STAYS : this.app.motions[bite.lower];
+    const there = this.intoTarget;
+    const off = Math.max(...bite.places.map((p) => Math.hypot(...moved(there, p).map((v, i) => v - moved(now, p)[i]))));
+    this.bite.textContent = `The lower teeth are ${off.toFixed(1)} mm off the target bite of the scans.`;
   }
 
   row({ key, label, unit, low, high }) {
@@ -150,6 +181,7 @@ export class PlanPanel {
       slider.value = String(numbers[key]);
       slider.setAttribute("aria-valuetext", text);
     }
+    this.showBite();
     this.undo.disabled = !this.app.plans.past.length;
     this.redo.disabled = !this.app.plans.future.length;
     const rows = this.points.map(({ label, place }) => {
