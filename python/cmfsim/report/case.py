@@ -18,7 +18,7 @@ from cmfsim.report.document import (
     View,
     number,
 )
-from cmfsim.report.page import MEASURES, MESH, MUSCLES, labelled, plan_name
+from cmfsim.report.page import MEASURES, MESH, MUSCLES, labelled, plan_name, whose
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, counted, grouped
 
@@ -119,8 +119,8 @@ def case_document(
     several = "Models" if len(predictions) > 1 else "Model"
     return Document(
         title=f"{entry['case']}: predicted face",
-        subtitle=f"{several} {models}. {plan_name(entry)}Lengths in mm; L is the patient's left, "
-        "P posterior, S up.",
+        subtitle=f"{whose(entry)}{several} {models}. {plan_name(entry)}Lengths in mm; L is the "
+        "patient's left, P posterior, S up.",
         facts=_facts(entry, evaluation),
         sections=sections,
         footer=f"Made by {versions}. Mass-tensor model after Kim, Jürgens, Weber, Nolte and Reyes "

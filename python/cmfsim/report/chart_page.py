@@ -10,7 +10,7 @@ from typing import Any
 
 from cmfsim.errors import third_party
 from cmfsim.report.clinical import TITLES, WAYS, absent_text, measure_rows, site_rows
-from cmfsim.report.page import DISCLAIMER, plan_name
+from cmfsim.report.page import DISCLAIMER, plan_name, whose
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, grouped
 
@@ -145,8 +145,9 @@ def draw_chart_page(
     page.line(MARGIN, y + 21.0, DISCLAIMER, TEXT, weight="bold", color=ALARM)
     skin = f"The skin moves by up to {prediction['skin']['largest']:.1f} mm."
     about = f"Model {prediction['model']}. {plan_name(prediction)}Lengths in mm. {skin}"
-    page.line(MARGIN, y + 33.0, about, TEXT, color=PALE)
-    y = page.heading(MARGIN, y + 48.0, "Plan")
+    page.line(MARGIN, y + 33.0, whose(prediction), TEXT)
+    page.line(MARGIN, y + 45.0, about, TEXT, color=PALE)
+    y = page.heading(MARGIN, y + 60.0, "Plan")
     words = plan_lines({name: m["clinical"] for name, m in prediction["plan"].items()})
     y = page.paragraph((MARGIN, y), words, TEXT, PLAN_LINES) + APART
     found = prediction.get("clinical", {"cephalometry": (), "face": (), "sites": ()})

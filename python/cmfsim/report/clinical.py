@@ -78,7 +78,10 @@ def measure_rows(found: Values, kind: str) -> list[tuple[str, ...]]:
             change = NOTHING if None in values else _text(values[1] - values[0], "+")
             cells = (NOTHING if value is None else _text(value) for value in values)
             norm = (entry["norm"] or NOTHING, entry["source"] or NOTHING)
-            rows.append((f"{entry['label']}, {entry['unit']}", *cells, change, *norm))
+            # A unit is not parted from its name.
+            rows.append(
+                (f"{entry['label']},\N{NO-BREAK SPACE}{entry['unit']}", *cells, change, *norm)
+            )
     return rows
 
 

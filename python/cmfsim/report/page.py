@@ -130,6 +130,13 @@ def _compact(png: bytes) -> tuple[bytes, str]:
     return packed.getvalue(), "webp"
 
 
+def whose(prediction: Mapping[str, object]) -> str:
+    """Whose face was predicted, and when, as sentences; empty parts are left out."""
+    patient, date = prediction.get("patient"), prediction.get("written_at")
+    texts = (f"Predicted {date}. " if date else "", f"Patient: {patient}. " if patient else "")
+    return "".join(texts)
+
+
 def plan_name(prediction: Mapping[str, object]) -> str:
     """What the planning page and a saved plan call the plan: its digits, as a sentence."""
     digits = prediction.get("plan_digits")

@@ -57,6 +57,8 @@ def full(many):
         "skin": {"largest": 12.3},
         "versions": {"cmfsim": "0.1.0", **({f"library{i}": "1.2.3" for i in range(30 * many)})},
         "case_key": "0" * 64,
+        "patient": "$4711$ " * (1 + 30 * many),
+        "written_at": "2026-11-28 13:30 +0100",
         "inputs": {f"folder/a_file_{i}.nii.gz": "f" * 64 for i in range(40 * many)},
         "plan": {f"segment_{i}": {"clinical": clinical} for i in range(1 + 12 * many)},
     }
@@ -114,6 +116,7 @@ def test_texts_stay_on_the_page_and_apart(many, drawn):
     texts = [text.get_text() for text in page.texts]
     assert any("not a medical device" in text for text in texts)
     assert any("0" * 64 in text for text in texts)
+    assert any("2026-11-28 13:30 +0100. Patient: $4711$" in text for text in texts)
     # A label that is a little too wide is shrunk, not shortened.
     assert ("Mandibular plane to FH, mm" in texts) == many
     assert ("… more in report.html" in texts) == many

@@ -112,7 +112,9 @@ CLINICAL = {
 
 def test_measures_and_landmarks_are_shown_before_planned_and_changed():
     measures, landmarks = clinical_sections({"clinical": CLINICAL})
-    assert measures.blocks[0].rows == (("ANB, °", "−1.0", "2.5", "+3.5", "2", "Steiner 1953"),)
+    assert measures.blocks[0].rows == (
+        ("ANB,\N{NO-BREAK SPACE}°", "−1.0", "2.5", "+3.5", "2", "Steiner 1953"),
+    )
     assert measures.blocks[1].text == "Not available: SNA, ° (S: not given)."
     assert landmarks.blocks[0].rows == (("pogonion", "maxilla", "−3.5", "0.0", "0.0", "3.5"),)
     assert landmarks.blocks[1].text == "Stay: nasion."

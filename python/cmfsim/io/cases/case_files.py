@@ -23,9 +23,9 @@ CASE_FORMAT = "cmfsim-case"
 # What a case's file is called where its folder alone is given.
 CASE_FILE = "case.toml"
 TABLES = (
-    "format", "version", "name", "note", "image", "surfaces", "landmarks", "region", "mesh", "lips",
-    "osteotomies", "plan", "node_kinds", "tissue", "muscles", "solver", "band", "postoperative",
-    "photo", "bite", "output",
+    "format", "version", "name", "patient", "note", "image", "surfaces", "landmarks", "region",
+    "mesh", "lips", "osteotomies", "plan", "node_kinds", "tissue", "muscles", "solver", "band",
+    "postoperative", "photo", "bite", "output",
 )  # fmt: skip
 
 
@@ -66,6 +66,8 @@ class Case:
     photo : CasePhoto or None
     bite : CaseBite or None
         Scans of the bite that results are compared with; `cmfsim bite` makes a plan of them.
+    patient : str
+        Who it is, as report and chart state it: only what the user has written.
     note : str
         A remark for readers of the report, such as that the patient is synthetic.
     places : mapping of str to str
@@ -97,6 +99,7 @@ class Case:
     postoperative: case_parts.CasePostoperative | None = None
     photo: case_parts.CasePhoto | None = None
     bite: case_parts.CaseBite | None = None
+    patient: str = ""
     note: str = ""
     places: Mapping[str, str] = field(default_factory=dict)
 
@@ -256,6 +259,7 @@ def _read(path: Path, changes: CaseChanges | None) -> Case:
         postoperative=given("postoperative", case_tables.postoperative_of),
         photo=given("photo", case_tables.photo_of),
         bite=given("bite", lambda table, folder: table.part(case_parts.CaseBite, folder)),
+        patient=document.text("patient") if "patient" in document else "",
         note=document.text("note") if "note" in document else "",
         places=document.all_places(),
     )

@@ -119,7 +119,8 @@ _MODULI = {
     "fat": {"young": _YOUNG, "poisson": _POISSON}, "muscle": _MUSCLE, "muscles": {str: _MUSCLE},
 }  # fmt: skip
 PREDICTION = {
-    **dict.fromkeys(("case", "case_key", "note?", "plan_digits?"), str), "model": frozenset(MODELS),
+    **dict.fromkeys(("case", "case_key", "patient?", "note?", "plan_digits?", "written_at?"), str),
+    "model": frozenset(MODELS),
     "versions": {str: str}, "inputs": {str: str}, "timings": {str: _SECONDS},
     "skin": dict.fromkeys(("mean", "face_mean?", "p95", "largest"), _SIZE), "plan": {str: _motion},
     "segments": {str: {"joined": COUNT, "sliding": COUNT}}, "mesh": {str: object},

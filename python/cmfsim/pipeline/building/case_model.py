@@ -144,6 +144,7 @@ def _summary(
     inputs = input_hashes(case)
     return {
         "case": case.name,
+        "patient": case.patient,
         "note": case.note,
         "nodes": {name: len(kinds.nodes(name)) for name in NODE_KINDS},
         "segments": {

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,8 +59,8 @@ from cmfsim.pictures import (
 from cmfsim.pictures.canvas import Painter
 from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.faces import animate_face
-from cmfsim.pipeline.banding import face_motion
 from cmfsim.pictures.lateral import LateralView, lateral_picture
+from cmfsim.pipeline.banding import face_motion
 from cmfsim.pipeline.building.inputs import input_hash
 from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import CaseEvaluation
@@ -309,7 +310,7 @@ def _fill_model(
     clinical["contacts"] = contacts if isinstance(contacts, dict) else contacts.as_dict()
     own = [asdict(finding) for finding in poor_bite(clinical["occlusion"])]
     findings = [*summary.get("findings", ()), *own]
-    figures = {"skin": skin, "clinical": clinical, "findings": findings}
+    figures = {"skin": skin, "clinical": clinical, "findings": findings, "written_at": _now()}
     prediction = replace(prediction, summary={**summary, **figures})
     place = drawing.place(prediction.model)
     (fresh / place).mkdir(exist_ok=True)
@@ -319,6 +320,11 @@ def _fill_model(
     with clock.timed("writing the files"):
         names = fill_prediction(fresh / place, prediction, more)
     return WrittenPrediction(place, names, prediction.summary)
+
+
+def _now() -> str:
+    """Date and time here, to the minute, with the difference from UTC."""
+    return datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z")
 
 
 def _older(output: Path, places: Iterable[str]) -> list[str]:

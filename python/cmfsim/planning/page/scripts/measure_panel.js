@@ -22,7 +22,7 @@ export class MeasurePanel {
     this.ofCase ??= face.measures(face.reference);
     const now = face.measures(motions);
     this.body.replaceChildren(...page.measures.map(({ label, unit, absent, about }, i) => {
-      const head = element("th", { scope: "row", textContent: `${label}, ${unit}`, title: about });
+      const head = element("th", { scope: "row", textContent: `${label},\u00a0${unit}`, title: about });
       if (now[i] === null) {
         return element("tr", {}, head, element("td", { className: "absent", colspan: "4", textContent: absent }));
       }
