@@ -45,10 +45,15 @@ def open_page(browser, path):
     context.close()
 
 
+def axe_script():
+    """The file of axe-core, wherever it would be."""
+    placed = Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js"
+    return Path(os.environ.get("CMFSIM_AXE", placed))
+
+
 def serious_faults(page):
     """Serious faults of accessibility that axe-core finds on a page; skips where it is absent."""
-    placed = Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js"
-    script = Path(os.environ.get("CMFSIM_AXE", placed))
+    script = axe_script()
     if not script.is_file():
         pytest.skip("axe-core is not installed: npm install --no-save axe-core, or CMFSIM_AXE")
     page.evaluate(script.read_text(encoding="utf-8"))

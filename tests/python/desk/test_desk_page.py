@@ -12,7 +12,7 @@ import pytest
 
 import cmfsim
 import real_heads
-from browser_page import until
+from browser_page import axe_script, serious_faults, until
 from cmfsim.desk.server import desk_server
 from cmfsim.desk.session import Session
 from cmfsim.io.results.predictions import read_prediction
@@ -67,6 +67,10 @@ class Person:
         mouse.up()
         self.count += 1
 
+    def can_be_used_by_all(self, page=None):
+        """axe-core, where it is installed, finds no serious fault of accessibility."""
+        assert not axe_script().is_file() or serious_faults(page or self.page) == []
+
     def waits(self, expression, seconds):
         """Until an expression is true, or the page reports an error."""
         end = time.monotonic() + seconds
@@ -114,8 +118,10 @@ def plan_by_clicks(person, seconds):
     page = person.page
     person.waits(OPEN, seconds)
     person.computed("head")
+    person.can_be_used_by_all()
     person.click("#to-landmarks")
     person.waits("globalThis.cmfsimPage?.timing.compute > 0", 60)
+    person.can_be_used_by_all()
     person.click("#accept")
     person.click("#save-in-case")
     person.waits(OPEN, 60)
@@ -128,9 +134,11 @@ def plan_by_clicks(person, seconds):
     raise_plane(person)
     person.type("#move-maxilla-forwards", "4")
     person.type("#move-mandible_body-forwards", "-2,5")
+    person.can_be_used_by_all()
     person.click("#compute")
     person.waits(PLANNING, seconds)
     person.computed("plan operator")
+    person.can_be_used_by_all()
     person.click("button[role=tab]:has-text('maxilla')")
     person.type("#number-up", "1")
     until(page, "!document.getElementById('save-in-case').disabled")
@@ -142,10 +150,12 @@ def plan_by_clicks(person, seconds):
     person.click("#predict")
     person.waits("document.querySelectorAll('#reports a').length === 2", seconds)
     person.computed("report")
+    person.can_be_used_by_all()
     with page.expect_popup() as opened:
         person.click("#reports a >> nth=0")
     opened.value.wait_for_load_state()
     assert "predicted face" in opened.value.title()
+    person.can_be_used_by_all(opened.value)
     return page.evaluate("cmfsimPage.desk.state.digits")
 
 
