@@ -1,6 +1,7 @@
 """CmfSim: choose a volume or models, move segments by transforms, and see the face follow.
 
-Two buttons: the face under the transforms, and the planning page, in which other plans are tried.
+Three buttons: the pieces of bone as they are cut, for the transforms; the face under these; and the
+planning page, in which other plans are tried.
 
 A thin widget. What it does with what was chosen is in CmfSimLib, which knows no Slicer; the
 prediction itself runs in a process of its own.
@@ -23,10 +24,11 @@ from slicer.ScriptedLoadableModule import (
 
 import slicer
 from CmfSimLib.case_folder import BONES, MODELS, Choice, ChoiceError, Segment, face_of, write_case
-from CmfSimLib.running import Run, page_command, predict_command, words_of
+from CmfSimLib.running import Run, page_command, pieces_command, predict_command, words_of
 
 ACTIVE = "displacement_length_mm"
 COLOURS = "vtkMRMLColorTableNodeFileViridis.txt"
+PIECES_BUTTON = "Show the pieces of bone"
 FACE_BUTTON, PAGE_BUTTON = "Predict the face", "Make the planning page"
 # How often a running prediction is asked for its progress, ms.
 INTERVAL = 300
@@ -142,6 +144,10 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
         self.edge.minimum, self.edge.maximum, self.edge.value = 1.0, 30.0, 6.0
         self.edge.suffix = " mm"
         form.addRow("Edge length:", self.edge)
+        self.piecesButton = qt.QPushButton(PIECES_BUTTON)
+        self.piecesButton.toolTip = "The bones named above as they are cut, before any moves"
+        self.piecesButton.connect("clicked()", self.onPiecesButton)
+        form.addRow(self.piecesButton)
         self.button = qt.QPushButton(FACE_BUTTON)
         self.button.connect("clicked()", self.onButton)
         form.addRow(self.button)
@@ -161,6 +167,10 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
             name, model, transform = (self.table.cellWidget(row, column) for column in range(3))
             yield name.currentText.strip(), model.currentNode(), transform.currentNode()
 
+    def onPiecesButton(self):
+        """Starts the cutting of the bones, or stops what runs."""
+        self._start(pieces_command, self.showPieces, is_preview=True)
+
     def onButton(self):
         """Starts a prediction, or stops what runs."""
         self._start(predict_command, self.showPrediction)
@@ -169,7 +179,7 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
         """Starts the making of a planning page, or stops what runs."""
         self._start(page_command, self.showPage)
 
-    def _start(self, command, show):
+    def _start(self, command, show, *, is_preview=False):
         if self.run is not None:
             self.run.stop()
             return
@@ -182,13 +192,14 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
                 (self.skull.currentNode(), self.marks.currentNode()),
                 (self.edge.value, self.model.currentText),
             )
+            chosen.is_preview = is_preview
             self.case = write_case(self.logic.folder, chosen)
         except (ChoiceError, RuntimeError) as error:
             slicer.util.errorDisplay(str(error), windowTitle="CmfSim")
             return
         self.show = show
         self.run = Run(command(self.case, chosen.model, python=self.logic.python()))
-        self.button.text = self.pageButton.text = "Stop"
+        self.button.text = self.pageButton.text = self.piecesButton.text = "Stop"
         self.bar.visible = True
         self.bar.value = 0
         self.timer.start()
@@ -205,6 +216,7 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
         self.timer.stop()
         run, self.run = self.run, None
         self.button.text, self.pageButton.text = FACE_BUTTON, PAGE_BUTTON
+        self.piecesButton.text = PIECES_BUTTON
         self.bar.visible = False
         answer = run.answer()
         run.close()
@@ -220,6 +232,12 @@ class CmfSimWidget(ScriptedLoadableModuleWidget):
         head = self.volume.currentNode() or self.skin.currentNode()
         self.logic.showFace(out / "prediction.mrb", head)
         return "The face is coloured by its displacement in mm."
+
+    def showPieces(self, out):
+        """Loads each piece of bone as a model, and states what they are."""
+        head = self.volume.currentNode() or self.skin.currentNode()
+        names = self.logic.showPieces(out, head)
+        return f"Pieces: {', '.join(names)}. Give each that moves a row and a transform."
 
     def showPage(self, out):
         """Opens the planning page in the browser, and states where it is."""
@@ -297,16 +315,29 @@ class CmfSimLogic(ScriptedLoadableModuleLogic):
         transform.GetMatrixTransformToParent(matrix)
         return tuple(tuple(matrix.GetElement(i, k) for k in range(4)) for i in range(4))
 
+    def showPieces(self, out, head):
+        """The names of the pieces of bone, loaded to where the head is shown."""
+        files = sorted(out.glob("segment-*.ply"))
+        names = [file.stem.removeprefix("segment-") for file in files]
+        for file, name in zip(files, names, strict=True):
+            self._loaded(file, name, head)
+        return names
+
+    def _loaded(self, file, name, head):
+        """A model in a file, in LPS as Slicer takes it, under the transform of the head."""
+        node = slicer.util.loadModel(str(file))
+        node.SetName(name)
+        if head is not None and head.GetParentTransformNode() is not None:
+            node.SetAndObserveTransformNodeID(head.GetParentTransformNode().GetID())
+        return node
+
     def showFace(self, bundle, head):
         """Loads the predicted face, coloured by its displacement, to where the head is shown."""
-        node = slicer.util.loadModel(str(face_of(bundle, self.folder)))
-        node.SetName("face predicted")
+        node = self._loaded(face_of(bundle, self.folder), "face predicted", head)
         display = node.GetDisplayNode()
         display.SetActiveScalar(ACTIVE, vtk.vtkAssignAttribute.POINT_DATA)
         display.SetAndObserveColorNodeID(COLOURS)
         display.SetScalarVisibility(True)
-        if head is not None and head.GetParentTransformNode() is not None:
-            node.SetAndObserveTransformNodeID(head.GetParentTransformNode().GetID())
         return node
 
 

@@ -41,7 +41,10 @@ class Segment:
 
 @dataclass
 class Choice:
-    """The choice in the module: a CT, or a skin with bones; landmarks; how to solve."""
+    """The choice in the module: a CT, or a skin with bones; landmarks; how to solve.
+
+    `is_preview`: every segment that is named is cut, whether or not it moves.
+    """
 
     volume: Path | None = None
     skin: Path | None = None
@@ -50,6 +53,7 @@ class Choice:
     skin_landmarks: Path | None = None
     edge_length: float = 6.0
     model: str = "M+S"
+    is_preview: bool = False
 
 
 class ChoiceError(ValueError):
@@ -79,7 +83,7 @@ def check(choice):
         raise ChoiceError("Choose a CT volume, or a model of the skin with models of the bones.")
     elif not any(segment.file for segment in choice.segments):
         raise ChoiceError("Choose at least one model of a bone, such as the cranium.")
-    if not any(is_moved(segment) for segment in choice.segments):
+    if not choice.is_preview and not any(is_moved(segment) for segment in choice.segments):
         raise ChoiceError("No segment moves: apply a linear transform to at least one.")
 
 
@@ -102,7 +106,9 @@ def case_text(choice):
     ]
     if choice.volume is not None:
         lines += ["", "[image]", f"file = {json.dumps(choice.volume.name)}"]
-        needed = [PROCEDURES.get(s.name) for s in choice.segments if is_moved(s)]
+        needed = [
+            PROCEDURES.get(s.name) for s in choice.segments if choice.is_preview or is_moved(s)
+        ]
         for procedure in dict.fromkeys(p for p in needed if p):
             lines += ["", "[[osteotomies]]", f'procedure = "{procedure}"']
     else:

@@ -43,6 +43,12 @@ def page_command(case, model, *, python=None):
     return [*_command("plan", case, model, python), "--no-open"]
 
 
+def pieces_command(case, model, *, python=None):
+    """The arguments that build the model of a case, with a file for each piece of bone."""
+    del model
+    return [python or sys.executable, "-m", "cmfsim", "build", str(case), "--json"]
+
+
 def _command(name, case, model, python):
     words = [python or sys.executable, "-m", "cmfsim", name, str(case), "--model", model]
     return [*words, "--json"]

@@ -252,6 +252,7 @@ def panel(monkeypatch, tmp_path):
         "ctk": MagicMock(),
         "vtk": MagicMock(),
     }
+    modules["qt"].QPushButton.side_effect = lambda *_: MagicMock()
     for name, module in modules.items():
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.delitem(sys.modules, "CmfSim", raising=False)
@@ -318,6 +319,33 @@ def test_the_panel_makes_a_planning_page_and_opens_it(panel, monkeypatch):
     qt.QUrl.fromLocalFile.assert_called_once_with(str(page))
     assert str(page) in widget.status.text
     assert widget.pageButton.text == "Make the planning page"
+
+
+def test_the_panel_shows_the_pieces_of_bone_before_any_moves(panel, monkeypatch, tmp_path):
+    widget, slicer = panel
+    started = MagicMock()
+    started.return_value.code = None
+    monkeypatch.setattr(sys.modules["CmfSim"], "Run", started)
+    monkeypatch.setattr(widget.logic, "python", lambda: "python")
+    made = case_folder.Choice(volume=Path("ct.nrrd"), segments=[case_folder.Segment("maxilla")])
+    monkeypatch.setattr(widget.logic, "choice", lambda *_: made)
+    widget.logic.folder = tmp_path
+    widget.onButton()
+    assert "No segment moves" in slicer.util.errorDisplay.call_args[0][0]
+    widget.onPiecesButton()
+    assert started.call_args[0][0][3:5] == ["build", str(tmp_path / "case.toml")]
+    text = (tmp_path / "case.toml").read_text(encoding="utf-8")
+    assert 'procedure = "le_fort_1"' in text
+    (tmp_path / "out").mkdir()
+    for name in ("cranium", "maxilla"):
+        (tmp_path / "out" / f"segment-{name}.ply").touch()
+    started.return_value.poll.return_value = []
+    started.return_value.code = 0
+    widget.onTimer()
+    loaded = [Path(call[0][0]).name for call in slicer.util.loadModel.call_args_list]
+    assert loaded == ["segment-cranium.ply", "segment-maxilla.ply"]
+    assert "Pieces: cranium, maxilla." in widget.status.text
+    assert widget.piecesButton.text == "Show the pieces of bone"
 
 
 def test_a_wheel_beside_the_requirements_is_installed(panel, monkeypatch, tmp_path):
