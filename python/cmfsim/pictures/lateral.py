@@ -8,14 +8,12 @@ that outlines are dark, as those of cortical bone are. What lies inside bones is
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cmfsim.pictures.canvas import Picture
 from cmfsim.pictures.charts import write_figure
 from cmfsim.values.checks import Floats
 from cmfsim.values.surface_data import SurfaceData
@@ -59,11 +57,6 @@ class LateralView:
     sites: Mapping[str, Floats]
     axes: Floats
     middle: float
-
-
-def lateral_picture(before: LateralView, planned: LateralView) -> Picture:
-    """The picture that `picture_lateral` writes, to be drawn later."""
-    return partial(picture_lateral, before=before, planned=planned)
 
 
 def picture_lateral(
@@ -181,17 +174,11 @@ def _shells(surfaces: list[SurfaceData], axes: Floats, window: Floats) -> Floats
             shares = _lattice(count)
             points = np.einsum("pc,tca->tpa", shares, flat[own])
             weights = np.repeat(areas[own] / len(shares), len(shares))
-            total += _counted(points.reshape(-1, 2), weights, across, high)
+            column, row = np.floor(points.reshape(-1, 2)).astype(np.int64).T
+            inside = (column >= 0) & (column < across) & (row >= 0) & (row < high)
+            places = (row * across + column)[inside]
+            total += np.bincount(places, weights[inside], minlength=len(total))
     return total.reshape(high, across) / PIXEL**2
-
-
-def _counted(points: Floats, weights: Floats, across: int, high: int) -> Floats:
-    """The sum of the weights of points in each pixel, (h w,)."""
-    column, row = np.floor(points).astype(np.int64).T
-    inside = (column >= 0) & (column < across) & (row >= 0) & (row < high)
-    places = (row * across + column)[inside]
-    found = np.bincount(places, weights[inside], minlength=high * across)
-    return found.astype(np.float64)
 
 
 def _lattice(count: int) -> Floats:

@@ -14,7 +14,7 @@ from cmfsim.pictures.lateral import (
     _planes,
     _section,
     _shells,
-    lateral_picture,
+    picture_lateral,
 )
 
 pytest.importorskip("matplotlib")
@@ -64,7 +64,7 @@ def test_a_segment_is_drawn_where_the_plan_moves_it(tmp_path):
     sites = {"N": np.array([40.0, 40.0]), "Me": np.array([40.0, -40.0])}
     before = LateralView({"cranium": ball(8.0)}, ball(40.0), sites, AXES, 0.0)
     planned = LateralView({"cranium": ball(8.0, (0.0, -20.0, 0.0))}, ball(40.0), sites, AXES, 0.0)
-    lateral_picture(before, planned)(tmp_path / "lateral.png")
+    picture_lateral(tmp_path / "lateral.png", before=before, planned=planned)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         pixels = image.imread(tmp_path / "lateral.png")[:, :, :3]

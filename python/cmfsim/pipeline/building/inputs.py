@@ -264,16 +264,8 @@ def plan_key(case: Case) -> str:
 
     Raises `OSError`: A file that the case names cannot be read.
     """
-    about = replace(
-        case,
-        plan={},
-        achieved=False,
-        muscles=None,
-        postoperative=None,
-        photo=None,
-        bite=None,
-        mesh=CaseMesh(),
-    )
+    others: dict[str, Any] = dict.fromkeys(("muscles", "postoperative", "photo", "bite"))
+    about = replace(case, plan={}, achieved=False, mesh=CaseMesh(), **others)
     folder = case.file.parent
     parts = ("image", "surfaces", "landmarks", "osteotomies")
     content = {name: _plain(getattr(about, name), folder) for name in parts}

@@ -59,7 +59,7 @@ from cmfsim.pictures import (
 from cmfsim.pictures.canvas import Painter
 from cmfsim.pictures.charts import write_figure
 from cmfsim.pictures.faces import animate_face
-from cmfsim.pictures.lateral import LateralView, lateral_picture
+from cmfsim.pictures.lateral import LateralView, picture_lateral
 from cmfsim.pipeline.banding import face_motion
 from cmfsim.pipeline.building.inputs import input_hash
 from cmfsim.pipeline.building.stages import BuildKeywords
@@ -310,7 +310,8 @@ def _fill_model(
     clinical["contacts"] = contacts if isinstance(contacts, dict) else contacts.as_dict()
     own = [asdict(finding) for finding in poor_bite(clinical["occlusion"])]
     findings = [*summary.get("findings", ()), *own]
-    figures = {"skin": skin, "clinical": clinical, "findings": findings, "written_at": _now()}
+    now = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z")
+    figures = {"skin": skin, "clinical": clinical, "findings": findings, "written_at": now}
     prediction = replace(prediction, summary={**summary, **figures})
     place = drawing.place(prediction.model)
     (fresh / place).mkdir(exist_ok=True)
@@ -320,11 +321,6 @@ def _fill_model(
     with clock.timed("writing the files"):
         names = fill_prediction(fresh / place, prediction, more)
     return WrittenPrediction(place, names, prediction.summary)
-
-
-def _now() -> str:
-    """Date and time here, to the minute, with the difference from UTC."""
-    return datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z")
 
 
 def _older(output: Path, places: Iterable[str]) -> list[str]:
@@ -410,9 +406,10 @@ def _lateral(prediction: Prediction) -> Picture:
     if middle is None:
         middle = float(prediction.skin_before.vertices.mean(axis=0) @ frame.left)
     plane = np.stack([frame.forwards, frame.up, frame.left]), middle
-    return lateral_picture(
-        LateralView(at_rest, prediction.face_before, before, *plane),
-        LateralView(moved, prediction.face, planned, *plane),
+    return partial(
+        picture_lateral,
+        before=LateralView(at_rest, prediction.face_before, before, *plane),
+        planned=LateralView(moved, prediction.face, planned, *plane),
     )
 
 

@@ -75,8 +75,7 @@ EDGE_ERROR = WORSE = 1.0
 def poor_bite(rows: Iterable[Mapping[str, Any]]) -> list[Finding]:
     """A finding with what a plan takes out of `BITE_LIMITS`, or further out; empty if nothing.
 
-    rows: "before" and "planned" of each of `OCCLUSAL_MEASURES`, as `clinical_figures` has them; of
-        others after them nothing is asked.
+    rows: As `clinical_figures` has them: "before" and "planned" of each of `OCCLUSAL_MEASURES`.
     """
     texts = []
     for measure, row in zip(OCCLUSAL_MEASURES, rows, strict=False):

@@ -163,6 +163,7 @@ def test_the_button_moves_the_lower_jaw_into_the_target_bite(opened, planning):
         "places": [[0.0, -90.0, -50.0], [30.0, -50.0, -50.0], [-30.0, -50.0, -50.0]],
     }
     assert not opened.locator("#target-bite").is_visible()
+    assert "null" not in opened.inner_text("#panel")
     opened.evaluate(
         """([target, upper]) => {
           cmfsimPage.page.target_bite = target;

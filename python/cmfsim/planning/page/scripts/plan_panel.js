@@ -46,8 +46,8 @@ export class PlanPanel {
         button("Reset segment to the case's plan", () => this.set(page.segments[this.segment].reference)),
         button("No movement", () => this.set(STAYS))),
       this.bite = element("p", { className: "state", id: "target-bite", role: "status" }),
-      page.target_bite && page.target_bite.lower !== null
-        ? button("Move the lower jaw into the target bite", () => this.intoBite(), { id: "into-bite" }) : null,
+      ...((page.target_bite?.lower ?? null) === null ? []
+        : [button("Move the lower jaw into the target bite", () => this.intoBite(), { id: "into-bite" })]),
       this.table,
     );
     this.fill();
