@@ -6,7 +6,7 @@ with those of the same anatomy in a perfect scan with its known landmarks, where
 than 0.5 mm. `--clicks` places the sites that a refused or doubtful case asks for, at most three,
 1.5 mm off, and tries wrong clicks.
 
-    python -m benches.accuracy.unseen_scans --work FOLDER [--only TEXT] [--clicks]
+    python -m benches.accuracy.unseen_scans --work FOLDER [--only TEXT]
         [--markdown docs/landmarks.md]
 """
 
@@ -132,7 +132,7 @@ def apart(scan: Path, clean: Path) -> dict[str, float]:
     (points, moved), (places, right) = face(scan), face(clean)
     moves = np.linalg.norm(right, axis=1) > MOVES
     away, nearest = cKDTree(points).query(places[moves])
-    near = away < NEAR
+    near = np.asarray(away < NEAR)
     off = np.linalg.norm(moved[nearest] - right[moves], axis=1)[near]
     if not len(off):
         return {"mean": np.inf, "p95": np.inf, "shown": 0.0}

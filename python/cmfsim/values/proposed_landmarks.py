@@ -164,8 +164,9 @@ class ProposedLandmarks:
             for reason in dict.fromkeys(missing.values()):
                 names = [name for name, given in missing.items() if given == reason]
                 what = f"{len(names)} {kind} landmarks were not found: {', '.join(names)}: {reason}"
-                code = "landmark-missing"
-                yield Finding(code, what, severity="warning", where=where, why=why, fix=fix)
+                yield Finding(
+                    "landmark-missing", what, severity="warning", where=where, why=why, fix=fix
+                )
 
 
 def _following(sites: Mapping[str, ProposedSite]) -> Iterator[Finding]:

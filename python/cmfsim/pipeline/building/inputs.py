@@ -148,7 +148,7 @@ def _with_given_bones(
         level = signed_level(surfaces[name], anatomy.skin)
         levels[name] = level.with_values(np.minimum(level.values, anatomy.skin.values))
         own = level.values > 0.0
-        share = np.count_nonzero(own & shown) / max(np.count_nonzero(own), 1)
+        share = int((own & shown).sum()) / max(int(own.sum()), 1)
         if share < LEAST_SHOWN:
             raise CaseInputError(
                 f"{case.where(f'image.bones.{name}')}: {share:.0%} of {path.name} lies where "

@@ -26,7 +26,7 @@ pub(super) struct Spread<'a> {
 }
 
 /// What a supernode passes to its parent: itself, its unknowns, and the rows of its pattern column by column.
-type Update = (usize, Range<usize>, Vec<f64>);
+type Carried = (usize, Range<usize>, Vec<f64>);
 
 impl Spread<'_> {
     /// Wᵀ W above the tail, column by column, of which the lower triangle counts; and what W carries to the tail,
@@ -34,7 +34,7 @@ impl Spread<'_> {
     pub fn square(&self) -> (Vec<f64>, Vec<f64>) {
         let (size, tail) = (self.unknowns.len(), self.l.0.nrows() - self.first_of_tail);
         let (mut square, mut carried) = (vec![0.0; size * size], vec![0.0; size * tail]);
-        let mut updates: Vec<Update> = Vec::new();
+        let mut updates: Vec<Carried> = Vec::new();
         for s in 0..self.tree.tail {
             let below = self.tree.first[s];
             let kept = updates.partition_point(|(child, ..)| *child < below);
@@ -82,7 +82,7 @@ impl Spread<'_> {
         &self,
         s: usize,
         range: Range<usize>,
-        children: Vec<Update>,
+        children: Vec<Carried>,
         square: &mut [f64],
     ) -> Vec<f64> {
         let (node, size, first) = (Supernode::new(self.l, s), self.unknowns.len(), range.start);
