@@ -1,10 +1,9 @@
-"""Scans that nobody here has, from the command line to the face, without hand work and with clicks.
+"""Scans that nobody here has, from the command line to the face, without hand work.
 
 Two heads of other shapes, scanned as `benches/scenes/unseen_scans.py` says. `cmfsim init` and
 `predict` run on each as a user runs them. Landmarks are compared with the known ones, and faces
 with those of the same anatomy in a perfect scan with its known landmarks, where these move by more
-than 0.5 mm. `--clicks` places the sites that a refused or doubtful case asks for, at most three,
-1.5 mm off, and tries wrong clicks.
+than 0.5 mm.
 
     python -m benches.accuracy.unseen_scans --work FOLDER [--only TEXT]
         [--markdown docs/landmarks.md]

@@ -7,6 +7,12 @@ mod bad_input;
 mod properties;
 
 mod algebra {
+    mod cholesky {
+        mod dense;
+        mod normal;
+        mod sweep;
+        mod symmetric;
+    }
     mod elastic_box;
     mod error_bound;
     mod krylov;
@@ -70,5 +76,6 @@ mod statics {
     mod options;
     mod pressed;
     mod projected_product;
+    mod reaction;
     mod unstable;
 }

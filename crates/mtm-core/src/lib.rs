@@ -84,6 +84,10 @@ mod vector;
 /// Parts that only the tests of this crate open; they may change in any version.
 #[doc(hidden)]
 pub mod internals {
+    pub use crate::algebra::cholesky::{
+        DenseSymmetric, FactorPreconditioner, NormalFactor, Progress, ROWS_TO_SHARE, Rough,
+        RowForces, RowKey, TailFlexibility, conjugate_gradients, hopeless,
+    };
     pub use crate::algebra::constraints::{Constraint, projected};
     pub use crate::algebra::error_bound::tridiagonal_extremes;
     pub use crate::algebra::krylov::Operator;
@@ -110,6 +114,7 @@ pub mod internals {
     pub use crate::statics::linear::pressed::with_links;
     pub use crate::statics::linear::projected_product::ProjectedProduct;
     pub use crate::statics::linear::unstable::{at_fault, carry_on};
+    pub use crate::statics::plans::reaction::krylov::Krylov;
 }
 
 pub use algebra::blocks::BlockMatrix;

@@ -302,8 +302,9 @@ def _landmark_file(
             'state it: "coordinateSystem": "LPS" (.mrk.json), # CoordinateSystem = LPS (.fcsv), '
             'or frame = "LPS" under [landmarks]'
         )
-        code = "frame-unstated"
-        findings.append(Finding(code, what, severity=severity, where=where, why=why, fix=fix))
+        findings.append(
+            Finding("frame-unstated", what, severity=severity, where=where, why=why, fix=fix)
+        )
     if unset:
         names = ", ".join(unset[:5]) + (", …" if len(unset) > 5 else "")
         what = f"{len(unset)} points were never placed and are skipped: {names}"

@@ -37,8 +37,8 @@ def test_the_demo_reports_every_model(folder):
         # Contact ends at its tolerance in mm; linear systems are solved to rounding.
         assert summary["solution"]["residual"] < (1e-5 if "S" in model else 1e-12)
     drawn = len(re.findall(r'<img src="data:image/(png|webp);', page))
-    # Prediction, plan, muscles, contacts of the teeth; errors of every model, and their chart.
-    assert drawn == 8 or "This report has no pictures" in page
+    # Prediction, plan, tracing, muscles, contacts of the teeth; errors of every model, and a chart.
+    assert drawn == 9 or "This report has no pictures" in page
 
 
 def test_upper_lip_comes_forward_and_chin_goes_back(folder):

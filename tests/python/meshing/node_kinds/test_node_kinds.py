@@ -341,7 +341,7 @@ def test_a_real_head_gets_kinds_that_hold_it_and_solve(head_name):
         moved=["maxilla", "mandible_body", "chin"],
         landmarks=points,
         fixed_planes={"posterior": ((0, back, 0), (0, 1, 0))},
-        contacts=made.surfaces,
+        contacts={name: sheet.surface for name, sheet in made.sheets.items()},
     )
     kinds, counts = found.kinds, found.counts
     assert found.findings == ()

@@ -28,7 +28,7 @@ impl TailFlexibility {
     ///
     /// # Errors
     /// `NotPositiveDefinite` if the body does not hold the others.
-    pub(super) fn new(
+    pub fn new(
         flexibility: DenseSymmetric,
         rows: Vec<u32>,
         (carried, own): (Vec<f64>, Vec<f64>),
@@ -263,42 +263,4 @@ impl Kernel for Project<'_> {
 
 fn vectors(values: &[f64]) -> Vec<[f64; 3]> {
     values.chunks_exact(3).map(|v| [v[0], v[1], v[2]]).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use super::*;
-
-    /// Several directions at a node, none at another, softness, and memory of a larger matrix: as assembled in
-    /// double precision, to six digits.
-    #[test]
-    fn rough_flexibility_between_directions_equals_the_exact_one() {
-        let wave = |i: usize, j: usize| ((1 + i * j + i + j) as f64 * 0.37).sin();
-        let n = 21;
-        let matrix = DenseSymmetric::from_columns(n, |c, column| {
-            for (r, v) in (c..).zip(column.iter_mut()) {
-                let size = |i: usize| 10.0_f64.powi((i % 5) as i32 - 2);
-                *v = size(r) * size(c) * if r == c { n as f64 } else { wave(r, c) };
-            }
-        });
-        let (rough, rows) = (Arc::new(Rough::of(&matrix)), (0..n as u32 / 3).collect());
-        let tail = TailFlexibility { rough, flexibility: Arc::new(matrix), rows, lifted: None };
-        let unit = |a: f64, b: f64| [a.sin() * b.cos(), a.sin() * b.sin(), a.cos()];
-        let directions: Vec<(usize, [f64; 3])> = [0, 0, 1, 2, 2, 2, 4, 6, 6]
-            .iter()
-            .enumerate()
-            .map(|(k, &node)| (node, unit(0.3 + k as f64, 1.7 * k as f64)))
-            .collect();
-        let softness: Vec<f64> = (0..directions.len()).map(|k| (k % 3) as f64 * 0.4).collect();
-        let (nodes, axes): (Vec<usize>, Vec<[f64; 3]>) = directions.iter().copied().unzip();
-        let exact = tail.normal_flexibility(&nodes, &axes, &softness);
-        let rough = tail.rough_flexibility(&directions, &softness, vec![f32::NAN; 400]);
-        let x: Vec<f64> =
-            (0..directions.len()).map(|k| (k as f64).cos() / exact.column(k)[0].sqrt()).collect();
-        let expected = exact.multiply(&x);
-        for (k, (a, b)) in expected.iter().zip(rough.multiply(&x)).enumerate() {
-            assert!((a - b).abs() <= 1e-6 * exact.column(k)[0].sqrt(), "{k}: {a:e} {b:e}");
-        }
-    }
 }

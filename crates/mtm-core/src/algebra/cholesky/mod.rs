@@ -2,8 +2,6 @@
 //! folder that refers to faer.
 
 mod dense;
-#[cfg(test)]
-mod grid;
 mod lifting;
 mod normal;
 mod numeric;
@@ -28,7 +26,7 @@ pub use normal::{
 use spread::Spread;
 use structure::{minimum_degree, positions, supernodal_structure};
 use sweep::{Supernode, Sweep};
-pub use symmetric::{DenseFactor, DenseSymmetric, Rough};
+pub use symmetric::{DenseFactor, DenseSymmetric, ROWS_TO_SHARE, Rough};
 use workspace::{out_of_memory, parallelism};
 
 use crate::algebra::blocks::BlockMatrix;
@@ -257,7 +255,7 @@ impl Factor {
         self.sweep().backward(x);
     }
 
-    fn sweep(&self) -> Sweep<'_> {
+    pub fn sweep(&self) -> Sweep<'_> {
         Sweep::new((&self.symbolic.structure, &self.values), &self.symbolic.tree)
     }
 

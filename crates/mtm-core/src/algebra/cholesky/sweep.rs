@@ -162,6 +162,12 @@ impl<'a> Sweep<'a> {
         Self { l, tree, least: LEAST_ENTRIES_FOR_A_THREAD.max(share as usize), needed: None }
     }
 
+    /// The same, in which subtrees of so many entries are worth a thread; None if there are none.
+    pub fn with_threads_from(self, least: usize) -> Option<Self> {
+        let (sweep, roots) = (Self { least, ..self }, &self.tree.roots);
+        (sweep.cut(roots).is_some() || sweep.shared(roots).is_some()).then_some(sweep)
+    }
+
     /// The same, backward through some supernodes alone: with each, all of its ancestors.
     pub fn through(self, needed: &'a [bool]) -> Self {
         Self { needed: Some(needed), ..self }
@@ -324,97 +330,5 @@ impl<'a> Sweep<'a> {
 fn add(to: &mut [f64], what: &[f64]) {
     for (to, v) in to.iter_mut().zip(what) {
         *to += v;
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    #![allow(clippy::unwrap_used)]
-    use std::sync::Arc;
-
-    use super::super::{Symbolic, grid::grid};
-    use super::Sweep;
-    use crate::vector::add;
-
-    /// One column shared by 1, 2 and 3 threads: bitwise identical, and equal to the result for several columns
-    /// at once; for dense and sparse right-hand sides, with and without rows kept last.
-    #[test]
-    fn sweeps_equal_those_of_several_columns_for_any_number_of_threads() {
-        let n = 40;
-        let matrix = grid(n);
-        let tail: Vec<u32> = (0..n as u32).map(|i| n as u32 * i + 7).collect();
-        for (tail, every) in [(&tail[..], 1), (&[], 1), (&tail, 400), (&[], 400)] {
-            let symbolic = Arc::new(Symbolic::new(&matrix, tail).unwrap());
-            let factor = symbolic.factor(&matrix).unwrap();
-            let sweep = Sweep { least: 1000, ..factor.sweep() };
-            let roots = &symbolic.tree.roots;
-            assert!(sweep.cut(roots).is_some() || sweep.shared(roots).is_some());
-            let force = |j: usize| if j.is_multiple_of(every) { (j as f64).cos() } else { 0.0 };
-            let b: Vec<[f64; 3]> = (0..n * n).map(|j| [force(j), 0.0, -force(j)]).collect();
-            let answers = [1, 2, 3].map(|threads| {
-                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-                let mut x = symbolic.permuted(&b);
-                pool.install(|| {
-                    sweep.forward(&mut x);
-                    sweep.backward(&mut x);
-                });
-                symbolic.unpermuted(&x)
-            });
-            assert!(answers[0] == answers[1] && answers[0] == answers[2]);
-            let mut several = vec![b.clone(), b];
-            factor.solve_many(&mut several);
-            let largest = several[0].as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));
-            for (v, w) in answers[0].as_flattened().iter().zip(several[0].as_flattened()) {
-                assert!((v - w).abs() <= 1e-13 * largest, "{v:e} {w:e}");
-            }
-        }
-    }
-
-    /// Rows anywhere in the order, and rows kept last that are free: what both do under forces, and with more forces
-    /// on the former, equals whole solutions.
-    #[test]
-    fn responses_of_some_rows_equal_whole_solutions() {
-        let n = 40;
-        let matrix = grid(n);
-        let tail: Vec<u32> = (0..n as u32).map(|i| n as u32 * i + 7).collect();
-        let chosen: Vec<u32> = (0..n as u32).rev().map(|i| n as u32 * i + 2 * (i % 3)).collect();
-        for tail in [&tail[..], &[]] {
-            let symbolic = Arc::new(Symbolic::new(&matrix, tail).unwrap());
-            let factor = symbolic.factor(&matrix).unwrap();
-            let flexibility = factor.flexibility(&chosen, &[]).unwrap();
-            let mut b: Vec<[f64; 3]> =
-                (0..n * n).map(|j| [(j as f64).cos(), 1.0, (2.0 * j as f64).sin()]).collect();
-            let forces: Vec<[f64; 3]> = (0..n).map(|j| [0.0, j as f64, -1.0]).collect();
-            let mut swept = factor.swept(&b);
-            let moved = factor.of_rows(swept.clone(), &chosen);
-            let lifted = flexibility.lifted_by(factor.on_tail(&swept));
-            let mut at_chosen = flexibility.following(moved, &lifted);
-            same(&at_chosen, &of(&chosen, &factor.solve(&b)));
-            factor.push(&chosen, &forces, &mut swept);
-            let lifted = flexibility.lifted_by(factor.on_tail(&swept));
-            let found = factor.above_tail(swept, &lifted);
-            for ((to, more), (&row, f)) in at_chosen
-                .iter_mut()
-                .zip(flexibility.respond(&forces))
-                .zip(chosen.iter().zip(&forces))
-            {
-                *to = add(*to, more);
-                b[row as usize] = add(b[row as usize], *f);
-            }
-            let whole = factor.solve(&b);
-            same(&found, &whole);
-            same(&at_chosen, &of(&chosen, &whole));
-        }
-    }
-
-    fn of(rows: &[u32], all: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        rows.iter().map(|&row| all[row as usize]).collect()
-    }
-
-    fn same(found: &[[f64; 3]], whole: &[[f64; 3]]) {
-        let largest = whole.as_flattened().iter().fold(0.0_f64, |m, v| m.max(v.abs()));
-        for (v, w) in found.as_flattened().iter().zip(whole.as_flattened()) {
-            assert!((v - w).abs() <= 1e-12 * largest, "{v:e} {w:e}");
-        }
     }
 }

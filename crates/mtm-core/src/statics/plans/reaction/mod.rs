@@ -9,7 +9,7 @@
 
 mod along;
 mod inner;
-mod krylov;
+pub(crate) mod krylov;
 mod rows;
 
 use std::sync::Arc;
