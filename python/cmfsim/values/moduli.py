@@ -35,8 +35,12 @@ def moduli_unusual(named: Mapping[str, "FatModuli | MuscleModuli"], where: str) 
     if not found:
         return []
     what = f"no soft tissue has these moduli: {', '.join(found)}"
-    facts = {"low": low, "high": high, "least": USUAL_POISSON}
-    return [Finding("moduli-unusual", what, severity="warning", where=where, facts=facts)]
+    return [
+        Finding(
+            "moduli-unusual", what, severity="warning", where=where,
+            facts={"low": low, "high": high, "least": USUAL_POISSON},
+        )
+    ]  # fmt: skip
 
 
 def _check_young(name: str, value: float | None) -> None:

@@ -199,7 +199,7 @@ def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[
     below, damaged = _headers_below(folder, {*map(_key, headers)}, wanted)
     if not headers and damaged:
         raise ImageInputError(damaged[0])
-    findings, where, skipped = list[Finding](), folder.name, "dicom-skipped"
+    findings, where = list[Finding](), folder.name
     places = Counter(h.path.parent.relative_to(folder).as_posix() for h in below)
     if len(places) + bool(headers) > 1:
         parts = [f"{name} ({n})" for name, n in sorted(places.items())]
@@ -213,7 +213,7 @@ def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[
         )
     if damaged:
         what = f"skipped {counted(len(damaged), 'file')} in folders below: {damaged[0]}"
-        findings.append(Finding(skipped, what, severity="warning", where=where))
+        findings.append(Finding("dicom-skipped", what, severity="warning", where=where))
     missing = [p.name for p in sorted(folder.iterdir()) if p.is_symlink() and not p.exists()]
     if missing:
         what = (
@@ -221,11 +221,11 @@ def _headers(folder: Path, wanted: str | None) -> tuple[list[DicomHeader], list[
         )
         why = "slices at the ends of a series are not missed when they are absent"
         fix = "fetch the files (with DataLad: datalad get)"
-        found = Finding(skipped, what, severity="warning", where=where, why=why, fix=fix)
+        found = Finding("dicom-skipped", what, severity="warning", where=where, why=why, fix=fix)
         findings.append(found)
     if others:
         what = f"skipped {counted(len(others), 'file')} not in DICOM: {listed(others)}"
-        findings.append(Finding(skipped, what, severity="note", where=where))
+        findings.append(Finding("dicom-skipped", what, severity="note", where=where))
     return headers, findings
 
 

@@ -412,8 +412,10 @@ def _placed(
         return image
     gap = float(np.median(np.diff(heights)))
     if gap > COARSE_SLICES:
-        what, most = f"slices are {gap:.3g} mm apart", {"most": COARSE_SLICES}
-        findings.append(Finding("ct-spacing-coarse", what, where=name, facts=most))
+        what = f"slices are {gap:.3g} mm apart"
+        findings.append(
+            Finding("ct-spacing-coarse", what, where=name, facts={"most": COARSE_SLICES})
+        )
     return of_slices(values, stack.positions, stack.axes, stack.spacing, name)
 
 
