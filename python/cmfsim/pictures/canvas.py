@@ -465,6 +465,10 @@ class Painter:
 def load() -> None:
     """Loads the libraries that draw."""
     pyvista_module().Plotter  # noqa: B018 (loaded when it is first asked for)
+    # For the tracing, which comes last; without it, that alone is left out.
+    with contextlib.suppress(ImportError):
+        import_module("matplotlib.figure")
+        import_module("matplotlib.backends.backend_agg")
 
 
 def draw_packed(path: str, packed: str) -> None:

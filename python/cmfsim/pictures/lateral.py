@@ -172,9 +172,9 @@ def _shells(surfaces: list[SurfaceData], axes: Floats, window: Floats) -> Floats
         for count in np.unique(parts).tolist():
             own = parts == count
             shares = _lattice(count)
-            points = np.einsum("pc,tca->tpa", shares, flat[own])
-            weights = np.repeat(areas[own] / len(shares), len(shares))
-            column, row = np.floor(points.reshape(-1, 2)).astype(np.int64).T
+            points = (shares @ flat[own].transpose(1, 0, 2).reshape(3, -1)).reshape(-1, 2)
+            weights = np.tile(areas[own] / len(shares), len(shares))
+            column, row = np.floor(points).astype(np.int64).T
             inside = (column >= 0) & (column < across) & (row >= 0) & (row < high)
             places = (row * across + column)[inside]
             total += np.bincount(places, weights[inside], minlength=len(total))
