@@ -72,7 +72,7 @@ pub fn squared_distance(grid: &Grid, most: f32, target: impl Fn(usize) -> bool +
 /// Voxels of the shape that are not close to any ball of `radius` inside it: its sheets and spikes.
 ///
 /// `squared` is the squared distance of each voxel to the complement, at least where it is below
-/// [`core_squared`]. A voxel is thin if it is further than (1 + `slack`) · radius from every centre of such a
+/// `core_squared`. A voxel is thin if it is further than (1 + `slack`) · radius from every centre of such a
 /// ball; a slack of 0.5 excludes edges and corners of 90°.
 pub fn thin_parts(grid: &Grid, squared: &[f32], radius: f64, slack: f64) -> Vec<bool> {
     let core = core_squared(grid, radius);
