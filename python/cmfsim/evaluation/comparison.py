@@ -266,13 +266,7 @@ def compare_skins(
     skin, other = Skin(simulated), Skin(postoperative)
     warps = _warps(landmarks) if method == "landmarks" else _Warps()
     names = landmarks[0] if landmarks is not None else None
-    count = len(skin.vertices)
-    if regions is not None:
-        parts = {n: _as_choice(f"region {n!r}", v, count) for n, v in regions.items()}
-    elif isinstance(names, Mapping) and all(name in names for name in SKIN_LANDMARKS):
-        parts = skin_regions(skin.vertices, names)
-    else:
-        parts = {}
+    parts = _parts(skin, regions, names)
     asked = _chosen_vertices(mask, skin, parts)
     chosen, seen = _uncovered(skin, asked), ~other.covered()
     matches = match_skins(
@@ -406,6 +400,18 @@ def _paired(ours: Landmarks, theirs: Landmarks) -> tuple[Floats, Floats, tuple[F
             "must have the same number, in the same order"
         )
     return first, second, ()
+
+
+def _parts(
+    skin: Skin, regions: Mapping[str, ArrayLike] | None, names: Landmarks | None
+) -> dict[str, NDArray[np.bool_]]:
+    """The vertices of each region to report."""
+    if regions is not None:
+        count = len(skin.vertices)
+        return {n: _as_choice(f"region {n!r}", v, count) for n, v in regions.items()}
+    if isinstance(names, Mapping) and all(name in names for name in SKIN_LANDMARKS):
+        return skin_regions(skin.vertices, names)
+    return {}
 
 
 def _chosen_vertices(

@@ -85,8 +85,7 @@ impl Equilibrium {
         // Step length below which the exact tangent is worth trying.
         let mut near = if by_factor { f64::INFINITY } else { NEAR_REST * reach(&pose, target) };
         let mut length = f64::INFINITY;
-        // Error of the state once it is small enough, when one step with the accuracy of the last one is still
-        // to be done.
+        // Error of the state once it is small enough: a step as accurate as the last one must be is still to come.
         let mut ending = None;
         // Steps of earlier descents are no sign of how this one converges.
         let start = solve.effort.history.len();
