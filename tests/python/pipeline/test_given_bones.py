@@ -66,3 +66,14 @@ def test_bones_of_another_scan_are_refused_by_name(folder, tmp_path):
     (tmp_path / "case.toml").write_text(text, encoding="utf-8")
     with pytest.raises(cmfsim.CaseError, match=r"mandible\.ply lies where .* \(bones-not-of-image"):
         read_anatomy(cmfsim.Case.load(tmp_path / "case.toml"), {}, lambda _: None)
+
+
+def test_a_bone_without_a_file_is_refused_and_never_becomes_soft_tissue(folder, tmp_path):
+    text = (folder / "case.toml").read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("cranium =")]
+    text = "\n".join(lines).replace('"ct.nrrd"', f'"{(folder / "ct.nrrd").as_posix()}"')
+    mandible = (folder / "from_scene/mandible.ply").as_posix()
+    text = text.replace('"from_scene/mandible.ply"', f'"{mandible}"')
+    (tmp_path / "case.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(cmfsim.CaseError, match=r"image\.bones.*cranium has no file"):
+        read_anatomy(cmfsim.Case.load(tmp_path / "case.toml"), {}, lambda _: None)

@@ -135,6 +135,13 @@ def _with_given_bones(
 
     Raises `CaseError`: They are those of another scan, or in another frame.
     """
+    missing = [name for name in ("cranium", "mandible") if name not in image.bones]
+    if missing:
+        raise CaseInputError(
+            f"{case.where('image.bones')}: {' and '.join(missing)} has no file: what the image "
+            "shows of it would become soft tissue; give both cranium and mandible, or remove "
+            "[image.bones]"
+        )
     shown = np.maximum.reduce([level.values for level in anatomy.bones.values()]) > 0.0
     surfaces: dict[str, SurfaceData] = {}
     levels: dict[str, ImageData] = {}

@@ -43,7 +43,7 @@ SPECKS = 100.0
 def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
     """The mesh without bodies that neither bone nor plane holds, and a finding for them.
 
-    A body hangs together by the faces of its tets: what an edge or a node joins to the rest swings
+    A body is connected by the faces of its tets: what an edge or a node joins to the rest can turn
     about it.
 
     Raises `MeshError`: Nothing of it is held.
@@ -458,7 +458,7 @@ def _without_specks(
 ) -> NDArray[np.bool_]:
     """The choice with its small patches, and the small gaps in it, turned over."""
     edges = edges_of(triangles.astype(np.int64))
-    # Patches hang together by edges between triangles of one choice.
+    # Patches are connected by edges between triangles of one choice.
     alike = chosen[edges.pairs[:, 0]] == chosen[edges.pairs[:, 1]]
     patch = connected_labels(edges.pairs[alike], len(triangles))
     a, b, c = (nodes[triangles[:, k]] for k in range(3))
