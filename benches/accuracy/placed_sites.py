@@ -19,9 +19,9 @@ import cmfsim
 from benches.scenes.marked import publish
 from cmfsim.io import read_landmark_file, read_surface
 from cmfsim.pipeline.proposing import ProposedHead, filled_landmarks
+from cmfsim.registration.closest import robust_similarity
 from cmfsim.registration.proposed.shape_model.model import SITES
 from cmfsim.registration.proposed.shape_model.site_covariance import average_sites, prior_covariance
-from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, SiteState
 

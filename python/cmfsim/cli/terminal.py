@@ -13,10 +13,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TextIO
 
-from cmfsim.doctor.report import severity_text
 from cmfsim.errors import CmfsimError, error_text
 from cmfsim.pictures import has_screen
-from cmfsim.values.finding import Finding, FindingGroup, counted, grouped
+from cmfsim.values.finding import Finding, FindingGroup, counted, grouped, severity_text
 from cmfsim.values.progress import COUNT, Observer, TimeLeft
 
 # Back to the start of the line and erase it.

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from cmfsim.doctor.evidence import gather
-from cmfsim.doctor.report import findings_text as findings_text
 from cmfsim.doctor.sites.landmarks import check_automatic
 from cmfsim.doctor.sites.placement import check_placement
 from cmfsim.doctor.surfaces import (
@@ -38,6 +37,7 @@ from cmfsim.doctor.surgery.plan import state_plan
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import SEVERITIES, Finding
+from cmfsim.values.finding import findings_text as findings_text
 
 
 @dataclass(frozen=True)

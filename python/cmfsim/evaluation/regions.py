@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.errors import LandmarkInputError
-from cmfsim.surfaces.barycentric import barycentric
+from cmfsim.surfaces.depth import barycentric
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats, as_floats, as_rows
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS

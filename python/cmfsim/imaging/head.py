@@ -14,11 +14,11 @@ from cmfsim.imaging.bones.jaw import Jaws, part_jaws
 from cmfsim.imaging.bones.metal import find_metal, metal_within
 from cmfsim.imaging.intensities.cupping import without_cupping, without_noise
 from cmfsim.imaging.intensities.intensity import weak_bone
-from cmfsim.imaging.morphology import Mask, Volume, depth
+from cmfsim.imaging.intensities.levels import level_of
+from cmfsim.imaging.morphology import Mask, Volume, depth, label
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.imaging.skins.air import air_level
 from cmfsim.imaging.skins.attached import attached_findings
-from cmfsim.imaging.skins.skin import Skin, find_skin
+from cmfsim.imaging.skins.skin import SKIN_SCALE, Skin, find_skin
 from cmfsim.imaging.working_grid import COARSE, Working, working_grid
 from cmfsim.registration.proposed.shape_model.model import head_model
 from cmfsim.values.anatomy import Anatomy
@@ -333,3 +333,16 @@ def _missing(border: str, part: str, what: str) -> Finding:
         severity="warning",
         where=f"{border} border of the image",
     )
+
+
+# Smaller bubbles are part of the tissue, mm³.
+LEAST_AIR = 200.0
+
+
+def air_level(work: Working, skin: Skin, bone: Bone, options: SegmentOptions) -> Volume | None:
+    """The level of hollows that no bone encloses; None if there are none."""
+    labels, sizes = label(skin.hollow & ~bone.mask)
+    large = sizes * float(np.prod(work.spacing)) > LEAST_AIR
+    if not large.any():
+        return None
+    return level_of(-work.hu, -options.skin_threshold, SKIN_SCALE, large[labels])

@@ -14,7 +14,6 @@ from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.registration.proposed import TemplateHead, landmarks_from
-from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.proposal import DOUBTFUL
 from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
@@ -22,6 +21,7 @@ from cmfsim.registration.proposed.shape_model.site_covariance import (
     SiteKey,
     site_covariance,
 )
+from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
@@ -103,7 +103,7 @@ def propose_landmarks(
     Examples
     --------
     >>> import cmfsim
-    >>> from cmfsim.registration.proposed.average_head import average_head
+    >>> from cmfsim.registration.proposed.template_head import average_head
     >>> head = average_head()
     >>> found = cmfsim.propose_landmarks(head.bones, head.skin)
     >>> len(found.skull), len(found.skin)

@@ -6,7 +6,7 @@ import pytest
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.proposed.template_head import average_head
 
 pytest.importorskip("scipy")
 

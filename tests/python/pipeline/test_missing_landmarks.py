@@ -8,7 +8,7 @@ from cmfsim.pipeline import proposing
 from cmfsim.pipeline.building.inputs import read_anatomy, read_case_landmarks
 from cmfsim.pipeline.building.landmarks import found_landmarks, landmark_summary
 from cmfsim.pipeline.building.stages import BuildOptions, Stages
-from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.proposed.template_head import average_head
 
 pytest.importorskip("scipy")
 pytest.importorskip("meshio")

@@ -12,8 +12,8 @@ from browser_page import open_page, serious_faults, until
 from cmfsim.io import read_landmark_file
 from cmfsim.pipeline.outputs.landmark_page import head_content, write_landmark_page
 from cmfsim.pipeline.proposing import ProposedHead, filled_landmarks, head_distribution
-from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.shape_model.site_covariance import PLACED_STD
+from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.landmark_sites import site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite, SiteState, site_state
 

@@ -10,9 +10,9 @@ import real_heads
 from benches.scenes import ct_variants as variants
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
-from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.shape_model.model import HINGE
 from cmfsim.registration.proposed.shape_model.state import rotation_of
+from cmfsim.registration.proposed.template_head import average_head
 
 pytest.importorskip("scipy")
 

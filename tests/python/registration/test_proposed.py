@@ -9,11 +9,11 @@ import cmfsim
 import real_heads
 from cmfsim.pipeline.proposing import read_template_head
 from cmfsim.registration.proposed import measured_biases
-from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.judgement import missing_sites
 from cmfsim.registration.proposed.pose import Pose, refined_pose
 from cmfsim.registration.proposed.shape_model.fitted_head import fit_head
 from cmfsim.registration.proposed.shape_model.samples import samples_of
+from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.motion import rigid_motion
 

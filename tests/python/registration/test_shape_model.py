@@ -7,10 +7,10 @@ import pytest
 
 import cmfsim
 from cmfsim.imaging.bones.model_seeds import bite_shifts
-from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.shape_model.fitted_head import LYING, fit_head
 from cmfsim.registration.proposed.shape_model.model import HINGE
 from cmfsim.registration.proposed.shape_model.samples import samples_of
+from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import joined_surface
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
     SiteDistribution,
     placed_distribution,
     site_covariance,
 )
+from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.landmark_sites import site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 

@@ -9,7 +9,6 @@ import cmfsim
 import real_heads
 from benches.scenes.warped_heads import KnownHead, warped
 from cmfsim.pipeline.proposing import read_template_head
-from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.definitions import detection
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.registration.proposed.shape_model.fitted_head import FIRST
@@ -17,6 +16,7 @@ from cmfsim.registration.proposed.shape_model.fitting import refined
 from cmfsim.registration.proposed.shape_model.model import SITES, head_model
 from cmfsim.registration.proposed.shape_model.samples import samples_of
 from cmfsim.registration.proposed.shape_model.search import found_poses
+from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.surface_data import joined_surface
 
 

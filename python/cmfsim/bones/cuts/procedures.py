@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 
 from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure
 from cmfsim.errors import CaseInputError, LandmarkInputError
+from cmfsim.registration.closest import robust_similarity
 from cmfsim.registration.proposed.shape_model.site_covariance import placed_distribution
-from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, SKULL_LANDMARKS, is_lower_site

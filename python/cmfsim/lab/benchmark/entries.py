@@ -32,7 +32,7 @@ from cmfsim.pipeline.banding import predict_with_band
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient
-from cmfsim.surfaces.barycentric import at_closest
+from cmfsim.surfaces.depth import at_closest
 from cmfsim.values.checks import Floats
 from cmfsim.values.prediction import MODELS, Prediction
 

@@ -21,8 +21,7 @@ from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.case_checks import CaseLipContact, Head
 from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
-from cmfsim.surfaces.barycentric import barycentric
-from cmfsim.surfaces.depth import distances
+from cmfsim.surfaces.depth import barycentric, distances
 from cmfsim.surfaces.levels import SurfaceOptions, contact_surface, surface_of_level
 from cmfsim.surfaces.topology import connected_labels, edges_of, tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment

@@ -10,8 +10,8 @@ from cmfsim.planning.landmark_page import (
     landmark_content,
     landmark_page_text,
 )
-from cmfsim.registration.proposed.average_head import average_head
 from cmfsim.registration.proposed.shape_model.site_covariance import PLACED_STD, SiteDistribution
+from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, SiteState
 
 PAGE_FILE = "landmarks.html"

@@ -2,5 +2,5 @@
 
 from cmfsim.planning.page.content import PageContent as PageContent
 from cmfsim.planning.page.content import page_content as page_content
-from cmfsim.planning.page.page import page_text as page_text
+from cmfsim.planning.page.document import page_text as page_text
 from cmfsim.planning.page.row_overlap import row_overlap as row_overlap

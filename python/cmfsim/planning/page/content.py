@@ -33,7 +33,7 @@ from cmfsim.planning.replanning import (
     PlanningModel,
     segment_boxes,
 )
-from cmfsim.surfaces.barycentric import barycentric
+from cmfsim.surfaces.depth import barycentric
 from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding

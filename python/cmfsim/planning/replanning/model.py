@@ -8,19 +8,85 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim._core import StaticSolver
+from cmfsim._core import PlanOperator, StaticSolver
 from cmfsim.errors import CaseInputError, SolverError
-from cmfsim.planning.replanning.columns import PlanColumns, plan_columns
 from cmfsim.planning.replanning.correction import PlanCorrection
 from cmfsim.solving.models import model_scene, predict_patient
 from cmfsim.solving.simulation import scene_plan, scene_tensors, solver_of
-from cmfsim.values.checks import Floats
-from cmfsim.values.motion import rigid_matrix
+from cmfsim.values.checks import Floats, frozen
+from cmfsim.values.motion import rigid_matrix, rigid_motion
 from cmfsim.values.patient_model import LiftedTissue, PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.scene import Scene
 from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
+
+# Numbers of a segment: nine of R − I, three for the displacement of its centre.
+COLUMNS = 12
+# Largest difference between the columns and their operator, mm, for a rotation by 7°.
+AGREEMENT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PlanColumns:
+    """A linear map from the rigid motions of segments to displacements.
+
+    u(q) = u₀ + Σ_s A_s q_s, with twelve numbers for each segment: q_s = (R − I row by row,
+    t + (R − I) c_s) for the motion x ↦ R x + t. The core provides A and c_s.
+
+    segments: In the order of the columns.
+    centres: (s, 3), mm, LPS. The point of each segment to which its columns refer.
+    matrix: (k, 3, 12 s), for each node and axis: nine columns per segment for R − I, row by row,
+        mm, and three for the displacement of its centre.
+    offset: u₀, (k, 3), mm. Displacements if no segment moves: contact closes gaps at rest.
+    """
+
+    segments: tuple[str, ...]
+    centres: Floats
+    matrix: Floats
+    offset: Floats
+
+    def numbers(self, plan: Mapping[str, ArrayLike]) -> Floats:
+        """The numbers q of a plan, (12 s,): R − I of each segment, then its centre's motion."""
+        found = []
+        for name, centre in zip(self.segments, self.centres, strict=True):
+            matrix = np.asarray(plan[name], dtype=np.float64)
+            turn = matrix[:3, :3] - np.eye(3)
+            found += [turn.ravel(), matrix[:3, 3] + turn @ centre]
+        return np.concatenate(found)
+
+    def displacements(self, plan: Mapping[str, ArrayLike]) -> Floats:
+        """The displacements under a plan, (k, 3) mm."""
+        return self.offset + self.matrix @ self.numbers(plan)
+
+
+def plan_columns(operator: PlanOperator) -> PlanColumns:
+    """The columns of an operator with their centres, checked against its displacements.
+
+    Raises `SolverError`: The columns do not reproduce the displacements of the operator.
+    """
+    names = tuple(operator.segments)
+    rest = {name: np.eye(4) for name in names}
+    offset = operator(rest)
+    matrix = operator.matrix.reshape(len(offset), 3, -1)
+    centres = operator.centres
+    columns = PlanColumns(names, frozen(centres), frozen(matrix), frozen(offset))
+    _check(columns, operator)
+    return columns
+
+
+def _check(columns: PlanColumns, operator: PlanOperator) -> None:
+    plan: dict[str, NDArray[np.float64]] = {
+        name: rigid_motion((2.0, -3.0, 1.0), 7.0, (1.0, number, -2.0), centre)
+        for number, (name, centre) in enumerate(zip(columns.segments, columns.centres, strict=True))
+    }
+    worst = float(np.abs(columns.displacements(plan) - operator(plan)).max(initial=0.0))
+    if not worst <= AGREEMENT:
+        raise SolverError(
+            f"the columns of the plan operator differ from its displacements by {worst:.1e} mm; "
+            f"rounding explains at most {AGREEMENT:g} mm: please report this"
+        )
+
 
 # Contact counts as solved at this gap, mm, where a case asks for less. Newton's method converges
 # quadratically, so that nodes are within 0.001 mm of where 0.0001 mm leaves them: a step is saved.

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Solution, Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.planning.replanning.columns import PlanColumns
-from cmfsim.planning.replanning.model import Motions, PlanningModel
+from cmfsim.planning.replanning.model import Motions, PlanColumns, PlanningModel
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.rates import ACCURACY, scene_parts, tissue_load
 from cmfsim.solving.simulation import scene_plan

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from cmfsim.registration.closest import robust_similarity
 from cmfsim.registration.proposed.shape_model.model import HINGE
 from cmfsim.registration.proposed.shape_model.state import rotation_of
-from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES, REFERENCE_PLACES
 

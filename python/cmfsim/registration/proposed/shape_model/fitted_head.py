@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from cmfsim.errors import LandmarkInputError
+from cmfsim.registration.closest import robust_similarity
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.registration.proposed.shape_model.fitting import (
     MOST_GAP,
@@ -35,7 +36,6 @@ from cmfsim.registration.proposed.shape_model.state import (
     jaw_rotation,
     rotation_of,
 )
-from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 
 # Rounds in the first place, of all rough poses, and of the best: noise in mm and modes.

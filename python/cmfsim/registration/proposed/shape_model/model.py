@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.registration.proposed.average_head import average_head
+from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES, SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData

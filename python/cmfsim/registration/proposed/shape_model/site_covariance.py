@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim.registration.closest import robust_similarity
 from cmfsim.registration.proposed.shape_model.model import (
     HEAD,
     JAW,
@@ -20,7 +21,6 @@ from cmfsim.registration.proposed.shape_model.model import (
     jaw_shares,
 )
 from cmfsim.registration.proposed.shape_model.state import N_JAW, moved_with_jaw
-from cmfsim.registration.similarity import robust_similarity
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, site_part
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
