@@ -10,7 +10,7 @@ from cmfsim.drafting.finds import LooseMotion, OtherFind, SurfaceFind, Transform
 from cmfsim.drafting.roles import MOVING, safe_key
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.slicer.transforms import is_itk_file, motion_in_lps, read_transform_file
-from cmfsim.values.case_parts import PROCEDURES
+from cmfsim.values.case_parts import CUT_UP, PROCEDURES
 from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.clinical_motion import clinical_motion, planned_motion
 from cmfsim.values.proposed_landmarks import ProposedSite
@@ -367,17 +367,29 @@ def add_typed(plan: Plan, typed: TypedPlan, bones: Iterable[str], *, is_turned: 
 
     bones: That the case has before it is cut.
     is_turned: Whether a scene turns the case, so that its landmarks lie elsewhere.
-    Raises `CaseError`: A segment that no bone is and no procedure makes, or that a file moves
-        already; a cut whose pieces are there already; a turn about a point that is not known.
+    Raises `CaseError`: A segment that no bone is and no procedure makes, that a cut divides, or
+        that a file moves already; a cut whose pieces are there already; a turn about a point that
+        is not known.
     """
     bones = set(bones)
     for cut in typed.cuts:
         there = sorted(bones.intersection(PROCEDURES[cut]))
         if there:
             raise CaseInputError(f"--cut {cut} makes {there[0]}, which is there as a surface")
+    whole = {
+        CUT_UP[cut]: cut
+        for cut in CUT_UP
+        if cut in typed.cuts or not typed.moves.keys().isdisjoint(PROCEDURES[cut])
+    }
     known = sorted((bones - {"cranium"}) | {name for made in PROCEDURES.values() for name in made})
     for segment, numbers in typed.moves.items():
         check_one_of("segment of --move", segment, known)
+        if segment in whole:
+            pieces = PROCEDURES[whole[segment]]
+            raise CaseInputError(
+                f"--move {segment}: {whole[segment]} cuts it into {', '.join(pieces)}; write "
+                f"--move {pieces[0]} for the piece with the teeth"
+            )
         if segment in plan.motions:
             raise CaseInputError(
                 f"--move {segment}: a file or the scene moves it already; remove one of them"

@@ -52,6 +52,8 @@ def test_a_cut_alone_proposes_a_plan_and_moves_nothing(head):
         (["--move", "up=1"], "the segment comes first"),
         (["--move", "chin", "up=1", "--move", "chin", "left=1"], "given twice"),
         (["--cut", "le_fort_2"], "invalid choice"),
+        (["--cut", "bsso", "--move", "mandible", "backwards=3"], "write --move mandible_body for"),
+        (["--move", "mandible", "up=1", "--move", "mandible_body", "up=1"], "bsso cuts it into"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_and_nothing_is_written(head, capsys, words, said):
