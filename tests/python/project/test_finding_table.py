@@ -10,40 +10,45 @@ from cmfsim import Finding
 from cmfsim.values.finding_table import BLANK, FINDING_KINDS, FORMER_CODES
 
 ROOT = Path(__file__).parents[3]
-SITES = package_findings()
-MADE = {site.code for site in SITES}
 
 
-def test_the_package_makes_the_codes_of_the_table_and_no_others():
-    assert set(FINDING_KINDS) == MADE
+@pytest.fixture(scope="module")
+def sites():
+    """Every place that makes a finding; reading the source takes seconds."""
+    return package_findings()
+
+
+def test_the_package_makes_the_codes_of_the_table_and_no_others(sites):
+    made = {site.code for site in sites}
+    assert set(FINDING_KINDS) == made
     # The reading of the source misses none of some that are made in different ways.
-    assert {"ct-flipped", "surface-inner-wall", "landmark-outside-image", "file-missing"} <= MADE
-    assert len(SITES) > 200
+    assert {"ct-flipped", "surface-inner-wall", "landmark-outside-image", "file-missing"} <= made
+    assert len(sites) > 200
 
 
-def test_a_site_states_a_severity_only_where_the_code_has_several():
-    for site in SITES:
+def test_a_site_states_a_severity_only_where_the_code_has_several(sites):
+    for site in sites:
         stated = set(FINDING_KINDS[site.code].severity.split(" or "))
         assert stated <= {"error", "warning", "note"}, site.code
         # A site of two codes states the severity for both.
         if "severity" not in site.given:
             assert len(stated) == 1, site.place
-        elif len({other.code for other in SITES if other.place == site.place}) == 1:
+        elif len({other.code for other in sites if other.place == site.place}) == 1:
             assert len(stated) > 1, site.place
             assert site.severities <= stated, site.place
 
 
-def test_every_code_has_its_texts_and_no_site_repeats_them():
+def test_every_code_has_its_texts_and_no_site_repeats_them(sites):
     for code, kind in FINDING_KINDS.items():
         assert all(len(text.strip("… ")) >= 8 for text in (kind.meaning, kind.why, kind.fix)), code
-    for site in SITES:
+    for site in sites:
         kind = FINDING_KINDS[site.code]
         for name, text in (("what", kind.meaning), ("why", kind.why), ("fix", kind.fix)):
             assert site.text(name) != text, f"{site.place}: {name}"
 
 
-def test_what_a_text_of_the_table_leaves_open_is_given_by_every_site():
-    for site in SITES:
+def test_what_a_text_of_the_table_leaves_open_is_given_by_every_site(sites):
+    for site in sites:
         kind = FINDING_KINDS[site.code]
         texts = (("what", kind.meaning), ("why", kind.why), ("fix", kind.fix))
         left = [text for name, text in texts if name not in site.given]
