@@ -89,6 +89,12 @@ def phantom_model(temporary: pytest.TempPathFactory) -> cmfsim.PatientModel:
     return shared(temporary, "phantom-model", make)
 
 
+def without_drawings(patch: pytest.MonkeyPatch) -> None:
+    """Has results that this process writes be without pictures, as where none is wanted."""
+    patch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
+    patch.setattr("cmfsim.pipeline.outputs.results.Painter.load", lambda _: None)
+
+
 def without_pictures(patch: pytest.MonkeyPatch, folder: Path) -> None:
     """Has processes be without PyVista, by a folder: pictures take most time."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from cmfsim.cli.terminal import Notices
 from cmfsim.report import case_document, render_page
 from cmfsim.values.finding import Finding, counted, grouped
 from head_case import HeadCase
+from shared_values import without_drawings
 
 pytest.importorskip("meshio")
 pytest.importorskip("jinja2")
@@ -82,7 +83,7 @@ def test_nothing_doubtful_prints_nothing(capsys):
 @pytest.fixture
 def noticed(tmp_path, monkeypatch):
     """A case with a warning of the doctor, one of building and one of solving."""
-    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
+    without_drawings(monkeypatch)
     build, solve = (cmfsim.pipeline.predicting.model_of, cmfsim.pipeline.predicting.solved_patient)
     solved = Finding("of-solving", "solving is doubtful", severity="warning")
 

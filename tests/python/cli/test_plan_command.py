@@ -21,6 +21,7 @@ from cmfsim.io.cases.tables import read_tables
 from cmfsim.pipeline.building.inputs import plan_key
 from cmfsim.pipeline.planning import page_state
 from head_case import HeadCase
+from shared_values import without_drawings
 
 pytest.importorskip("skimage")
 pytest.importorskip("meshio")
@@ -123,7 +124,7 @@ def test_the_plan_of_a_wished_face_is_found_and_saved(case, answer):
 
 def test_predict_takes_the_plan_of_a_page(case, answer, wished, capsys, monkeypatch):
     # Pictures are tested elsewhere, and take longer than the rest.
-    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
+    without_drawings(monkeypatch)
     file = case.parent / "out/towards.toml"
     # Beside the results, which predict replaces.
     plan = case.parent / "saved.toml"

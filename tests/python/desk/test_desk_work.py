@@ -10,6 +10,7 @@ import cmfsim
 from cmfsim.desk import work
 from cmfsim.pipeline import predicting
 from cmfsim.pipeline.building.inputs import read_anatomy
+from shared_values import without_drawings
 
 pytest.importorskip("skimage")
 pytest.importorskip("pyvista")
@@ -65,6 +66,7 @@ def test_the_exact_face_of_a_plan_is_that_of_predict(case, predicted):
 def test_a_report_builds_nothing_again_and_is_that_of_predict(case, predicted, monkeypatch):
     built = []
     monkeypatch.setattr(predicting, "build_patient", lambda *_: built.append(1))
+    without_drawings(monkeypatch)
     work.report(str(case))
     assert not built
     output = cmfsim.Case.load(case).output

@@ -12,9 +12,9 @@ from cmfsim.cli import main
 from cmfsim.io.results.predictions import read_prediction
 from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.pipeline import banding, predicting
-from cmfsim.pipeline.outputs.results import write_results
+from cmfsim.pipeline.outputs.results import _pictures_of, write_results
 from cmfsim.surfaces.depth import tissue_depth
-from shared_values import COARSE_EDGE, coarse_demo_patient
+from shared_values import COARSE_EDGE, coarse_demo_patient, without_drawings
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,12 @@ def patient(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def solved_once():
-    """One solution of the patient for all bands, which differ by what calibrates them."""
+    """One solution of the patient for all bands, which differ by what calibrates them.
+
+    And no pictures but the one of the band itself, which test_a_band_is_drawn looks at.
+    """
     with pytest.MonkeyPatch.context() as patch:
+        without_drawings(patch)
         for name in ("solved_patient", "skin_rates"):
             patch.setattr(banding, name, functools.cache(getattr(banding, name)))
         yield
@@ -100,6 +104,13 @@ def test_without_a_calibration_every_name_says_so(plain, tmp_path):
         page = (tmp_path / written.report).read_text(encoding="utf-8")
         assert "How far to trust it (uncalibrated)" in page
         assert "UNCALIBRATED" in page
+
+
+def test_a_band_is_drawn(patient, plain, tmp_path):
+    pytest.importorskip("pyvista")
+    path = tmp_path / "band.png"
+    dict(_pictures_of(patient, {}, plain))[path.name](path)
+    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_calibrated_band_has_the_factor_of_its_region(patient, plain, tmp_path):

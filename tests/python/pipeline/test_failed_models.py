@@ -10,6 +10,7 @@ import cmfsim
 import cmfsim.pipeline.predicting as stage
 from cmfsim.cli import main
 from head_case import HeadCase
+from shared_values import without_drawings
 
 pytest.importorskip("meshio")
 pytest.importorskip("jinja2")
@@ -17,8 +18,9 @@ pytest.importorskip("jinja2")
 
 @pytest.fixture
 def unsettled(monkeypatch, tmp_path):
-    """A case whose contact never settles, and no PyVista to draw it with."""
+    """A case whose contact never settles, and no pictures of it."""
     monkeypatch.setitem(sys.modules, "pyvista", None)
+    without_drawings(monkeypatch)
     solve = stage.solved_patient
 
     def solved_patient(patient, model, tensors):

@@ -21,6 +21,7 @@ from cmfsim.io.results.predictions import predictions_of, read_prediction
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
 from cmfsim.pipeline.outputs.results import write_case_report, write_results
 from head_case import HeadCase
+from shared_values import without_drawings
 
 pytest.importorskip("meshio")
 pytest.importorskip("pyvista")
@@ -64,7 +65,7 @@ def replanned(prediction):
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     """They take most of the time."""
-    monkeypatch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
+    without_drawings(monkeypatch)
     for name in ("picture_distances", "chart_errors"):
         monkeypatch.setattr(
             f"cmfsim.pipeline.outputs.results.{name}", lambda path, *_, **__: draw(path)

@@ -13,6 +13,7 @@ import cmfsim
 from cmfsim.cli import main
 from cmfsim.io.results.metrics import EVALUATION_FILE, read_evaluation
 from cmfsim.io.results.predictions import read_prediction
+from shared_values import without_drawings
 
 MUTANTS = 150
 HIDDEN = "of the reader alone"
@@ -22,7 +23,7 @@ HIDDEN = "of the reader alone"
 def originals(prediction, evaluation, tmp_path_factory):  # noqa: F811
     """A folder of results with two models and a comparison, and its two summaries."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cmfsim.pipeline.outputs.results._pictures_of", lambda *_: iter(()))
+        without_drawings(patch)
         for name in ("picture_distances", "chart_errors"):
             patch.setattr(
                 f"cmfsim.pipeline.outputs.results.{name}",
