@@ -4,6 +4,7 @@ import os
 import signal
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 # A shell that runs the suite in the background has it ignore Ctrl-C, which some tests send.
@@ -88,3 +89,17 @@ def pytest_collection_modifyitems(items):
     here = Path(__file__).parent
     rank = {here / name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path, len(rank)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _remembered(request, tmp_path_factory):
+    """Equal heads are read and searched once in a run, but where the tests are about that."""
+    if request.path.parent.name in ("registration", "building", "surfaces", "meshing"):
+        yield
+        return
+    # It loads NumPy, whose threads are set above.
+    from shared_values import remember  # noqa: PLC0415
+
+    with pytest.MonkeyPatch.context() as patch:
+        remember(patch, tmp_path_factory)
+        yield

@@ -5,6 +5,7 @@ every run creates for itself: no value outlives the code that made it.
 """
 
 import contextlib
+import hashlib
 import os
 import pickle
 from collections.abc import Callable, Iterator
@@ -17,6 +18,8 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.lab.virtual.demo import write_demo_case
+from cmfsim.pipeline import proposing
+from cmfsim.pipeline.building import inputs
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 
@@ -87,6 +90,27 @@ def phantom_model(temporary: pytest.TempPathFactory) -> cmfsim.PatientModel:
         return cmfsim.build_model(phantom_case.surface_case(folder, head, anatomy), check=False)
 
     return shared(temporary, "phantom-model", make)
+
+
+def remember(patch: pytest.MonkeyPatch, temporary: pytest.TempPathFactory) -> None:
+    """Has slow steps of reading a head be made once in a run for equal arguments, as plain values.
+
+    Four seconds for surfaces of a head and their levels, seven for the landmarks found on them.
+    """
+    for module, name in (
+        (inputs, "repair_surface"),
+        (inputs, "anatomy_from_surfaces"),
+        (proposing, "landmarks_from"),
+    ):
+        patch.setattr(module, name, _remembered(getattr(module, name), temporary))
+
+
+def _remembered(step: Callable[..., Any], temporary: pytest.TempPathFactory) -> Callable[..., Any]:
+    def call(*given: Any, **named: Any) -> Any:
+        digest = hashlib.sha256(pickle.dumps((given, named))).hexdigest()
+        return shared(temporary, f"{step.__name__}-{digest}", lambda _: step(*given, **named))
+
+    return call
 
 
 def without_drawings(patch: pytest.MonkeyPatch) -> None:
