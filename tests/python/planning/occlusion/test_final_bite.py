@@ -48,6 +48,13 @@ def moved(surface, motion):
     return cmfsim.SurfaceData(carried(motion, surface.vertices), surface.triangles)
 
 
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch):
+    """Fits of a seventh of the points of a row: the motion is right to 0.1 mm by them as well."""
+    module = importlib.import_module("cmfsim.planning.occlusion.final_bite")
+    monkeypatch.setattr(module, "MOST_POINTS", 400)
+
+
 def test_the_lower_jaw_goes_where_the_scans_have_it(scans):
     rows = heads.closed_rows()
     bite = cmfsim.final_bite(*rows, *scans)
@@ -61,19 +68,11 @@ def test_the_lower_jaw_goes_where_the_scans_have_it(scans):
     assert bite.overlap == contacts.greatest_overlap
 
 
-@pytest.fixture
-def few_points(monkeypatch):
-    """Fits of fewer points of each row: to tell that one is poor needs no hundredths of a mm."""
-    module = importlib.import_module("cmfsim.planning.occlusion.final_bite")
-    monkeypatch.setattr(module, "MOST_POINTS", 400)
-
-
 def mirrored(surface, *, turned=True):
     triangles = surface.triangles[:, ::-1] if turned else surface.triangles
     return cmfsim.SurfaceData(surface.vertices * [-1.0, 1.0, 1.0], np.ascontiguousarray(triangles))
 
 
-@pytest.mark.usefixtures("few_points")
 def test_a_mirrored_scan_is_refused_or_noticed_where_the_arch_is_symmetric(scans):
     upper, lower = scans
     rows = heads.closed_rows()
@@ -92,7 +91,6 @@ def test_a_mirrored_scan_is_refused_or_noticed_where_the_arch_is_symmetric(scans
         cmfsim.final_bite(lean, rows[1], mirrored(own), mirrored(lower))
 
 
-@pytest.mark.usefixtures("few_points")
 def test_scans_of_another_shape_frame_or_unit_are_refused_by_name(scans):
     upper, lower = scans
     apart = FRAME @ cmfsim.rigid_motion((0, 0, -8)) @ np.linalg.inv(FRAME)
@@ -107,7 +105,6 @@ def test_scans_of_another_shape_frame_or_unit_are_refused_by_name(scans):
             cmfsim.final_bite(*heads.closed_rows(), *pair)
 
 
-@pytest.mark.usefixtures("few_points")
 def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
     scans, tmp_path, tmp_path_factory, capsys, monkeypatch
 ):
