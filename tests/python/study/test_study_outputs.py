@@ -39,7 +39,7 @@ def _patient(folder, head, anatomy, share):
     """A coarse case whose face after the operation is `share` of the way to `_moved`."""
     folder.mkdir()
     path = phantom_case.surface_case(folder, head, anatomy)
-    text = path.read_text(encoding="utf-8").replace("edge_length = 7.0", "edge_length = 10.0")
+    text = path.read_text(encoding="utf-8").replace("edge_length = 7.0", "edge_length = 14.0")
     skin = cmfsim.read_surface(folder / "skin.ply")
     vertices = np.asarray(skin.vertices)
     after = vertices + share * (_moved(vertices) - vertices)
@@ -62,7 +62,7 @@ def folder(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("cohort")
     head = cmfsim.make_head()
-    anatomy = drawn_levels(tmp_path_factory, 3.0)
+    anatomy = drawn_levels(tmp_path_factory, 4.0)
     _patient(folder / "P1", head, anatomy, 1.0)
     _patient(folder / "P2", head, anatomy, 0.4)
     (folder / "cohort.toml").write_text(

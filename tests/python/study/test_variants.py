@@ -48,11 +48,11 @@ def folder(tmp_path_factory):
     """Two coarse patients; the second's other skin is no surface. The third is not there."""
     folder = tmp_path_factory.mktemp("cohort")
     head = cmfsim.make_head()
-    anatomy = drawn_levels(tmp_path_factory, 3.0)
+    anatomy = drawn_levels(tmp_path_factory, 4.0)
     for name, share in (("P1", 1.0), ("P2", 0.5)):
         (folder / name).mkdir()
         path = phantom_case.surface_case(folder / name, head, anatomy)
-        text = path.read_text(encoding="utf-8").replace("edge_length = 7.0", "edge_length = 10.0")
+        text = path.read_text(encoding="utf-8").replace("edge_length = 7.0", "edge_length = 14.0")
         after = '[postoperative]\nskin = "after.ply"\nverified = true'
         path.write_text(f"{text}\n{after}\n", encoding="utf-8")
         skin = cmfsim.read_surface(folder / name / "skin.ply")
