@@ -123,5 +123,5 @@ def test_jaws_separated_by_landmarks_need_no_image_again(case):
     # A head of other options is opened anew: it is kept under another name.
     other = replace(known, image=replace(known.image, working_spacing=4.0))
     for one in (known, other):
-        read_anatomy(one, {}, stages.append, kept)
+        read_anatomy(one, marks, stages.append, kept)
     assert len(kept) == 2

@@ -17,7 +17,7 @@ from cmfsim.cli import main
 from cmfsim.pipeline.evaluating import evaluation_key
 from cmfsim.report import case_document, render_page
 from cmfsim.study.cohort import _compared
-from shared_values import drawn_levels, without_pictures
+from shared_values import drawn_levels, without_drawings, without_pictures
 
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
@@ -253,6 +253,7 @@ def test_the_command_writes_faces_figures_and_report(with_truth, capsys, monkeyp
     """Without pictures, which take most of the time; test_demo.py counts those of a report."""
     pytest.importorskip("jinja2")
     monkeypatch.setitem(sys.modules, "pyvista", None)
+    without_drawings(monkeypatch)
     words = ["evaluate", str(with_truth.file), "--model", "H", "--model", "M", "--no-doctor", "-q"]
     assert main(words) == 0
     out = capsys.readouterr().out

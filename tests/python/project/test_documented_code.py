@@ -20,7 +20,9 @@ from cmfsim.cli.parsing import make_parser
 from cmfsim.drafting import init_case
 from cmfsim.io.cases.templates import write_template
 from cmfsim.io.files.reading_writing import toml_module
+from cmfsim.pictures import faces
 from scene_text import model, pack, shift, transform, write_scene
+from shared_values import without_drawings
 
 pytest.importorskip("skimage")
 pytest.importorskip("SimpleITK")
@@ -220,6 +222,9 @@ def coarse_case(tmp_path_factory):
 @pytest.mark.parametrize("page", ["docs/building.md", "docs/predicting.md"])
 def test_python_about_a_case_runs(page, coarse_case, monkeypatch):
     monkeypatch.chdir(coarse_case)
+    # A prediction's pictures are counted by test_demo.py, frames by test_animation.py.
+    without_drawings(monkeypatch)
+    monkeypatch.setattr(faces, "STEPS", 1)
     assert names_after_python(page)
 
 

@@ -8,6 +8,7 @@ import pytest
 import cmfsim
 import real_heads
 from benches.scenes import ct_variants as variants
+from cmfsim.pipeline import proposing
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
 from cmfsim.registration.proposed.shape_model.model import HINGE
@@ -144,6 +145,12 @@ def test_doubtful_jaws_are_separated_again_by_the_landmarks_found(tmp_path, monk
     assert good.findings == ()
     # Tooth rows that rise as these do count as doubtful.
     monkeypatch.setattr("cmfsim.registration.proposed.jaw_evidence.RISE", (30.0, 40.0))
+    # The first search is that of both heads below.
+    first = proposing._proposed(anatomy, [])
+    search = proposing._proposed
+    monkeypatch.setattr(
+        proposing, "_proposed", lambda head, more: first if head is anatomy else search(head, more)
+    )
     found = proposed_head(case, anatomy, lambda _: None)
     assert [f.code for f in found.findings] == ["jaws-separated-again"]
     assert BY_SHAPE not in [f.code for f in found.anatomy.findings]
