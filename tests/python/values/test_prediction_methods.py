@@ -2,6 +2,7 @@
 
 import base64
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ import cmfsim
 from cmfsim import pictures
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_parts
-from shared_values import coarse_demo_patient
+from cmfsim.pictures.canvas import write_picture
+from cmfsim.pipeline.outputs import results
+from shared_values import coarse_demo_patient, without_drawings
 
 
 @pytest.fixture(scope="module")
@@ -18,10 +21,13 @@ def prediction(tmp_path_factory):
     return cmfsim.predict_patient(coarse_demo_patient(tmp_path_factory), "M")
 
 
-def test_saved_parts_are_those_in_memory(prediction, tmp_path):
-    """And the folder is one that `cmfsim predict` might have written."""
+def test_saved_parts_are_those_in_memory(prediction, tmp_path, monkeypatch):
+    """And the folder is one that `cmfsim predict` might have written, here with one picture."""
+    without_drawings(monkeypatch)
+    white = partial(write_picture, image=np.full((2, 2, 3), 255, dtype=np.uint8))
+    monkeypatch.setattr(results, "_pictures_of", lambda *_: iter([("plan.png", white)]))
     names = prediction.save(tmp_path / "new" / "out")
-    assert {"prediction.vtp", "face.stl", "prediction.json"} <= set(names)
+    assert {"prediction.vtp", "face.stl", "prediction.json", "plan.png"} <= set(names)
     assert sorted(names) == sorted(path.name for path in (tmp_path / "new" / "out").iterdir())
     read = read_parts(tmp_path / "new" / "out")
     assert {kind: list(of_kind) for kind, of_kind in read.items()} == {
