@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from html import escape
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.cli import main
-from cmfsim.pipeline.evaluating import evaluation_key
+from cmfsim.pipeline.evaluating import check_face_after, evaluation_key
 from cmfsim.report import case_document, render_page
 from cmfsim.study.cohort import _compared
 from shared_values import drawn_levels, without_drawings, without_pictures
@@ -229,6 +230,18 @@ def test_a_face_beyond_every_forehead_is_no_comparison(with_truth):
     # As the process does that works on a case of a cohort.
     with pytest.raises(cmfsim.CaseError, match="more than any model moves the skin"):
         _compared(made, ["H"])
+
+
+def test_one_vertex_in_a_fold_does_not_hide_a_face_of_another_patient(with_truth):
+    """A coarse mesh has vertices that move further than any bone."""
+    off = SimpleNamespace(
+        statistics={"no change": SimpleNamespace(mean=12.0)},
+        errors={"no change": np.full(100, 12.0), "H": np.full(100, 12.0)},
+        models=("H",),
+    )
+    moved = {"H": np.where(np.arange(100) == 7, 20.0, 3.0)}
+    found = {f.code for f in check_face_after(with_truth, off, None, moved)}
+    assert found == {"postoperative-other-face"}
 
 
 @pytest.mark.usefixtures("predicted")
