@@ -5,7 +5,6 @@ import contextlib
 import dataclasses
 import json
 import logging
-import re
 import sys
 import textwrap
 import time
@@ -28,7 +27,6 @@ from cmfsim.io.results.predictions import predictions_of
 from cmfsim.io.results.result_files import is_model_file
 from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
 from cmfsim.pictures.window import OVER_BONES, prediction_parts
-from cmfsim.pipeline.building.inputs import plan_key
 from cmfsim.pipeline.predicting import case_for_models, prepare
 from cmfsim.report import Table
 from cmfsim.values.checks import as_positive
@@ -45,8 +43,6 @@ INDENT = 14
 # Distances of a contact surface from the bone beneath.
 AWAY = ("mean", "p95", "max")
 _log = logging.getLogger(__name__)
-# What the planning page states of the case that a plan was made for.
-MADE_FOR = re.compile(r"^# made for: ([0-9a-f]{64})\s*$", re.MULTILINE)
 
 
 def build_text(summary: Mapping[str, Any], *, width: int = WIDTH) -> str:
@@ -171,13 +167,6 @@ def case_of(options: argparse.Namespace) -> Case:
         case = dataclasses.replace(case, mesh=mesh)
     if getattr(options, "plan", None) is not None:
         case = case.with_plan(options.plan)
-        made_for = MADE_FOR.search(options.plan.read_text(encoding="utf-8"))
-        if made_for is not None and made_for[1] != plan_key(case):
-            _log.warning(
-                "%s: this plan was made for another case, or for other images, landmarks or cuts "
-                "of this case: check the motions below, or create the planning page again",
-                options.plan,
-            )
     if options.output is not None:
         # A link that the user names is followed, and the folder it leads to is printed.
         output = options.output.resolve() if options.output.is_symlink() else options.output

@@ -18,6 +18,7 @@ from cmfsim.planning.occlusion import final_bite, patient_rows
 from cmfsim.solving.models import solved_patient
 from cmfsim.values.case_parts import CaseBite, CaseMuscles
 from cmfsim.values.checks import check_one_of
+from cmfsim.values.finding import Finding
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import expected_stages
@@ -293,6 +294,9 @@ def build_patient(
     # Before the files are read: the key must be that of what is built.
     hashes = input_hashes(case)
     key, about = case_key(case, hashes), plan_key(case)
+    other = Finding("plan-other-case", where="the file of the plan")
+    strange = [other] if case.made_for not in {"", about} else []
+    options.observer.found(strange)
     patient = model_of(case_for_models(case, models), options)
     options.observer.found(patient.findings)
     for name, found in patient.summary["inputs"].items():
@@ -303,7 +307,14 @@ def build_patient(
             )
     if case.bite is not None:
         patient = _with_bite(patient, case.bite, options)
+    patient = _with_findings(patient, strange)
     return replace(patient, summary={**patient.summary, "inputs_key": key, "plan_key": about})
+
+
+def _with_findings(patient: PatientModel, found: Sequence[Finding]) -> PatientModel:
+    findings = [*patient.summary.get("findings", ()), *map(asdict, found)]
+    summary = {**patient.summary, "findings": findings}
+    return replace(patient, findings=(*patient.findings, *found), summary=summary)
 
 
 def _with_bite(patient: PatientModel, scans: CaseBite, options: BuildOptions) -> PatientModel:
@@ -312,8 +323,7 @@ def _with_bite(patient: PatientModel, scans: CaseBite, options: BuildOptions) ->
     upper, lower = patient_rows(patient)
     bite = final_bite(upper, lower, read_surface(scans.upper), read_surface(scans.lower))
     options.observer.found(bite.findings)
-    findings = [*patient.summary.get("findings", ()), *map(asdict, bite.findings)]
     places = [getattr(lower.arch, name).tolist() for name in ("tip", "left", "right")]
     target = {**bite.as_dict(), "upper": upper.segment, "lower": lower.segment, "places": places}
-    summary = {**patient.summary, "findings": findings, "target_bite": target}
-    return replace(patient, findings=(*patient.findings, *bite.findings), summary=summary)
+    patient = _with_findings(patient, bite.findings)
+    return replace(patient, summary={**patient.summary, "target_bite": target})

@@ -19,7 +19,10 @@ from cmfsim.cli import main
 from cmfsim.cli.case_commands import case_of
 from cmfsim.io.cases.tables import read_tables
 from cmfsim.pipeline.building.inputs import plan_key
+from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.planning import page_state
+from cmfsim.pipeline.predicting import build_patient
+from cmfsim.values.case_parts import CaseMesh
 from head_case import HeadCase
 from shared_values import without_drawings
 
@@ -168,7 +171,7 @@ def test_a_written_plan_is_read_back(case, tmp_path):
         cmfsim.write_plan(tmp_path / "plan.toml", {"mandible": 2 * np.eye(4)})
 
 
-def test_a_plan_of_another_head_is_warned_of(case, caplog):
+def test_a_plan_of_another_head_is_warned_of(case):
     file = case.parent / "strange.toml"
     file.write_text(PLAN.format(state="0" * 64, matrix=MOTION.tolist()), encoding="utf-8")
     loaded = cmfsim.Case.load(case)
@@ -176,8 +179,13 @@ def test_a_plan_of_another_head_is_warned_of(case, caplog):
     # Neither plan, mesh nor muscles change what a plan is about; landmarks do.
     assert plan_key(loaded.with_plan(file)) == state
     options = argparse.Namespace(case=case, plan=file, edge_length=None, output=None)
-    assert case_of(options).plan.keys() == {"mandible"}
-    assert "was made for another case" in caplog.text
+    given = dataclasses.replace(case_of(options), mesh=CaseMesh(edge_length=12.0))
+    assert given.plan.keys() == {"mandible"}
+    for made_for, warned in ((given.made_for, True), (state, False)):
+        found = dataclasses.replace(given, made_for=made_for)
+        patient = build_patient(found, ["H"], BuildOptions(check=False))
+        assert ("plan-other-case" in [f.code for f in patient.findings]) == warned
+        assert ("plan-other-case" in [f["code"] for f in patient.summary["findings"]]) == warned
 
 
 def test_plans_in_files_are_checked_with_their_lines(case, tmp_path):

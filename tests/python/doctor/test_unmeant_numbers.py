@@ -18,6 +18,8 @@ NUMBERS = {
     "no centre": ("\ncentre = [3, -100, 1450]", "", "plan-far"),
     "no centre, near": ("angle = 2\naxis = [1, 0, 0]\ncentre = [3, -100, 1450]",
                         "angle = 0.5\naxis = [1, 0, 0]", "plan-no-centre"),
+    "a centre in another patient": ("centre = [3, -100, 1450]", "centre = [3, -100, 1150]",
+                                    "plan-centre-far"),
     "centimetres": (TURN, "translation = [0, -0.4, 0.1]", "plan-tiny"),
     "another order": (TURN, "translation = [-6, 0, 0]", "plan-sideways"),
     "both Le Fort": ("[plan.mandible]", f"{LE_FORT}\n[plan.mandible]", "cuts-both-le-fort"),

@@ -304,7 +304,7 @@ def check_plan(
                     None if piece is None else piece[:, :3],
                     plan[name].point,
                     typed=given.typed,
-                    has_centre=given.centre is not None,
+                    centre=given.centre,
                 )
             )
         )

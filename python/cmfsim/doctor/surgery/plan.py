@@ -26,6 +26,8 @@ TINY = 0.05
 SMALL, SIDEWAYS = 1.0, 5.0
 # Turns that nobody plans, degrees: 0.2 rad are 11°. Below the first, rounding of a typed matrix.
 TINY_TURN = (1e-3, 0.2)
+# No segment is turned about a point further from it than this, mm: a head is 250 mm high.
+FAR_CENTRE = 150.0
 # Less than this is rounding of no motion, mm and degrees.
 NOTHING = 1e-6
 # Where no surface of the segment is known, how far it reaches from the point that is, mm.
@@ -44,6 +46,7 @@ class SizedMotion:
     points: (k, 3), mm, or None, on the segment's surface, where one is known.
     point: (3,), mm, or None. One point of the segment, where no surface is known.
     typed: Whether it was given by translation, angle, axis and centre.
+    centre: (3,), mm, or None, where it was given.
     """
 
     name: str
@@ -52,7 +55,7 @@ class SizedMotion:
     points: Floats | None = None
     point: Floats | None = None
     typed: bool = False
-    has_centre: bool = False
+    centre: Floats | None = None
 
 
 def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
@@ -65,7 +68,7 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
     angle = decompose_motion(motion.matrix).angle
     if far > FAR:
         remedy = "check translation (mm), sign and frame (LPS: forwards is −P)"
-        if angle > 0.0 and motion.typed and not motion.has_centre:
+        if angle > 0.0 and motion.typed and motion.centre is None:
             remedy = (
                 "give the centre of the rotation: without one, the segment rotates about the "
                 "origin of the coordinates"
@@ -80,13 +83,24 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
             fix=remedy,
             facts={"most": FAR},
         )
-    elif angle > TINY_TURN[0] and motion.typed and not motion.has_centre:
+    elif angle > TINY_TURN[0] and motion.typed and motion.centre is None:
         yield Finding(
             "plan-no-centre",
             f"{motion.name} turns by {angle:.1f}° about the origin of the coordinates, for no "
             f"centre is given: the turn moves it by up to {far:.1f} mm",
             where=motion.where,
         )
+    # The origin is where other programs turn about, with a translation that makes up for it.
+    turns = motion.points is not None and angle > TINY_TURN[0]
+    if turns and motion.centre is not None and motion.centre.any():
+        away = float(np.linalg.norm(points - motion.centre, axis=1).min())
+        if away > FAR_CENTRE:
+            yield Finding(
+                "plan-centre-far",
+                f"{motion.name} turns about a point {away:.0f} mm away from it, and moves by up to "
+                f"{far:.1f} mm",
+                where=motion.where,
+            )
     yield from check_turn(motion.name, motion.where, angle)
     reach = 0.0 if motion.points is not None else REACH * math.radians(angle)
     yield from check_tiny(motion.name, motion.where, far + reach, angle)

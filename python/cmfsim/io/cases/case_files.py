@@ -4,6 +4,7 @@ Only the case file itself is read here. Paths that it names are resolved against
 """
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +23,8 @@ from cmfsim.values.tissue_data import TissueData
 CASE_FORMAT = "cmfsim-case"
 # What a case's file is called where its folder alone is given.
 CASE_FILE = "case.toml"
+# What plans in files state of the case that they were made for.
+MADE_FOR = re.compile(r"^# made for: ([0-9a-f]{64})\s*$", re.MULTILINE)
 TABLES = (
     "format", "version", "name", "patient", "note", "image", "surfaces", "landmarks", "region",
     "mesh", "lips", "osteotomies", "plan", "node_kinds", "tissue", "muscles", "solver", "band",
@@ -70,6 +73,8 @@ class Case:
         Who it is, as report and chart state it: only what the user has written.
     note : str
         A remark for readers of the report, such as that the patient is synthetic.
+    made_for : str
+        What the file of its plan states of the case that it was made for (`with_plan`).
     places : mapping of str to str
         File and line of each dotted key, such as "case.toml:12", for findings.
 
@@ -101,6 +106,7 @@ class Case:
     bite: case_parts.CaseBite | None = None
     patient: str = ""
     note: str = ""
+    made_for: str = ""
     places: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -163,7 +169,8 @@ class Case:
         ----------
         path : path
             TOML with tables `[plan.SEGMENT]`, as in a case, and nothing else. They replace the
-            case's own plan: segments that they do not name stay.
+            case's own plan: segments that they do not name stay. If the file states another case
+            that it was made for, predictions have the finding `plan-other-case`.
 
         Raises
         ------
@@ -176,7 +183,13 @@ class Case:
         document = read_tables(Path(path)).only("plan")
         if not list(document.table("plan")):
             document.fail("plan", "has no motion: add tables [plan.SEGMENT]")
-        return replace(self, plan=plan_of(document, Path(path).parent), achieved=False)
+        made_for = MADE_FOR.search(Path(path).read_text(encoding="utf-8"))
+        return replace(
+            self,
+            plan=plan_of(document, Path(path).parent),
+            achieved=False,
+            made_for="" if made_for is None else made_for[1],
+        )
 
     def where(self, key: str) -> str:
         """File, line and key, as findings name a place in the case file."""

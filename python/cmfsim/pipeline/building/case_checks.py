@@ -158,7 +158,7 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
             case.where("plan" if case.achieved else f"plan.{name}"),
             points=surfaces[name].vertices,
             typed=given is not None and given.typed,
-            has_centre=given is not None and given.centre is not None,
+            centre=None if given is None else given.centre,
         )
         # A measured motion may be as small as it likes.
         found += [

@@ -256,7 +256,7 @@ def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
         "case": {
             field.name: _plain(getattr(case, field.name), folder)
             for field in fields(case)
-            if field.name not in {"file", "output", "places", "band"}
+            if field.name not in {"file", "output", "places", "band", "made_for"}
         },
         "version": __version__,
     }
