@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.pipeline.building.surgery.motions import planned_bones
+from cmfsim.pipeline.building.case_checks import plan_sizes
+from cmfsim.pipeline.building.surgery.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.surgery.postoperative import read_postoperative
 from cmfsim.report.case import motion_blocks
 from head_case import HeadCase, ellipsoid, icosphere
@@ -193,6 +194,18 @@ def test_a_scan_that_is_larger_as_a_whole_moves_the_jaw_and_says_by_how_much(tmp
     shift = re.search(r"the skull is 1\.\d+ times .* \((.*)\) mm of the motion", finding.why)
     stated = np.array([float(x) for x in shift[1].split(",")])
     assert np.linalg.norm(stated) == pytest.approx(excess, rel=0.25)
+
+
+def test_the_scan_before_given_as_the_one_after_is_a_warning(tmp_path):
+    """Registration never gives the identity, so what moved is compared with a millimetre."""
+    case = cmfsim.Case.load(operated().write(tmp_path))
+    level = cmfsim.ImageData(np.zeros((2, 2, 2)), (1, 1, 1))
+    jaw = cmfsim.BoneSegment("mandible", level, ellipsoid("mandible"))
+    for far, codes in ((0.02, ["plan-still"]), (3.0, [])):
+        planned = PlannedBones((jaw,), {"mandible": cmfsim.rigid_motion((0, far, 0))})
+        found = plan_sizes(case, planned, [])
+        assert [f.code for f in found] == codes
+        assert all("0.02 mm between the two scans" in f.what for f in found)
 
 
 def test_slip_of_a_fitted_mesh_is_taken_off_and_said(tmp_path):

@@ -127,9 +127,16 @@ def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
         )
 
 
-def nothing_moves(where: str) -> Finding:
-    """The warning about a plan that moves no segment."""
-    return Finding("plan-still", "no segment moves", where=where)
+def nothing_moves(where: str, measured: float | None = None) -> Finding:
+    """The warning about a plan that moves no segment.
+
+    measured: How far bones moved at most, mm, where that was measured.
+    """
+    if measured is None:
+        return Finding("plan-still", "no segment moves", where=where)
+    what = f"no segment moved by more than {measured:.2g} mm between the two scans"
+    fix = "check that the scan in [postoperative] is the one after the operation"
+    return Finding("plan-still", what, where=where, fix=fix)
 
 
 def check_turn(name: str, where: str, angle: float) -> Iterator[Finding]:

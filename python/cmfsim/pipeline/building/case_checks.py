@@ -10,7 +10,7 @@ from cmfsim._core import TetMesh
 from cmfsim.doctor import SizedMotion, check_motion_size
 from cmfsim.doctor.sites.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
 from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of
-from cmfsim.doctor.surgery.plan import nothing_moves
+from cmfsim.doctor.surgery.plan import SMALL, nothing_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.meshing import TissueRegion
@@ -23,6 +23,7 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.mesh_report import MeshReport
+from cmfsim.values.motion import carried
 from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import LiftedTissue
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
@@ -144,9 +145,11 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
     """
     seen = {(finding.code, finding.where) for finding in known}
     found: list[Finding] = []
-    if case.achieved and all(_is_still(motion) for motion in bones.motions.values()):
-        found.append(nothing_moves(case.where("plan")))
     surfaces = {segment.name: segment.surface for segment in bones.segments}
+    if case.achieved:
+        far = max(_travel(motion, surfaces[name]) for name, motion in bones.motions.items())
+        if far < SMALL:
+            found.append(nothing_moves(case.where("plan"), far))
     for name, motion in bones.motions.items():
         if isinstance(motion, MovedSurface):
             continue
@@ -172,10 +175,13 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
     return found
 
 
-def _is_still(motion: Floats | MovedSurface) -> bool:
+def _travel(motion: Floats | MovedSurface, surface: SurfaceData) -> float:
+    """How far a bone moves at most, mm."""
     if isinstance(motion, MovedSurface):
-        return np.array_equal(motion.surface.vertices, motion.moved_vertices)
-    return np.array_equal(motion, np.eye(4))
+        surface, moved = motion.surface, motion.moved_vertices
+    else:
+        moved = carried(motion, surface.vertices)
+    return float(np.linalg.norm(moved - surface.vertices, axis=1).max())
 
 
 def jaws(
