@@ -260,6 +260,9 @@ def parts_of(path: Path, model: str | None = None) -> list[ViewPart]:
         output = Case.load(path).output
         if not output.is_dir():
             raise CaseInputError(f"{path}: has no results yet: run cmfsim predict {path} first")
+        # A model that was built alone, which holds no prediction, is shown as it is.
+        with contextlib.suppress(FileNotFoundError):
+            output = import_module("cmfsim.pipeline.outputs.results").results_folder(path)
         return _of_folder(output, model)
     suffix = path.suffix.lower()
     if suffix in SURFACES:

@@ -138,15 +138,21 @@ def test_a_case_that_was_changed_gets_no_report_of_its_earlier_plan(
     case = phantom_case.surface_case(
         tmp_path, cmfsim.make_head(), shared_values.drawn_levels(tmp_path_factory, 2.0)
     )
-    digest = input_hash(case)
+    inputs = {name: input_hash(case.parent / name) for name in (case.name, "cranium.ply")}
     patient = shared_values.coarse_demo_patient(tmp_path_factory)
-    summary = {**patient.summary, "inputs": {case.name: digest}}
+    summary = {**patient.summary, "inputs": inputs}
     prediction = cmfsim.predict_patient(replace(patient, summary=summary), "H")
     cmfsim.write_prediction(case_results, prediction)
     assert main(["report", str(case.parent), "--pdf"]) == 0
+    bone = (case.parent / "cranium.ply").read_bytes()
+    (case.parent / "cranium.ply").write_bytes(bone + b" ")
+    assert main(["report", str(case.parent)]) == 2
+    assert "another cranium.ply" in capsys.readouterr().err
+    (case.parent / "cranium.ply").write_bytes(bone)
     case.write_text(case.read_text(encoding="utf-8") + "# changed\n", encoding="utf-8")
     assert main(["report", str(case.parent), "--pdf"]) == 2
-    assert "report-older" in capsys.readouterr().err
+    assert main(["view", str(case.parent), "--screenshot", str(tmp_path / "a.png")]) == 2
+    assert capsys.readouterr().err.count("report-older") == 2
     # Whoever names the results means them; a line says that the case has gone on.
     assert main(["report", str(case_results)]) == 0
     assert "or of this one as it was" in caplog.text

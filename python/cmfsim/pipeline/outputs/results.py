@@ -427,7 +427,8 @@ def optional_pictures() -> Iterator[None]:
     try:
         yield
     except CmfsimError as error:
-        _log.warning("no more pictures: %s", error)
+        # The last line of the error of a worker, which begins with its trace.
+        _log.warning("no more pictures: %s", str(error).strip().rpartition("\n")[2])
 
 
 def _fill_evaluation(fresh: Path, evaluation: CaseEvaluation) -> dict[str, Any]:
@@ -574,8 +575,8 @@ def _shown(found: Mapping[Path, Mapping[str, Any]]) -> tuple[Path, dict[str, byt
 def results_folder(given: Path) -> Path:
     """The folder with the results of a case, or the given one, which has results.
 
-    Raises `CaseError`: The results of a case are of other inputs than it has now: a report would
-        show an earlier plan beside the present one. Next to results, that is a warning.
+    Raises `CaseError`: The results of a case are of other inputs than it has now: an earlier plan
+        or scan would be shown for the present one. Next to results, that is a warning.
     """
     is_case = given.is_file() or (given / CASE_FILE).is_file()
     case_file = given if given.is_file() else (given if is_case else given.parent) / CASE_FILE
@@ -583,15 +584,20 @@ def results_folder(given: Path) -> Path:
         return given
     folder = Case.load(case_file).output if is_case else given
     (found, *_) = predictions_of(folder).values()
-    digest = found["inputs"].get(case_file.name)
-    if digest == input_hash(case_file) or (digest is None and not is_case):
+    inputs = found["inputs"]
+    if not is_case and case_file.name not in inputs:
         return folder
-    text = f"{folder}: holds the results of another {case_file.name}, or of this one as it was"
+    # Files beyond the case's folder are listed by their names alone, and are not compared.
+    there = {name: case_file.parent / name for name in {case_file.name: "", **inputs}}
+    other = [n for n, p in there.items() if p.exists() and input_hash(p) != inputs.get(n)]
+    if not other:
+        return folder
+    text = f"{folder}: holds the results of another {other[0]}, or of this one as it was"
     if is_case:
         raise CaseInputError(
             f"{text} (report-older): run cmfsim predict again, or give {folder} if these are meant"
         )
-    _log.warning("%s: run cmfsim predict again if its plan has changed", text)
+    _log.warning("%s: run cmfsim predict again if the plan or an input has changed", text)
     return folder
 
 
