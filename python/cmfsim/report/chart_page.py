@@ -137,8 +137,9 @@ def draw_chart_page(
 ) -> None:
     """Draws the page of one plan onto an empty figure of matplotlib, of the size `A4`.
 
-    The prediction is what `prediction.json` holds; pictures are PNG files, "prediction" and
-    "lateral" or, without that, "plan"; findings are those of all stages.
+    The prediction is what `prediction.json` holds; pictures are PNG files, "prediction",
+    "lateral" and "plan", which stands below the others if there is no band; findings are those of
+    all stages.
     """
     page, y = _Page(figure), MARGIN
     page.line(MARGIN, y, f"{prediction['case']}: predicted face", TITLE, weight="bold")
@@ -171,7 +172,13 @@ def draw_chart_page(
         texts = [f"Not available: {absent}"] if absent else []
         ends.append(page.paragraph((x, end), texts, FINE, ABSENT_LINES, room))
     y = max(ends) + APART
-    y = max(_sites(page, y, found), _band(page, y, prediction.get("band"))) + APART
+    band, plan = prediction.get("band"), pictures.get("plan")
+    ends = [_sites(page, y, found), _band(page, y, band)]
+    if band is None and plan is not None and "lateral" in pictures:
+        # The bones from the front as well, where the band would stand.
+        most = (RIGHT, (BAND_ROWS - 1) * ROW)
+        ends.append(page.picture(COLUMN, ends[1] + 2.0, plan, most))
+    y = max(ends) + APART
     y = page.heading(MARGIN, y, "Warnings")
     groups = [group for group in grouped(findings) if group.severity != "note"]
     lines = [f"{group.severity}: {group.line}" for group in groups] or ["None."]

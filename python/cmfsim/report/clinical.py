@@ -18,7 +18,8 @@ NORMS = (
     "Norms are means ± standard deviations of small groups of adults or adolescents without "
     "deformity; they are no aim of an operation. Legan and Burstone's nasolabial angle has its own "
     "point on the columella. Without teeth or porion among the landmarks, occlusal and Frankfort "
-    "planes are estimated."
+    "planes are estimated. S, Po, Gn and the tips of roots are not found automatically: add them "
+    "to the file of skull landmarks under these names."
 )
 
 

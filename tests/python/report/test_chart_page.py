@@ -97,12 +97,14 @@ def test_texts_stay_on_the_page_and_apart(many, drawn):
     figure = figures.Figure(figsize=A4, dpi=360)
     renderer = agg.FigureCanvasAgg(figure).get_renderer()
     pictures = {"prediction": png(1240, 1650), "lateral": png(700, 1400)} if drawn else {}
+    pictures |= {"plan": png(800, 1600)} if drawn else {}
     draw_chart_page(figure, full(many), pictures, findings)
     scale = 72.0 / figure.dpi
     page, *shown = figure.axes
     boxes = [text.get_window_extent(renderer) for text in page.texts]
     boxes += [axes.get_window_extent() for axes in shown]
-    assert len(shown) == 2 * drawn
+    # The plan stands where the band would be.
+    assert len(shown) == drawn * (2 + (not many))
     width, height = (72.0 * size for size in A4)
     for box in boxes:
         assert scale * box.x0 >= 35.0
