@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -307,14 +307,8 @@ def build_patient(
             )
     if case.bite is not None:
         patient = _with_bite(patient, case.bite, options)
-    patient = _with_findings(patient, strange)
+    patient = patient.with_findings(strange)
     return replace(patient, summary={**patient.summary, "inputs_key": key, "plan_key": about})
-
-
-def _with_findings(patient: PatientModel, found: Sequence[Finding]) -> PatientModel:
-    findings = [*patient.summary.get("findings", ()), *map(asdict, found)]
-    summary = {**patient.summary, "findings": findings}
-    return replace(patient, findings=(*patient.findings, *found), summary=summary)
 
 
 def _with_bite(patient: PatientModel, scans: CaseBite, options: BuildOptions) -> PatientModel:
@@ -325,5 +319,5 @@ def _with_bite(patient: PatientModel, scans: CaseBite, options: BuildOptions) ->
     options.observer.found(bite.findings)
     places = [getattr(lower.arch, name).tolist() for name in ("tip", "left", "right")]
     target = {**bite.as_dict(), "upper": upper.segment, "lower": lower.segment, "places": places}
-    patient = _with_findings(patient, bite.findings)
+    patient = patient.with_findings(bite.findings)
     return replace(patient, summary={**patient.summary, "target_bite": target})

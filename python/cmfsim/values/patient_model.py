@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
@@ -264,6 +264,12 @@ class PatientModel(Frozen):
         plan_given = cast("Mapping[str, Floats | MovedSurface]", motions)
         scene = replace(self.scene, plan=plan_given, fixed=fixed, segments=segments)
         return replace(self, scene=scene, findings=findings, summary=summary)
+
+    def with_findings(self, found: Sequence[Finding]) -> PatientModel:
+        """The patient with more findings, after its own."""
+        findings = [*self.summary.get("findings", ()), *map(asdict, found)]
+        summary = {**self.summary, "findings": findings}
+        return replace(self, findings=(*self.findings, *found), summary=summary)
 
     @property
     def planned_bones(self) -> dict[str, tuple[SurfaceData, Floats]]:

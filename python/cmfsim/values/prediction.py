@@ -126,7 +126,8 @@ class Prediction(Frozen):
     def replan(self, plan: Mapping[str, ArrayLike | MovedSurface]) -> Prediction:
         """The prediction of the same model for the same patient under another plan, solved exactly.
 
-        The patient is not built again; the equations are set up and factorised again. For many
+        The patient is not built again; the equations are set up and factorised again. Findings say
+        where motions are implausible, or teeth and bones meet that did not. For many
         plans use `planning_model`, which keeps the factorisation.
 
         Parameters
@@ -151,7 +152,8 @@ class Prediction(Frozen):
         if self.predicted_by is None:
             why = "this prediction does not record how it was made: use predict or predict_patient"
             raise CaseInputError(why)
-        return self.predicted_by(self.patient.with_plan(plan), self.model)
+        checked = _above("pipeline.building.case_checks").given_plan
+        return self.predicted_by(checked(self.patient.with_plan(plan)), self.model)
 
     @property
     def face_before(self) -> SurfaceData:

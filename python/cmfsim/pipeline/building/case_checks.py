@@ -25,7 +25,7 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.mesh_report import MeshReport
 from cmfsim.values.motion import carried
 from cmfsim.values.node_kinds import NodeKinds
-from cmfsim.values.patient_model import LiftedTissue
+from cmfsim.values.patient_model import LiftedTissue, PatientModel
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
@@ -204,6 +204,24 @@ def jaws(
             motion = bones.motions.get(segment.name, np.eye(4))
             parts.append(BonePart(segment.name, jaw, where, segment.surface, motion))
     return [found for found in check_jaws(parts, landmarks) if found.code not in seen]
+
+
+def given_plan(patient: PatientModel) -> PatientModel:
+    """The patient with the findings on a plan that was given in memory, without a case."""
+    where = "the plan given in memory"
+    parts: list[BonePart] = []
+    found: list[Finding] = []
+    for segment in patient.segments:
+        motion = patient.scene.plan.get(segment.name, np.eye(4))
+        if not isinstance(motion, MovedSurface) and motion.shape != (4, 4):
+            continue
+        if (jaw := jaw_of(segment.name)) is not None:
+            parts.append(BonePart(segment.name, jaw, where, segment.surface, motion))
+        if not isinstance(motion, MovedSurface):
+            vertices = segment.surface.vertices
+            found += check_motion_size(SizedMotion(segment.name, motion, where, vertices))
+    found += check_jaws(parts, patient.landmarks.get("skull", {}))
+    return patient.with_findings(found)
 
 
 def untouched(

@@ -137,6 +137,9 @@ def test_a_prediction_is_planned_again_as_the_model_solves_it(planning, referenc
     np.testing.assert_array_equal(again.scene.plan["mandible_body"], np.eye(4))
     assert again.summary["plan"]["maxilla"]["clinical"]["source"] == ""
     assert again.summary["case_key"] != reference.summary["case_key"]
+    assert "plan-far" not in [finding.code for finding in again.findings]
+    far = reference.replan({"maxilla": cmfsim.rigid_motion((0.0, -25.0, 0.0))})
+    assert "plan-far" in [finding.code for finding in far.findings]
     with pytest.raises(cmfsim.CaseError, match="'skull'; segments are"):
         reference.replan({"skull": np.eye(4)})
     with pytest.raises(cmfsim.CaseError, match="does not record how it was made"):
