@@ -21,7 +21,7 @@ NUMBERS = {
     "a centre in another patient": ("centre = [3, -100, 1450]", "centre = [3, -100, 1150]",
                                     "plan-centre-far"),
     "centimetres": (TURN, "translation = [0, -0.4, 0.1]", "plan-tiny"),
-    "another order": (TURN, "translation = [-6, 0, 0]", "plan-sideways"),
+    "another order": (TURN, "translation = [-4, 0, 1]", "plan-sideways"),
     "both Le Fort": ("[plan.mandible]", f"{LE_FORT}\n[plan.mandible]", "cuts-both-le-fort"),
 }  # fmt: skip
 

@@ -23,7 +23,7 @@ TURNED, TOO_TURNED = 20.0, 60.0
 TINY = 0.05
 # Motions of less than this, mm and degrees, are more likely in centimetres, and those further to a
 # side than this, mm, if that is most of the motion, in another order.
-SMALL, SIDEWAYS = 1.0, 5.0
+SMALL, SIDEWAYS = 1.0, 3.0
 # Turns that nobody plans, degrees: 0.2 rad are 11°. Below the first, rounding of a typed matrix.
 TINY_TURN = (1e-3, 0.2)
 # No segment is turned about a point further from it than this, mm: a head is 250 mm high.
