@@ -56,6 +56,12 @@ class Examination:
     findings: tuple[Finding, ...]
     plan: Mapping[str, ClinicalMotion]
 
+    def __repr__(self) -> str:
+        """The plan in words, and each finding on a line."""
+        lines = [f"plan: {name}: {motion.text}" for name, motion in self.plan.items()]
+        lines += [f"{f.severity}: {f.what} [{f.code}]" for f in self.findings]
+        return "\n  ".join(["Examination", *lines])
+
 
 def diagnose(case: CaseOrPath, models: Sequence[str] | None = None) -> tuple[Finding, ...]:
     """The findings on a case before it is built: errors first, then warnings and notes.

@@ -23,6 +23,15 @@ def test_a_clean_case_has_no_findings(tmp_path):
     assert cmfsim.diagnose(cmfsim.Case.load(HeadCase().write(tmp_path))) == ()
 
 
+def test_an_examination_shows_plan_and_findings_in_lines(tmp_path):
+    head = HeadCase(rounds=2)
+    head.replace("translation = [0, -4, 1]", "translation = [0, -24, 1]")
+    title, plan, *found = repr(cmfsim.examine(head.write(tmp_path))).splitlines()
+    assert title == "Examination"
+    assert plan.startswith("  plan: mandible: 24.0 mm forwards")
+    assert any(line.startswith("  warning: ") and line.endswith("[plan-far]") for line in found)
+
+
 def test_what_build_mends_without_doubt_is_a_note(tmp_path):
     """An open neck, doubled and flat triangles, a tet too coarse in a few places when refined."""
     head = HeadCase()
