@@ -147,7 +147,8 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
     found: list[Finding] = []
     surfaces = {segment.name: segment.surface for segment in bones.segments}
     if case.achieved:
-        far = max(_travel(motion, surfaces[name]) for name, motion in bones.motions.items())
+        travels = (_travel(motion, surfaces[name]) for name, motion in bones.motions.items())
+        far = max(travels, default=0.0)
         if far < SMALL:
             found.append(nothing_moves(case.where("plan"), far))
     for name, motion in bones.motions.items():
