@@ -96,6 +96,14 @@ pub enum Motion {
 }
 
 impl Motion {
+    /// The rigid motion, if it is one.
+    pub(crate) fn rigid(&self) -> Option<&RigidMotion> {
+        match self {
+            Self::Rigid(rigid) => Some(rigid),
+            Self::Nodes(_) | Self::Surface(_) => None,
+        }
+    }
+
     /// Displacements of `points` that follow the segment, mm; none if only its joined nodes are known to move.
     pub(crate) fn displacements(&self, points: &[[f64; 3]]) -> Option<Vec<[f64; 3]>> {
         match self {
@@ -453,8 +461,7 @@ impl Boundary {
                         return Err(misplanned(
                             &segment.name,
                             "displacements of joined nodes do not say how its contact surface moves; \
-                             give a rigid 4×4 matrix or a SurfaceMotion"
-                                .into(),
+                             give a rigid 4×4 matrix or a SurfaceMotion",
                         ));
                     }
                 }
@@ -509,7 +516,7 @@ pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a M
             return Err(misplanned(name, format!("no such segment; the boundary has {known}")));
         }
         if plan[..i].iter().any(|(other, _)| other == name) {
-            return Err(misplanned(name, "it is named twice".into()));
+            return Err(misplanned(name, "it is named twice"));
         }
     }
     segments
@@ -526,14 +533,15 @@ pub(crate) fn matched<'a>(plan: &'a Plan, segments: &[&str]) -> Result<Vec<&'a M
             Some((_, motion)) => Ok(motion),
             None => Err(misplanned(
                 segment,
-                "it is missing; a plan names every segment (identity matrix: no motion)".into(),
+                "it is missing; a plan names every segment (identity matrix: no motion)",
             )),
         })
         .collect()
 }
 
-fn misplanned(segment: &str, problem: String) -> MtmError {
-    MtmError::Plan { segment: segment.to_owned(), problem }
+/// The error for a plan that does not fit the boundary.
+pub(crate) fn misplanned(segment: &str, problem: impl Into<String>) -> MtmError {
+    MtmError::Plan { segment: segment.to_owned(), problem: problem.into() }
 }
 
 /// Whether a gap, mm, is within the range that contact can maintain.

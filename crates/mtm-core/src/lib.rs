@@ -126,7 +126,7 @@ pub use algebra::pool;
 pub use boundary::{
     Against, Boundary, Conflicts, Gap, Motion, NodeKind, Plan, Segment, TouchingPair,
 };
-pub use contact::{ContactMode, ContactOptions};
+pub use contact::{ContactMode, ContactOptions, ContactResult};
 pub use error::{ErrorKind, MtmError, Result, Shortfall};
 pub use geometry::decimation::decimated;
 pub use geometry::motion::{RigidMotion, SurfaceMotion, rigid_matrix};
@@ -163,5 +163,5 @@ pub use registration::thin_plate::{Folds, ThinPlateSpline};
 pub use statics::options::{Interrupt, Method, StaticOptions};
 pub use statics::plans::replan::PlanOperator;
 pub use statics::plans::response::Change;
-pub use statics::solution::{ContactResult, Solution, Timings, TouchResult};
+pub use statics::solution::{Solution, Timings, TouchResult};
 pub use statics::solver::StaticSolver;

@@ -89,36 +89,42 @@ pub struct Sliding {
     pub(crate) diagonal: f64,
 }
 
-/// Final state of the sliding nodes.
-#[derive(Debug, Clone)]
-pub struct ContactState {
-    /// Displacement of each sliding node, mm.
-    pub displacements: Vec<[f64; 3]>,
+/// Contact at the sliding nodes after a solve.
+#[derive(Debug, Clone, Default)]
+pub struct ContactResult {
+    /// The sliding nodes, segment by segment.
+    pub nodes: Vec<u32>,
+    /// Displacement of each, mm.
+    pub(crate) displacements: Vec<[f64; 3]>,
     /// Force that the bone exerts on each, N: along the normal, to within the tolerance.
-    pub reactions: Vec<[f64; 3]>,
-    /// Closest point of the moved surface, mm.
+    pub(crate) reactions: Vec<[f64; 3]>,
+    /// Closest point of the moved contact surface, mm.
     pub points: Vec<[f64; 3]>,
-    /// Unit normal of the contact surface at each node, out of the bone.
+    /// Unit normal along which the contact force acts, out of the bone.
     pub normals: Vec<[f64; 3]>,
     /// Contact force along the normal, N; positive pushes the tissue away from the bone.
     pub forces: Vec<f64>,
-    /// Constraint of each held node.
-    pub rows: Vec<ContactRow>,
-    /// How the forces change direction as held nodes slide.
-    pub springs: Vec<Spring>,
-    /// Final distance of each node from its surface, out of the bone, mm.
+    /// Distance from the surface minus the prescribed gap, mm; for nodes that keep their offset at rest,
+    /// distance from the surface shifted by that offset.
     pub gaps: Vec<f64>,
     /// Whether the node is held to the surface.
     pub active: Vec<bool>,
+    /// Constraint of each held node.
+    pub(crate) rows: Vec<ContactRow>,
+    /// How the forces change direction as held nodes slide.
+    pub(crate) springs: Vec<Spring>,
     /// Newton steps done.
-    pub iterations: usize,
-    /// Largest distance, mm, by which the remaining tangential force would move a node on its own.
+    pub(crate) iterations: usize,
+    /// Largest distance, mm, by which the remaining tangential force would move a sliding node on its own.
     pub unbalanced: f64,
-    /// Whether the tolerance was reached.
+    /// The nodes moved back with their segments to the position at rest; none if a segment is deformed.
+    pub at_rest: Option<ContactStart>,
+    /// Whether gaps and forces are within the tolerance. If not, they are still too small to be visible on a
+    /// face.
     pub converged: bool,
 }
 
-impl ContactState {
+impl ContactResult {
     /// Largest distance of a held node from its surface, mm.
     pub(crate) fn largest_gap(&self) -> f64 {
         let held = self.gaps.iter().zip(&self.active).filter(|(_, active)| **active);
@@ -291,7 +297,7 @@ impl Sliding {
     pub(crate) fn carried_back(
         &self,
         motions: &[&Motion],
-        state: &ContactState,
+        state: &ContactResult,
     ) -> Option<ContactStart> {
         self.moved(motions, &self.start_of(state), |rigid, place, force| {
             (rigid.apply_inverse(place), rigid.rotate_inverse(force))
@@ -313,16 +319,15 @@ impl Sliding {
         way: impl Fn(&RigidMotion, [f64; 3], [f64; 3]) -> ([f64; 3], [f64; 3]),
     ) -> Option<ContactStart> {
         let each = self.nodes.iter().zip(start.places.iter().zip(&start.reactions));
-        let moved = each.map(|(node, (&place, &force))| match motions[node.segment] {
-            Motion::Rigid(rigid) => Some(way(rigid, place, force)),
-            _ => None,
+        let moved = each.map(|(node, (&place, &force))| {
+            motions[node.segment].rigid().map(|rigid| way(rigid, place, force))
         });
         let (places, reactions) = moved.collect::<Option<Vec<_>>>()?.into_iter().unzip();
         Some(ContactStart { places, reactions })
     }
 
     /// The positions of the sliding nodes in `state`, and the forces on them.
-    pub(crate) fn start_of(&self, state: &ContactState) -> ContactStart {
+    pub(crate) fn start_of(&self, state: &ContactResult) -> ContactStart {
         let places = self.positions.iter().zip(&state.displacements).map(|(x, u)| add(*x, *u));
         ContactStart { places: places.collect(), reactions: state.reactions.clone() }
     }

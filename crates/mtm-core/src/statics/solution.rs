@@ -2,39 +2,10 @@
 
 use std::time::Instant;
 
-use crate::contact::{ContactRow, ContactStart, Spring};
+use crate::contact::ContactResult;
 
 /// Seconds by stage; exactly zero for a stage that the scene does not need.
 pub type Timings = Vec<(&'static str, f64)>;
-
-/// Contact at the sliding nodes after a solve.
-#[derive(Debug, Clone, Default)]
-pub struct ContactResult {
-    /// The sliding nodes, segment by segment.
-    pub nodes: Vec<u32>,
-    /// Closest point of the moved contact surface, mm.
-    pub points: Vec<[f64; 3]>,
-    /// Unit normal along which the contact force acts, out of the bone.
-    pub normals: Vec<[f64; 3]>,
-    /// Contact force along the normal, N; positive pushes the tissue away from the bone.
-    pub forces: Vec<f64>,
-    /// Distance from the surface minus the prescribed gap, mm; for nodes that keep their offset at rest,
-    /// distance from the surface shifted by that offset.
-    pub gaps: Vec<f64>,
-    /// Whether the node is held to the surface.
-    pub active: Vec<bool>,
-    /// Constraint of each held node.
-    pub(crate) rows: Vec<ContactRow>,
-    /// How the forces change direction as held nodes slide.
-    pub(crate) springs: Vec<Spring>,
-    /// Largest distance, mm, by which the remaining tangential force would move a sliding node on its own.
-    pub unbalanced: f64,
-    /// The nodes moved back with their segments to the position at rest; none if a segment is deformed.
-    pub at_rest: Option<ContactStart>,
-    /// Whether gaps and forces are within the tolerance. If not, they are still too small to be visible on a
-    /// face.
-    pub converged: bool,
-}
 
 /// Nodes in contact with a surface of their pair, with the contact forces.
 #[derive(Debug, Clone, Default)]
@@ -99,8 +70,7 @@ pub struct Solution {
 impl Solution {
     /// Largest |gap| of the held sliding nodes, mm; 0 if there are none.
     pub fn contact_gap(&self) -> f64 {
-        let c = &self.contact;
-        c.gaps.iter().zip(&c.active).filter(|(_, a)| **a).fold(0.0, |m, (g, _)| m.max(g.abs()))
+        self.contact.largest_gap()
     }
 }
 

@@ -20,7 +20,7 @@ mod problem;
 use crate::boundary::Motion;
 use crate::contact::newton::problem::{ContactProblem, farthest};
 use crate::contact::seat::Seats;
-use crate::contact::{Body, ContactOptions, ContactStart, ContactState, Sliding};
+use crate::contact::{Body, ContactOptions, ContactResult, ContactStart, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
 
 /// How far contact forces may carry nodes in the first step, and in any step, over the reach of the surfaces.
@@ -56,7 +56,7 @@ impl Sliding {
         options: &ContactOptions,
         interrupted: &(dyn Fn() -> bool + Sync),
         body: &mut dyn Body,
-    ) -> Result<ContactState> {
+    ) -> Result<ContactResult> {
         let allowed = "1 or more";
         ErrorKind::Solver.require(
             options.max_iterations > 0,

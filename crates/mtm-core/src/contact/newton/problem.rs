@@ -3,7 +3,7 @@
 use crate::contact::pairs::BORDER_REACH;
 use crate::contact::seat::{LocalShape, Seats};
 use crate::contact::{
-    Body, Constraints, ContactMode, ContactOptions, ContactRow, ContactStart, ContactState,
+    Body, Constraints, ContactMode, ContactOptions, ContactResult, ContactRow, ContactStart,
     Response, Sliding, Spring,
 };
 use crate::error::{MtmError, Result};
@@ -262,7 +262,7 @@ impl ContactProblem<'_> {
         unbalanced: f64,
         converged: bool,
         iterations: usize,
-    ) -> Result<ContactState> {
+    ) -> Result<ContactResult> {
         let places = self.places(&state.displacements);
         let closest: Vec<_> =
             places.iter().enumerate().map(|(i, &x)| self.seats.closest(i, x)).collect();
@@ -283,7 +283,8 @@ impl ContactProblem<'_> {
         }
         let rows = self.rows(&state, active);
         let springs = self.springs(&state, active, FROZEN_SPRING_SHARE);
-        Ok(ContactState {
+        Ok(ContactResult {
+            nodes: self.sliding.nodes.iter().map(|n| n.node).collect(),
             points: closest.iter().map(|(found, _)| found.point).collect(),
             normals: state.touches.iter().map(|t| t.normal).collect(),
             gaps: state.touches.iter().map(|t| t.gap).collect(),
@@ -295,6 +296,7 @@ impl ContactProblem<'_> {
             active: active.to_vec(),
             iterations,
             unbalanced,
+            at_rest: None,
             converged,
         })
     }

@@ -2,7 +2,7 @@
 
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::constraints::{Constraint, projected};
-use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
+use crate::contact::{Constraints, ContactResult, ContactRow, Sliding, Spring};
 use crate::vector::{add, dot, scaled};
 
 /// Constraints and springs on rows of the system.
@@ -21,7 +21,7 @@ impl RowConditions {
     }
 
     /// The conditions of `state`: nodes that are held move no further along their normals.
-    pub fn of_state(sliding: &Sliding, state: &ContactState) -> Self {
+    pub fn of_state(sliding: &Sliding, state: &ContactResult) -> Self {
         Self::on_rows(sliding, state.rows.iter().map(|r| (r, 0.0)), &state.springs)
     }
 

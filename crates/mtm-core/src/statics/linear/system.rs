@@ -12,13 +12,14 @@ use crate::algebra::krylov::StepAccuracy;
 use crate::algebra::multigrid::Multigrid;
 use crate::algebra::row_sums::in_pool;
 use crate::contact::links::Link;
-use crate::contact::{Constraints, ContactRow, ContactState, Sliding, Spring};
+use crate::contact::{Constraints, ContactResult, Sliding, Spring};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::{Extremes, Iterative, KeptForNext, SolveMemory, hierarchy};
 use crate::statics::linear::pressed::with_links;
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::options::{Interrupt, Method, StaticOptions};
+use crate::statics::plans::about::Slope;
 use crate::statics::plans::frozen::FrozenContact;
 use crate::statics::plans::reaction::ContactFactor;
 use crate::statics::plans::settling::{
@@ -69,7 +70,7 @@ pub(crate) struct BodyRows<'a> {
 pub(crate) struct SolvedRows {
     /// mm.
     pub rows: Vec<[f64; 3]>,
-    pub contact: Option<ContactState>,
+    pub contact: Option<ContactResult>,
     /// Time that contact took, s.
     pub contact_seconds: f64,
 }
@@ -90,20 +91,15 @@ impl From<Settled> for SolvedRows {
 
 /// Contact constraints that stay the same for several right-hand sides.
 pub(crate) struct Frozen<'a> {
-    /// Sliding node and normal of each constraint.
-    pub rows: &'a [ContactRow],
-    /// Offset of every row, for each right-hand side.
-    pub offsets: &'a [Vec<f64>],
-    /// How the contact forces change direction as nodes slide.
-    pub springs: &'a [Spring],
-    /// Goal of every spring, for each right-hand side.
-    pub goals: &'a [Vec<f64>],
+    pub state: &'a ContactResult,
+    /// Offsets of its rows and goals of its springs, for each right-hand side.
+    pub slopes: &'a [Slope],
 }
 
 impl Frozen<'_> {
     /// The springs with their goals for right-hand side `k`.
     fn springs(&self, k: usize) -> Vec<Spring> {
-        let goals = self.springs.iter().zip(&self.goals[k]);
+        let goals = self.state.springs.iter().zip(&self.slopes[k].goals);
         goals.map(|(spring, &goal)| Spring { goal, ..*spring }).collect()
     }
 }
@@ -321,24 +317,13 @@ impl System {
         };
         let still = vec![[0.0; 3]; sliding.nodes().len()];
         let check = || if interrupted() { Err(MtmError::Interrupted) } else { Ok(()) };
-        let conditions = |k: usize, solve: &mut dyn FnMut(&Constraints<'_>) -> Result<Rows>| {
-            let (rows, offsets) = (frozen.rows, &frozen.offsets[k][..]);
-            let springs = frozen.springs(k);
-            let reach = f64::INFINITY;
-            solve(&Constraints {
-                rows,
-                offsets,
-                springs: &springs,
-                about: &still,
-                share: 0.0,
-                spring_share: OPERATOR_SPRING_SHARE,
-                reach,
-            })
-        };
+        let Frozen { state, slopes } = frozen;
         match &self.kept {
             Kept::Factor { factor, contact } => {
-                let kept = FrozenContact::new(contact.flexibility(), frozen.rows, frozen.springs)?;
-                let forces = |k, free: &[_]| conditions(k, &mut |c| Ok(kept.forces(free, c)));
+                let kept = FrozenContact::new(contact.flexibility(), &state.rows, &state.springs)?;
+                let forces = |k: usize, free: &[_]| {
+                    Ok(kept.forces(free, &slopes[k].offsets, &frozen.springs(k)))
+                };
                 check()?;
                 all_together(factor, contact.flexibility(), columns, forces)
             }
@@ -347,13 +332,21 @@ impl System {
                 let mut trail = SolveMemory::default();
                 let solve = |((k, b), &scale): ((usize, &Rows), &f64)| {
                     check()?;
+                    trail.begin_again();
+                    let conditions = Constraints {
+                        rows: &state.rows,
+                        offsets: &slopes[k].offsets,
+                        springs: &frozen.springs(k),
+                        about: &still,
+                        share: 0.0,
+                        spring_share: OPERATOR_SPRING_SHARE,
+                        reach: f64::INFINITY,
+                    };
+                    let nodes = (sliding, RowLinks { share, ..RowLinks::default() });
                     let mut solve = PlanSolve::new(scale, interrupted);
-                    conditions(k, &mut |c| {
-                        trail.begin_again();
-                        let nodes = (sliding, RowLinks { share, ..RowLinks::default() });
-                        let found = system.solve_projected(b, nodes, c, &mut trail, &mut solve);
-                        found.map(|found| found.rows)
-                    })
+                    let found =
+                        system.solve_projected(b, nodes, &conditions, &mut trail, &mut solve);
+                    found.map(|found| found.rows)
                 };
                 columns.iter().enumerate().zip(scales).map(solve).collect()
             }

@@ -17,7 +17,7 @@ use std::sync::{Arc, OnceLock};
 use crate::algebra::blocks::BlockMatrix;
 use crate::algebra::cholesky::Symbolic;
 use crate::algebra::multigrid::Multigrid;
-use crate::contact::{Body, Constraints, ContactState, Response, Sliding};
+use crate::contact::{Body, Constraints, ContactResult, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, Shortfall};
 use crate::mechanics::strain_energy::{LAG, PointTangents, StrainEnergy};
 use crate::mechanics::tensors::MassTensors;
@@ -241,7 +241,7 @@ impl Equilibrium {
             tangents,
         };
         let u = vec![[0.0; 3]; prescribed.len()];
-        let settled = |u: &[[f64; 3]], contact: ContactState| SolvedRows {
+        let settled = |u: &[[f64; 3]], contact: ContactResult| SolvedRows {
             rows: self.reduction.rows(u),
             contact: Some(contact),
             contact_seconds: clock.total(),

@@ -5,7 +5,7 @@
 use std::borrow::Cow;
 
 use crate::boundary::Motion;
-use crate::contact::{ContactState, Sliding};
+use crate::contact::{ContactResult, Sliding};
 use crate::error::Result;
 use crate::mechanics::strain_energy::TangentKind::{self, Definite, Exact};
 use crate::statics::linear::effort::PlanSolve;
@@ -34,7 +34,7 @@ pub(crate) struct SlidingBody<'a> {
 
 /// Starting state of a step: displacements of the nodes that are not unknowns, none if they do not move, and the
 /// previous contact state.
-type Start<'a> = (Option<&'a [[f64; 3]]>, Option<&'a ContactState>);
+type Start<'a> = (Option<&'a [[f64; 3]]>, Option<&'a ContactResult>);
 
 /// Steps of a body in contact.
 struct InContact<'a, 'i> {
@@ -42,7 +42,7 @@ struct InContact<'a, 'i> {
     target: &'a Target<'a>,
     slide: &'a SlidingBody<'a>,
     /// State after the last step.
-    contact: ContactState,
+    contact: ContactResult,
     /// Error allowed in the last step, and that which keeps contact within its required accuracy, mm.
     before: f64,
     fine: f64,
@@ -54,7 +54,7 @@ impl StepRule for InContact<'_, '_> {
         let (body, start) = ((self.target, self.slide), (None, Some(&self.contact)));
         let (rows, state) = self.equilibrium.settled(pose, body, start, how, self.interrupted)?;
         let iterations = self.contact.iterations + state.iterations;
-        self.contact = ContactState { iterations, ..state };
+        self.contact = ContactResult { iterations, ..state };
         // Walls do no work along themselves, and their work across gaps does not enter the energy of the body.
         let gaps = 2.0 * how.1.max(self.before).max(self.fine);
         self.before = how.1;
@@ -67,7 +67,7 @@ impl StepRule for InContact<'_, '_> {
     }
 
     fn resume(&mut self, pose: &Iterate) {
-        let ContactState { displacements, reactions, .. } = &mut self.contact;
+        let ContactResult { displacements, reactions, .. } = &mut self.contact;
         let nodes = self.slide.sliding.nodes();
         for ((node, u), force) in nodes.iter().zip(displacements).zip(reactions) {
             (*u, *force) = (pose.u[node.node as usize], pose.slope[node.row as usize]);
@@ -85,7 +85,7 @@ impl Equilibrium {
         target: &Target<'_>,
         slide: &SlidingBody<'_>,
         solve: &mut PlanSolve<'_>,
-    ) -> Result<(Vec<[f64; 3]>, ContactState)> {
+    ) -> Result<(Vec<[f64; 3]>, ContactResult)> {
         let interrupted = solve.interrupted;
         let rest = self.pose(vec![[0.0; 3]; target.prescribed.len()], target)?;
         let mut change = target.prescribed.to_vec();
@@ -136,7 +136,7 @@ impl Equilibrium {
         (change, contact): Start<'_>,
         (kind, allowed): (TangentKind, f64),
         interrupted: Interrupt<'_>,
-    ) -> Result<(Vec<[f64; 3]>, ContactState)> {
+    ) -> Result<(Vec<[f64; 3]>, ContactResult)> {
         let here = self.reduction.rows(&pose.u);
         // Closest points cannot converge further than the solves do.
         let far = reach(pose, target);

@@ -1,6 +1,6 @@
 //! Contact about a known equilibrium: how its conditions change, to first order, as bone segments move on.
 
-use crate::contact::{ContactRow, SlidingNode, Spring};
+use crate::contact::{ContactResult, ContactRow, SlidingNode};
 use crate::geometry::motion::RigidMotion;
 use crate::vector::{add, dot, scaled, sub};
 
@@ -42,12 +42,7 @@ impl Rate {
 
 /// Contact at equilibrium.
 pub(crate) struct ContactEquilibrium<'a> {
-    pub rows: &'a [ContactRow],
-    pub springs: &'a [Spring],
-    /// Unit normal, contact force (N) and state of every sliding node.
-    pub normals: &'a [[f64; 3]],
-    pub forces: &'a [f64],
-    pub active: &'a [bool],
+    pub state: &'a ContactResult,
     pub sliding: &'a [SlidingNode],
     /// Motion of each segment.
     pub motions: &'a [RigidMotion],
@@ -65,7 +60,10 @@ pub(crate) struct Slope {
 impl ContactEquilibrium<'_> {
     /// No change.
     pub fn still(&self) -> Slope {
-        Slope { offsets: vec![0.0; self.rows.len()], goals: vec![0.0; self.springs.len()] }
+        Slope {
+            offsets: vec![0.0; self.state.rows.len()],
+            goals: vec![0.0; self.state.springs.len()],
+        }
     }
 
     /// Adds the change of the conditions as `segment` moves at `rate`. A row follows its surface along its
@@ -74,46 +72,42 @@ impl ContactEquilibrium<'_> {
     /// term is a spring that moves with the surface, the second a load, which is added to the rows of `field`.
     pub fn add(&self, segment: usize, rate: &Rate, slope: &mut Slope, field: &mut [[f64; 3]]) {
         let mut ways = vec![[0.0; 3]; self.sliding.len()];
-        for (row, offset) in self.rows.iter().zip(&mut slope.offsets) {
+        for (row, offset) in self.state.rows.iter().zip(&mut slope.offsets) {
             if self.sliding[row.node].segment == segment {
                 ways[row.node] = rate.at(self.foot(row));
                 *offset += dot(row.normal, ways[row.node]);
             }
         }
-        for (spring, goal) in self.springs.iter().zip(&mut slope.goals) {
+        for (spring, goal) in self.state.springs.iter().zip(&mut slope.goals) {
             if self.sliding[spring.node].segment == segment {
                 *goal += dot(spring.axis, ways[spring.node]);
             }
         }
         for (i, node) in self.sliding.iter().enumerate() {
-            if node.segment == segment && self.active[i] {
-                let turn = rate.turned(self.motions[segment].rotate_inverse(self.normals[i]));
+            if node.segment == segment && self.state.active[i] {
+                let turn = rate.turned(self.motions[segment].rotate_inverse(self.state.normals[i]));
                 self.push(i, turn, field);
             }
         }
     }
 
-    /// The conditions at a plan in which nothing moves, continued from this state: `displacements` are those of
-    /// the sliding nodes, `places` their positions at rest by node.
-    pub fn at_rest(
-        &self,
-        displacements: &[[f64; 3]],
-        places: &[[f64; 3]],
-        field: &mut [[f64; 3]],
-    ) -> Slope {
+    /// The conditions at a plan in which nothing moves, continued from this state; `places`: position of each node
+    /// at rest.
+    pub fn at_rest(&self, places: &[[f64; 3]], field: &mut [[f64; 3]]) -> Slope {
+        let state = self.state;
         let mut slope = self.still();
         let mut reached = vec![[0.0; 3]; self.sliding.len()];
-        for (row, offset) in self.rows.iter().zip(&mut slope.offsets) {
+        for (row, offset) in state.rows.iter().zip(&mut slope.offsets) {
             let node = &self.sliding[row.node];
             let foot = self.foot(row);
             *offset = dot(row.normal, sub(foot, places[node.node as usize]));
             reached[row.node] = sub(self.motions[node.segment].apply(foot), foot);
         }
-        for (spring, goal) in self.springs.iter().zip(&mut slope.goals) {
-            *goal = dot(spring.axis, sub(displacements[spring.node], reached[spring.node]));
+        for (spring, goal) in state.springs.iter().zip(&mut slope.goals) {
+            *goal = dot(spring.axis, sub(state.displacements[spring.node], reached[spring.node]));
         }
-        for (i, node) in self.sliding.iter().enumerate().filter(|(i, _)| self.active[*i]) {
-            let normal = self.normals[i];
+        for (i, node) in self.sliding.iter().enumerate().filter(|(i, _)| state.active[*i]) {
+            let normal = state.normals[i];
             let back = self.motions[node.segment].rotate_inverse(normal);
             self.push(i, sub(back, normal), field);
         }
@@ -128,7 +122,7 @@ impl ContactEquilibrium<'_> {
     /// Adds the load of sliding node `i` whose normal turns by `turn`, only across the normal: the component
     /// along it belongs to the row.
     fn push(&self, i: usize, turn: [f64; 3], field: &mut [[f64; 3]]) {
-        let (normal, force) = (self.normals[i], self.forces[i]);
+        let (normal, force) = (self.state.normals[i], self.state.forces[i]);
         let across = sub(turn, scaled(normal, dot(normal, turn)));
         let row = &mut field[self.sliding[i].row as usize];
         *row = add(*row, scaled(across, force));

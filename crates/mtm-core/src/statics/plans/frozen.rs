@@ -9,7 +9,7 @@
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 use crate::algebra::cholesky::{DenseFactor, DenseSymmetric, TailFlexibility};
-use crate::contact::{Constraints, ContactRow, Spring};
+use crate::contact::{ContactRow, Spring};
 use crate::error::Result;
 use crate::statics::plans::reaction::{ConditionRows, singular, unheld};
 use crate::vector::{add, dot, scaled};
@@ -33,16 +33,7 @@ impl FrozenContact {
     /// `NotPositiveDefinite` if the rows are degenerate, or if springs drive nodes by more than the body can
     /// resist.
     pub fn new(tail: &TailFlexibility, rows: &[ContactRow], springs: &[Spring]) -> Result<Self> {
-        let offsets = vec![0.0; rows.len()];
-        let rows = ConditionRows::new(&Constraints {
-            rows,
-            offsets: &offsets,
-            springs,
-            about: &[],
-            share: 0.0,
-            spring_share: 0.0,
-            reach: f64::INFINITY,
-        });
+        let rows = ConditionRows::new(rows, &vec![0.0; rows.len()], springs);
         let unstable: Vec<Spring> = springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
         let n = rows.rows.len();
         let axes = unstable.iter().map(|s| (s.node, s.axis));
@@ -71,14 +62,15 @@ impl FrozenContact {
         Ok(Self { rows, normal: factor, unstable, coupling, held })
     }
 
-    /// Force on each sliding node, N: `free` are the displacements without contact, `offsets` and `goals` the
-    /// values prescribed for rows and springs, mm.
-    pub fn forces(&self, free: &[[f64; 3]], c: &Constraints<'_>) -> Vec<[f64; 3]> {
-        let mut along = ConditionRows::new(c).missing(free);
+    /// Force on each sliding node, N: `free` are the displacements without contact, `offsets` those prescribed for
+    /// the rows, mm; `springs` have their goals.
+    pub fn forces(&self, free: &[[f64; 3]], offsets: &[f64], springs: &[Spring]) -> Vec<[f64; 3]> {
+        let contact = &self.rows.rows[..offsets.len()];
+        let mut along = ConditionRows::new(contact, offsets, springs).missing(free);
         self.normal.solve(&mut along);
         let mut out = vec![[0.0; 3]; free.len()];
         if let Some(held) = &self.held {
-            let asked = c.springs.iter().filter(|s| s.stiffness < 0.0);
+            let asked = springs.iter().filter(|s| s.stiffness < 0.0);
             let open = asked.zip(&self.coupling).map(|(s, column)| {
                 let by_rows: f64 = column.iter().zip(&along).map(|(g, f)| g * f).sum();
                 dot(s.axis, free[s.node]) - s.goal + by_rows

@@ -6,9 +6,9 @@
 
 use rayon::prelude::*;
 
-use crate::boundary::{Motion, NodeKind, Plan, Segment, matched};
-use crate::contact::{ContactState, Sliding};
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::boundary::{Motion, NodeKind, Plan, Segment, matched, misplanned};
+use crate::contact::{ContactResult, Sliding};
+use crate::error::{ErrorKind, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::statics::linear::system::Frozen;
 use crate::statics::options::Interrupt;
@@ -81,14 +81,7 @@ impl StaticSolver {
         let n = self.tensors.element_nodes().positions().len();
         let nodes = nodes.unwrap_or_else(|| (0..self.tensors.mesh().n_nodes() as u32).collect());
         match nodes.iter().position(|&j| j as usize >= n) {
-            Some(row) => Err(MtmError::IndexOutOfRange {
-                what: "nodes".into(),
-                row,
-                item: "node",
-                index: nodes[row] as usize,
-                count: n,
-                kind: ErrorKind::Boundary,
-            }),
+            Some(row) => Err(ErrorKind::Boundary.no_such(("nodes", row), "node", nodes[row], n)),
             None => Ok(nodes),
         }
     }
@@ -128,42 +121,30 @@ impl StaticSolver {
     fn solve_in_contact(
         &self,
         mut columns: UnitColumns,
-        (state, sliding): (&ContactState, &Sliding),
+        (state, sliding): (&ContactResult, &Sliding),
         centres: &[[f64; 3]],
         reference: &Plan,
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
         columns.scales.push(1.0);
         columns.fields.push(vec![[0.0; 3]; self.reduction.unknowns.len()]);
-        let identity = RigidMotion::identity();
-        let motion = |s: &Segment| *find(reference, &s.name).unwrap_or(&identity);
-        let motions: Vec<RigidMotion> = self.node_kinds.segments().iter().map(motion).collect();
-        let about = ContactEquilibrium {
-            rows: &state.rows,
-            springs: &state.springs,
-            normals: &state.normals,
-            forces: &state.forces,
-            active: &state.active,
-            sliding: sliding.nodes(),
-            motions: &motions,
-        };
+        let motions = self.node_kinds.motions(reference)?;
+        let motions: Vec<RigidMotion> = motions.iter().filter_map(|m| m.rigid()).copied().collect();
+        let about = ContactEquilibrium { state, sliding: sliding.nodes(), motions: &motions };
         let places = self.tensors.element_nodes().positions();
-        let (mut offsets, mut goals) = (Vec::new(), Vec::new());
+        let mut slopes = Vec::new();
         for (k, field) in columns.fields.iter_mut().enumerate() {
-            let slope = match centres.get(k / COLUMNS) {
+            slopes.push(match centres.get(k / COLUMNS) {
                 Some(&centre) => {
                     let rate = Rate::unit(k % COLUMNS, centre);
                     let mut slope = about.still();
                     about.add(k / COLUMNS, &rate, &mut slope, field);
                     slope
                 }
-                None => about.at_rest(&state.displacements, places, field),
-            };
-            offsets.push(slope.offsets);
-            goals.push(slope.goals);
+                None => about.at_rest(places, field),
+            });
         }
-        let (rows, springs) = (&state.rows[..], &state.springs[..]);
-        let frozen = Frozen { rows, offsets: &offsets, springs, goals: &goals };
+        let frozen = Frozen { state, slopes: &slopes };
         self.solve_columns(columns.fields, (&columns.scales, None), Some(frozen), interrupted)
     }
 
@@ -250,21 +231,14 @@ impl PlanOperator {
 
     /// [`apply`](Self::apply) into a buffer of one row per node.
     pub fn apply_into(&self, plan: &Plan, out: &mut [[f64; 3]]) -> Result<()> {
-        if out.len() != self.nodes.len() {
-            return Err(MtmError::Length {
-                what: "output".into(),
-                found: out.len(),
-                expected: self.nodes.len(),
-                why: "one row per node of the operator",
-                kind: ErrorKind::Boundary,
-            });
-        }
+        let why = "one row per node of the operator";
+        ErrorKind::Boundary.require_length("output", out.len(), self.nodes.len(), why)?;
         rigid_plan(plan)?;
         let names: Vec<&str> = self.segments.iter().map(String::as_str).collect();
         let mut numbers = Vec::with_capacity(names.len());
         for (motion, &centre) in matched(plan, &names)?.into_iter().zip(&self.centres) {
             // Motions that are not rigid were rejected above.
-            let Motion::Rigid(rigid) = motion else { continue };
+            let Some(rigid) = motion.rigid() else { continue };
             // (R − I)(x − c) + s with s the displacement of the centre.
             let mut own = [0.0; COLUMNS];
             for r in 0..3 {
@@ -307,22 +281,9 @@ fn dot12(a: &[f64; COLUMNS], b: &[f64; COLUMNS]) -> f64 {
     (sums[0] + sums[2]) + (sums[1] + sums[3])
 }
 
-fn find<'a>(plan: &'a Plan, name: &str) -> Option<&'a RigidMotion> {
-    plan.iter().find_map(|(segment, motion)| match motion {
-        Motion::Rigid(rigid) if segment == name => Some(rigid),
-        _ => None,
-    })
-}
-
+/// Rejects motions that are not rigid.
 fn rigid_plan(plan: &Plan) -> Result<()> {
-    for (segment, motion) in plan {
-        if !matches!(motion, Motion::Rigid(_)) {
-            return Err(MtmError::Plan {
-                segment: segment.clone(),
-                problem: "the operator takes rigid 4×4 matrices only; use solve for other motions"
-                    .into(),
-            });
-        }
-    }
-    Ok(())
+    let why = "the operator takes rigid 4×4 matrices only; use solve for other motions";
+    let other = plan.iter().find(|(_, motion)| motion.rigid().is_none());
+    other.map_or(Ok(()), |(segment, _)| Err(misplanned(segment, why)))
 }

@@ -5,8 +5,8 @@
 //! change under a load that depends on the known u. Plans enter as loads of the joined nodes and as motions of
 //! the contact surfaces.
 
-use crate::boundary::{Motion, Plan, matched};
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::boundary::{Plan, misplanned};
+use crate::error::{ErrorKind, Result};
 use crate::geometry::motion::RigidMotion;
 use crate::statics::linear::system::Frozen;
 use crate::statics::options::Interrupt;
@@ -51,42 +51,28 @@ impl StaticSolver {
     ) -> Result<Vec<Vec<[f64; 3]>>> {
         self.check_linear("a first-order change")?;
         self.check_start(solution)?;
-        self.check_accuracy(accuracy)?;
-        let segments = self.node_kinds.segments();
-        let names: Vec<&str> = segments.iter().map(|s| s.name.as_str()).collect();
-        let rigid = |motion: &Motion| match motion {
-            Motion::Rigid(rigid) => Some(*rigid),
-            _ => None,
-        };
-        let known: Vec<Option<RigidMotion>> =
-            matched(plan, &names)?.into_iter().map(rigid).collect();
+        let what = "accuracy of a first-order change";
+        let is_allowed = accuracy > 0.0 && accuracy < 1.0;
+        ErrorKind::Solver.require(is_allowed, what, accuracy, "above 0 and below 1")?;
+        let motions = self.node_kinds.motions(plan)?;
+        let known: Vec<Option<RigidMotion>> = motions.iter().map(|m| m.rigid().copied()).collect();
         let motions: Vec<RigidMotion> =
             known.iter().map(|m| m.unwrap_or_else(RigidMotion::identity)).collect();
-        let contact = &solution.contact;
-        let about = ContactEquilibrium {
-            rows: &contact.rows,
-            springs: &contact.springs,
-            normals: &contact.normals,
-            forces: &contact.forces,
-            active: &contact.active,
-            sliding: self.sliding.as_ref().map_or(&[], |s| s.nodes()),
-            motions: &motions,
-        };
-        let (mut fields, mut posed) = (Vec::new(), Vec::new());
+        let sliding = self.sliding.as_ref().map_or(&[][..], |s| s.nodes());
+        let about = ContactEquilibrium { state: &solution.contact, sliding, motions: &motions };
+        let (mut fields, mut slopes, mut prescribed) = (Vec::new(), Vec::new(), Vec::new());
         for change in changes {
-            let mut found = self.posed(change, &about, &known)?;
-            fields.push(std::mem::take(&mut found.rows));
-            posed.push(found);
+            let found = self.posed(change, &about, &known)?;
+            fields.push(found.rows);
+            slopes.push(found.slope);
+            prescribed.push(found.prescribed);
         }
-        let offsets: Vec<Vec<f64>> = posed.iter().map(|p| p.slope.offsets.clone()).collect();
-        let goals: Vec<Vec<f64>> = posed.iter().map(|p| p.slope.goals.clone()).collect();
-        let frozen =
-            Frozen { rows: about.rows, offsets: &offsets, springs: about.springs, goals: &goals };
+        let frozen = Frozen { state: &solution.contact, slopes: &slopes };
         let scales = vec![0.0; fields.len()];
         let frozen = self.sliding.is_some().then_some(frozen);
         let solved = self.solve_columns(fields, (&scales, Some(accuracy)), frozen, interrupted)?;
-        let filled = posed.iter().zip(&solved);
-        Ok(filled.map(|(p, rows)| self.filled(&p.prescribed, rows)).collect())
+        let filled = prescribed.iter().zip(&solved);
+        Ok(filled.map(|(prescribed, rows)| self.filled(prescribed, rows)).collect())
     }
 
     /// `change` as prescribed displacements, forces on the rows and change of the contact conditions.
@@ -110,13 +96,13 @@ impl StaticSolver {
         };
         for (name, rows) in rates {
             let Some(s) = segments.iter().position(|segment| segment.name == *name) else {
-                return Err(unfit(name, "the scene has no such segment"));
+                return Err(misplanned(name, "the scene has no such segment"));
             };
             if known[s].is_none() {
-                return Err(unfit(name, "a rate needs a segment that the plan moves rigidly"));
+                return Err(misplanned(name, "a rate needs a segment that the plan moves rigidly"));
             }
             if rows.as_flattened().iter().any(|value| !value.is_finite()) {
-                return Err(unfit(name, "its rate is not finite"));
+                return Err(misplanned(name, "its rate is not finite"));
             }
             let rate = Rate::new(rows);
             for &j in &segments[s].joined {
@@ -129,21 +115,4 @@ impl StaticSolver {
         }
         Ok(PosedChange { prescribed: u, rows: field, slope })
     }
-
-    fn check_accuracy(&self, accuracy: f64) -> Result<()> {
-        if accuracy > 0.0 && accuracy < 1.0 {
-            return Ok(());
-        }
-        Err(MtmError::OutOfRange {
-            what: "accuracy of a first-order change".into(),
-            index: 0,
-            value: accuracy,
-            allowed: "above 0 and below 1",
-            kind: ErrorKind::Solver,
-        })
-    }
-}
-
-fn unfit(segment: &str, problem: &str) -> MtmError {
-    MtmError::Plan { segment: segment.to_owned(), problem: problem.into() }
 }

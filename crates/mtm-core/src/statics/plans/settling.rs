@@ -11,14 +11,14 @@ use crate::algebra::krylov::StepAccuracy;
 use crate::algebra::row_sums::in_pool;
 use crate::boundary::Motion;
 use crate::contact::links::Link;
-use crate::contact::{Body, Constraints, ContactStart, ContactState, Response, Sliding};
+use crate::contact::{Body, Constraints, ContactResult, ContactStart, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
 use crate::mechanics::kinematics::Kinematics;
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::{Advance, Iterative, KeptForNext, SolveMemory};
 use crate::statics::linear::row_conditions::RowConditions;
 use crate::statics::options::{Method, StaticOptions};
-use crate::statics::plans::reaction::{Answer, Answers, ContactFactor};
+use crate::statics::plans::reaction::{Answers, ContactFactor};
 use crate::statics::solution::Clock;
 use crate::vector::{between, dot, norm, sub};
 
@@ -170,7 +170,7 @@ impl RowLinks<'_> {
 pub(crate) struct Settled {
     /// mm.
     pub rows: Vec<[f64; 3]>,
-    pub contact: ContactState,
+    pub contact: ContactResult,
     /// Time that contact took, s.
     pub contact_seconds: f64,
 }
@@ -245,16 +245,15 @@ impl RowStep {
 impl Body for Flexible<'_> {
     fn respond(&mut self, c: &Constraints<'_>) -> Result<Response> {
         let Self { answers, tolerance, .. } = self;
-        let Answer { displacements, forces, solved, is_carried } =
-            in_pool(|| answers.respond(c, *tolerance))?;
+        let mut response = in_pool(|| answers.respond(c, *tolerance))?;
+        let (to, forces_to) = (response.displacements.clone(), response.reactions.clone());
         let before = self.last.take().map(|last| (last.to, last.forces_to));
         self.is_known = before.is_some();
-        let (from, forces_from) = before.unwrap_or_else(|| (displacements.clone(), forces.clone()));
-        let step =
-            RowStep { from, to: displacements.clone(), forces_from, forces_to: forces.clone() };
-        let slopes = self.is_known.then(|| step.slopes());
+        let (from, forces_from) = before.unwrap_or_else(|| (to.clone(), forces_to.clone()));
+        let step = RowStep { from, to, forces_from, forces_to };
+        response.slopes = self.is_known.then(|| step.slopes());
         self.last = Some(step);
-        Ok(Response { displacements, reactions: forces, slopes, solved, is_carried })
+        Ok(response)
     }
 
     fn shorten(&mut self, share: f64) {
@@ -350,7 +349,7 @@ impl Body for Projected<'_, '_> {
 }
 
 /// Error left by contact, mm.
-pub(crate) fn left_by(state: &ContactState) -> f64 {
+pub(crate) fn left_by(state: &ContactResult) -> f64 {
     GAP_SAFETY * state.largest_gap().max(state.unbalanced)
 }
 
@@ -361,26 +360,18 @@ pub(crate) fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
 
 /// The error for a method that cannot solve for parts that touch.
 pub(crate) fn touching_needs_pcg(method: Method) -> MtmError {
-    MtmError::NotTogether {
-        what: "method",
-        found: method.name().into(),
-        with: "a boundary with touching pairs",
-        needed: "auto or pcg",
-        kind: ErrorKind::Solver,
-    }
+    not_touching(("method", method.name()), "auto or pcg")
+}
+
+fn not_touching(found: (&'static str, &str), needed: &'static str) -> MtmError {
+    ErrorKind::Solver.not_together(found, "a boundary with touching pairs", needed)
 }
 
 /// The method for a boundary with pairs that may touch: every round changes the matrix, and would need a new
 /// factorisation.
 pub(crate) fn method_for_touching(options: &StaticOptions) -> Result<Method> {
     if options.kinematics != Kinematics::Linear {
-        return Err(MtmError::NotTogether {
-            what: "kinematics",
-            found: options.kinematics.name().into(),
-            with: "a boundary with touching pairs",
-            needed: "linear",
-            kind: ErrorKind::Solver,
-        });
+        return Err(not_touching(("kinematics", options.kinematics.name()), "linear"));
     }
     match options.method {
         Method::Auto | Method::Pcg => Ok(Method::Pcg),

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::boundary::{Boundary, Motion, NodeKind, Plan};
 use crate::contact::pairs::Pairs;
-use crate::contact::{ContactMode, ContactState, Sliding};
+use crate::contact::{ContactMode, ContactResult, Sliding};
 use crate::error::{ErrorKind, MtmError, Result, check_forces};
 use crate::mechanics::kinematics::Kinematics;
 use crate::mechanics::tensors::MassTensors;
@@ -476,7 +476,7 @@ impl StaticSolver {
         &self,
         plan: &Plan,
         interrupted: Interrupt<'_>,
-    ) -> Result<Option<ContactState>> {
+    ) -> Result<Option<ContactResult>> {
         if self.sliding.is_none() {
             return Ok(None);
         }

@@ -1,8 +1,7 @@
 //! What a solution reports of itself: the residual of its forces, and the state of its contact.
 
 use crate::boundary::Motion;
-use crate::contact::ContactState;
-use crate::statics::solution::ContactResult;
+use crate::contact::ContactResult;
 use crate::statics::solver::StaticSolver;
 use crate::vector::{dot, scaled, sub};
 
@@ -15,7 +14,7 @@ impl StaticSolver {
         &self,
         forces: &[[f64; 3]],
         loads: Option<&[[f64; 3]]>,
-        (contact, touching): (Option<&ContactState>, &[[f64; 3]]),
+        (contact, touching): (Option<&ContactResult>, &[[f64; 3]]),
         b: &[[f64; 3]],
     ) -> f64 {
         let mut rest: Vec<[f64; 3]> = self
@@ -53,25 +52,13 @@ impl StaticSolver {
     /// The state of the sliding nodes; empty without any.
     pub(super) fn contact_result(
         &self,
-        state: Option<ContactState>,
+        state: Option<ContactResult>,
         motions: &[&Motion],
     ) -> ContactResult {
-        let (Some(sliding), Some(state)) = (&self.sliding, state) else {
+        let (Some(sliding), Some(mut state)) = (&self.sliding, state) else {
             return ContactResult { converged: true, ..ContactResult::default() };
         };
-        let at_rest = sliding.carried_back(motions, &state);
-        ContactResult {
-            nodes: sliding.nodes().iter().map(|n| n.node).collect(),
-            points: state.points,
-            normals: state.normals,
-            forces: state.forces,
-            gaps: state.gaps,
-            unbalanced: state.unbalanced,
-            at_rest,
-            converged: state.converged,
-            active: state.active,
-            rows: state.rows,
-            springs: state.springs,
-        }
+        state.at_rest = sliding.carried_back(motions, &state);
+        state
     }
 }

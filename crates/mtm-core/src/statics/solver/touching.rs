@@ -12,7 +12,7 @@ use crate::boundary::Motion;
 use crate::contact::links::Link;
 use crate::contact::pairs::{Left, Pairs, Round, Touching};
 use crate::contact::planes::Planes;
-use crate::contact::{ContactStart, ContactState, SlidingNode};
+use crate::contact::{ContactResult, ContactStart, SlidingNode};
 use crate::error::{MtmError, Result};
 use crate::geometry::motion::SurfaceMotion;
 use crate::mesh::TetMesh;
@@ -76,7 +76,7 @@ struct PartialState {
     u: Vec<[f64; 3]>,
     /// Displacements of the unknown rows.
     rows: Vec<[f64; 3]>,
-    contact: Option<ContactState>,
+    contact: Option<ContactResult>,
     touching: Touching,
 }
 
@@ -306,7 +306,7 @@ impl TouchingPlan<'_> {
         &self,
         pose: &PartialState,
         rows: Vec<[f64; 3]>,
-        contact: Option<ContactState>,
+        contact: Option<ContactResult>,
         goal: &StepTarget<'_>,
     ) -> PartialState {
         let u = self.body.reduction.filled(goal.prescribed, &rows);
@@ -333,7 +333,7 @@ impl TouchingPlan<'_> {
         goal: &StepTarget<'_>,
         rough: bool,
         solve: &mut PlanSolve<'_>,
-    ) -> Result<(Vec<[f64; 3]>, Option<ContactState>)> {
+    ) -> Result<(Vec<[f64; 3]>, Option<ContactResult>)> {
         let rows = &pose.rows[..];
         let linked = RowLinks { links: &round.links, share: rough.then_some(ROUGH_SHARE) };
         let before = solve.effort.iterations;

@@ -18,7 +18,7 @@ use along::Along;
 use inner::{ForceAccuracy, Inner, RowForces};
 
 use crate::algebra::cholesky::{Factor, NormalFactor, ProductAccuracy, ROUGH, TailFlexibility};
-use crate::contact::{Constraints, ContactRow, Spring};
+use crate::contact::{Constraints, ContactRow, Response, Spring};
 use crate::error::{MtmError, Result};
 use crate::vector::{add, dot, norm, scaled, sub};
 use krylov::{Krylov, length};
@@ -64,16 +64,7 @@ impl ContactFactor {
         let flexibility = factor.flexibility(sliding, held)?;
         let row = |(node, &normal)| ContactRow { node, normal, point: [0.0; 3] };
         let rows: Vec<ContactRow> = normals.iter().enumerate().map(row).collect();
-        let offsets = vec![0.0; rows.len()];
-        let rows = ConditionRows::new(&Constraints {
-            rows: &rows,
-            offsets: &offsets,
-            springs: &[],
-            about: &[],
-            share: 0.0,
-            spring_share: 0.0,
-            reach: f64::INFINITY,
-        });
+        let rows = ConditionRows::new(&rows, &vec![0.0; rows.len()], &[]);
         let rest = Arc::new(rows.factor(&flexibility)?.inverse());
         Ok(Self { flexibility, rest })
     }
@@ -141,18 +132,6 @@ pub(crate) struct Answers<'a> {
     made: Option<Arc<NormalFactor>>,
 }
 
-/// Response of the sliding nodes to contact conditions.
-pub(crate) struct Answer {
-    /// Displacement of each, mm.
-    pub displacements: Vec<[f64; 3]>,
-    /// Force on each, N.
-    pub forces: Vec<[f64; 3]>,
-    /// Whether they are within the tolerance.
-    pub solved: bool,
-    /// Whether unstable springs would have carried nodes beyond their reach.
-    pub is_carried: bool,
-}
-
 impl<'a> Answers<'a> {
     /// The response of the sliding nodes to conditions `c`, with the relative accuracy that `c` requests;
     /// `tolerance`: of contact, over the size of the scene.
@@ -164,10 +143,10 @@ impl<'a> Answers<'a> {
     ///
     /// # Errors
     /// `NotPositiveDefinite` if the rows are degenerate.
-    pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Answer> {
+    pub fn respond(&mut self, c: &Constraints<'_>, tolerance: f64) -> Result<Response> {
         let unstable: Vec<Spring> =
             c.springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
-        let rows = ConditionRows::new(c);
+        let rows = ConditionRows::new(c.rows, c.offsets, c.springs);
         let mut inner = self.inner(&rows, &unstable);
         let found = self.balanced(c, &rows, &unstable, &mut inner, tolerance);
         if inner.is_made {
@@ -175,8 +154,8 @@ impl<'a> Answers<'a> {
         }
         self.memory = inner.into_memory();
         let (solved, is_carried) = found?;
-        let (displacements, forces) = (self.displacements(), self.pushed.clone());
-        Ok(Answer { displacements, forces, solved, is_carried })
+        let (displacements, reactions) = (self.displacements(), self.pushed.clone());
+        Ok(Response { displacements, reactions, slopes: None, solved, is_carried })
     }
 
     /// Brings the nodes into balance; whether their forces are exact, and whether springs had to be softened.

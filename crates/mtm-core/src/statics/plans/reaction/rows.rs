@@ -1,7 +1,7 @@
 //! Conditions of contact as rows of the normal system.
 
 use crate::algebra::cholesky::{DenseSymmetric, NormalFactor, RowKey, TailFlexibility};
-use crate::contact::{Constraints, ContactRow};
+use crate::contact::{ContactRow, Spring};
 use crate::error::{MtmError, Result};
 use crate::vector::{add, dot, scaled};
 
@@ -17,10 +17,11 @@ pub(crate) struct ConditionRows {
 }
 
 impl ConditionRows {
-    pub fn new(c: &Constraints<'_>) -> Self {
-        let (mut rows, mut goals) = (c.rows.to_vec(), c.offsets.to_vec());
+    /// Of contact `rows` with their `offsets`, and of the `springs` that hold nodes back.
+    pub fn new(rows: &[ContactRow], offsets: &[f64], springs: &[Spring]) -> Self {
+        let (mut rows, mut goals) = (rows.to_vec(), offsets.to_vec());
         let mut softness = vec![0.0; rows.len()];
-        for spring in c.springs.iter().filter(|s| s.stiffness > 0.0) {
+        for spring in springs.iter().filter(|s| s.stiffness > 0.0) {
             rows.push(ContactRow { node: spring.node, normal: spring.axis, point: [0.0; 3] });
             goals.push(spring.goal);
             softness.push(1.0 / spring.stiffness);
