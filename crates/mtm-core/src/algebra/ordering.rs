@@ -145,12 +145,9 @@ pub fn nested_dissection(graph: &NodeGraph) -> Result<Option<Vec<u32>>> {
     };
     if status != metis::OK {
         // The graph is well formed, so the only possible failure is lack of memory.
-        return Err(MtmError::OutOfMemory {
-            what: "nested dissection",
-            needed_mb: (64 * neighbours.len()) >> 20,
-            limit_mb: None,
-            advice: "use method=\"pcg\", which needs no elimination order",
-        });
+        let advice = "use method=\"pcg\", which needs no elimination order";
+        let bytes = 64 * neighbours.len();
+        return Err(MtmError::out_of_memory("nested dissection", bytes, None, advice));
     }
     Ok(Some(order.iter().map(|&j| j as u32).collect()))
 }

@@ -18,13 +18,15 @@ const LEAST_PROGRESS: f64 = 1e-9;
 /// Over-relaxation ω, 0 < ω < 2; 1 is the plain iteration.
 const FACTOR: f64 = 1.6;
 
+/// Remedy reported if sweeps do not converge.
+pub const NO_SWEEPS: &str =
+    "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison";
+
 /// Outcome of the iteration.
 #[derive(Debug, Clone)]
 pub struct RelaxationOutcome {
     /// The solution, mm.
     pub solution: Vec<[f64; 3]>,
-    /// Sweeps done.
-    pub sweeps: usize,
     /// Largest step of each sweep, mm.
     pub steps: Vec<f64>,
 }
@@ -60,10 +62,8 @@ pub fn relax(
         }
         steps.push(step);
         if !step.is_finite() {
-            return Err(MtmError::NotPositiveDefinite {
-                node: 0,
-                detail: "the relaxation diverged: the stiffness is indefinite".into(),
-            });
+            let why = "the relaxation diverged: the stiffness is indefinite";
+            return Err(MtmError::not_definite(0, why));
         }
         if step == 0.0 {
             bound = 0.0;
@@ -75,24 +75,21 @@ pub fn relax(
             bound = FACTOR * step * contraction / (1.0 - contraction);
         }
         if bound <= tolerance {
-            return Ok(RelaxationOutcome { solution: x, sweeps: sweep, steps });
+            return Ok(RelaxationOutcome { solution: x, steps });
         }
     }
     Err(MtmError::NotConverged {
         method: "relaxation",
         iterations: max_sweeps,
         shortfall: Shortfall::new("the estimated error of a node", bound, tolerance, " mm"),
-        advice: "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison",
+        advice: NO_SWEEPS,
     })
 }
 
 /// K_jj⁻¹.
 fn inverse_block(a: &BlockMatrix, j: usize) -> Result<Block> {
     let block = Matrix3::from_row_slice(a.diagonal_block(j));
-    let factor = block.cholesky().ok_or_else(|| MtmError::NotPositiveDefinite {
-        node: j,
-        detail: "its vertex tensor is not positive definite".into(),
-    })?;
-    let m = factor.inverse();
+    let why = "its vertex tensor is not positive definite";
+    let m = block.cholesky().ok_or_else(|| MtmError::not_definite(j, why))?.inverse();
     Ok(std::array::from_fn(|i| m[(i / 3, i % 3)]))
 }

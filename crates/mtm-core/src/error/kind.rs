@@ -80,6 +80,28 @@ impl MtmError {
     }
 }
 
+/// Errors that need no family.
+impl MtmError {
+    pub(crate) fn not_definite(node: usize, detail: impl Into<String>) -> Self {
+        Self::NotPositiveDefinite { node, detail: detail.into() }
+    }
+
+    pub(crate) fn not_determined(what: &'static str, reason: impl Into<String>) -> Self {
+        Self::NotDetermined { what, reason: reason.into() }
+    }
+
+    /// `bytes` needed, and those that the caller allows, if it is not the system that refuses.
+    pub(crate) fn out_of_memory(
+        what: &'static str,
+        bytes: usize,
+        limit: Option<usize>,
+        advice: &'static str,
+    ) -> Self {
+        let limit_mb = limit.map(|limit| limit >> 20);
+        Self::OutOfMemory { what, needed_mb: bytes >> 20, limit_mb, advice }
+    }
+}
+
 /// Errors of a family.
 impl ErrorKind {
     pub(crate) fn out_of_range(

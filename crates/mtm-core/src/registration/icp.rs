@@ -243,14 +243,12 @@ impl ClosestPairs {
         trim(&mut matches, options.trim);
         let kept = matches.iter().filter(|pair| pair.counts).count();
         if kept < LEAST_PLANE_PAIRS.min(moving.len()) {
-            return Err(MtmError::NotDetermined {
-                what: "the motion of the moving points",
-                reason: format!(
-                    "{kept} of {} pairs are left by trimming, distance, angle and border; allow more of \
-                     them, or start closer (initial)",
-                    moving.len()
-                ),
-            });
+            let all = moving.len();
+            let why = format!(
+                "{kept} of {all} pairs are left by trimming, distance, angle and border; allow more of them, \
+                 or start closer (initial)"
+            );
+            return Err(MtmError::not_determined("the motion of the moving points", why));
         }
         let squares: f64 = counting(&matches).map(|pair| pair.distance * pair.distance).sum();
         Ok(Self { mean_square: squares / kept as f64, kept, matches })
@@ -306,14 +304,12 @@ fn plane_step(pose: &Pose, pairs: &ClosestPairs, radius: f64) -> Result<Pose> {
     let largest = eigen.eigenvalues.max();
     let free = eigen.eigenvalues.iter().filter(|&&v| v <= FREE_MOTION * largest).count();
     if free > 0 || pairs.kept < LEAST_PLANE_PAIRS {
-        return Err(MtmError::NotDetermined {
-            what: "the motion of the moving points",
-            reason: format!(
-                "{free} of 6 ways to move them leave their distances as they are, as on a plane, a ball \
-                 or a cylinder ({} pairs); take more of the surface, or method \"point\"",
-                pairs.kept
-            ),
-        });
+        let kept = pairs.kept;
+        let why = format!(
+            "{free} of 6 ways to move them leave their distances as they are, as on a plane, a ball or a \
+             cylinder ({kept} pairs); take more of the surface, or method \"point\""
+        );
+        return Err(MtmError::not_determined("the motion of the moving points", why));
     }
     let parts = eigen.eigenvectors.transpose() * b;
     let step = -(eigen.eigenvectors * parts.component_div(&eigen.eigenvalues));

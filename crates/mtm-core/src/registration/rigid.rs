@@ -112,11 +112,8 @@ pub(crate) fn fit_pairs(
     }
     let spread = (moving_squares * fixed_squares).sqrt();
     if spread == 0.0 {
-        return Err(MtmError::NotDetermined {
-            what: "the rotation between the two sets",
-            reason: "all points of one set coincide; check whether all pairs share a point"
-                .to_owned(),
-        });
+        let why = "all points of one set coincide; check whether all pairs share a point";
+        return Err(MtmError::not_determined("the rotation between the two sets", why));
     }
     let rotation = best_rotation(&(m / spread))?;
     // Σ y·R x = tr(R M), since (R x)·y = tr(R x yᵀ).
@@ -146,13 +143,11 @@ fn best_rotation(m: &Matrix3<f64>) -> Result<UnitQuaternion<f64>> {
     order.sort_by(|&i, &j| eigen.eigenvalues[j].total_cmp(&eigen.eigenvalues[i]));
     let gap = eigen.eigenvalues[order[0]] - eigen.eigenvalues[order[1]];
     if gap <= UNDETERMINED_GAP {
-        return Err(MtmError::NotDetermined {
-            what: "the rotation between the two sets",
-            reason: format!(
-                "the best one is better than the next by {gap:.1e} of the spread of the points; is one \
-                 set a mirror image of the other, or do all its points lie in a line?"
-            ),
-        });
+        let why = format!(
+            "the best one is better than the next by {gap:.1e} of the spread of the points; is one set a \
+             mirror image of the other, or do all its points lie in a line?"
+        );
+        return Err(MtmError::not_determined("the rotation between the two sets", why));
     }
     let best = eigen.eigenvectors.column(order[0]);
     // Of q and −q, the one with the smaller rotation angle: bitwise the same whatever the sign of the

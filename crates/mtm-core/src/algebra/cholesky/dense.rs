@@ -49,10 +49,8 @@ impl TailFlexibility {
     }
 
     fn with(mut self, liftable: Option<Arc<Liftable>>, held: &[usize]) -> Result<Self> {
-        let loose = |place| MtmError::NotPositiveDefinite {
-            node: self.row(self.n_sliding() + place),
-            detail: "tissue that is lifted off the bone is not held by the tissue around it".into(),
-        };
+        let why = "tissue that is lifted off the bone is not held by the tissue around it";
+        let loose = |place| MtmError::not_definite(self.row(self.n_sliding() + place), why);
         self.lifted = liftable.map(|all| Lifted::new(all, held).map_err(loose)).transpose()?;
         Ok(self)
     }

@@ -113,30 +113,11 @@ impl Symbolic {
             .map_err(|_| out_of_memory("the Cholesky factor", bytes))?;
         let mut values = vec![0.0; self.structure.len_val()];
         let order = (&self.order[..], &self.position[..]);
-        numeric::factor(&self.structure, &self.tree, matrix, order, &mut values).map_err(
-            |index| MtmError::NotPositiveDefinite {
-                node: self.order[index / 3] as usize,
-                detail:
-                    "a pivot of the factorisation is not positive; a part of the body may be a \
-                         mechanism, or the material contrast too large for f64"
-                        .into(),
-            },
-        )?;
+        let why = "a pivot of the factorisation is not positive; a part of the body may be a mechanism, or \
+                   the material contrast too large for f64";
+        numeric::factor(&self.structure, &self.tree, matrix, order, &mut values)
+            .map_err(|index| MtmError::not_definite(self.order[index / 3] as usize, why))?;
         Factor { symbolic: self.clone(), values, trial_error: 0.0 }.tried(matrix)
-    }
-
-    /// `b` in elimination order.
-    fn permuted(&self, b: &[[f64; 3]]) -> Vec<f64> {
-        self.order.iter().flat_map(|&j| b[j as usize]).collect()
-    }
-
-    /// `x` back in the order of the system.
-    fn unpermuted(&self, x: &[f64]) -> Vec<[f64; 3]> {
-        let mut out = vec![[0.0; 3]; self.order.len()];
-        for (&j, v) in self.order.iter().zip(x.chunks_exact(3)) {
-            out[j as usize] = [v[0], v[1], v[2]];
-        }
-        out
     }
 
     /// First unknown of the tail.
@@ -159,12 +140,16 @@ impl Factor {
 
     /// `b` in elimination order.
     pub fn permuted(&self, b: &[[f64; 3]]) -> Vec<f64> {
-        self.symbolic.permuted(b)
+        self.symbolic.order.iter().flat_map(|&j| b[j as usize]).collect()
     }
 
     /// `x` back in the order of the system.
     pub fn unpermuted(&self, x: &[f64]) -> Vec<[f64; 3]> {
-        self.symbolic.unpermuted(x)
+        let mut out = vec![[0.0; 3]; self.symbolic.order.len()];
+        for (&j, v) in self.symbolic.order.iter().zip(x.chunks_exact(3)) {
+            out[j as usize] = [v[0], v[1], v[2]];
+        }
+        out
     }
 
     /// The factor, after it has recovered a known solution.
@@ -186,14 +171,12 @@ impl Factor {
             return Ok(self);
         }
         let (worst, at) = self.smallest_pivot(matrix);
-        Err(MtmError::NotPositiveDefinite {
-            node: at,
-            detail: format!(
-                "the smallest pivot keeps {worst:.1e} of its diagonal and a known solution comes back \
-                 with relative error {trial_error:.1e}; a part of the body is almost a mechanism, or \
-                 the material contrast is too large for f64"
-            ),
-        })
+        let why = format!(
+            "the smallest pivot keeps {worst:.1e} of its diagonal and a known solution comes back \
+             with relative error {trial_error:.1e}; a part of the body is almost a mechanism, or \
+             the material contrast is too large for f64"
+        );
+        Err(MtmError::not_definite(at, why))
     }
 
     /// The smallest pivot relative to its diagonal entry, and its row.
@@ -217,10 +200,10 @@ impl Factor {
 
     /// A⁻¹ b.
     pub fn solve(&self, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
-        let mut x = self.symbolic.permuted(b);
+        let mut x = self.permuted(b);
         self.forward(&mut x);
         self.backward(&mut x);
-        self.symbolic.unpermuted(&x)
+        self.unpermuted(&x)
     }
 
     /// A⁻¹ B for several right-hand sides, each given as rows of three, in place.
@@ -228,7 +211,7 @@ impl Factor {
         if self.symbolic.order.is_empty() {
             return;
         }
-        let mut x: Vec<f64> = columns.iter().flat_map(|b| self.symbolic.permuted(b)).collect();
+        let mut x: Vec<f64> = columns.iter().flat_map(|b| self.permuted(b)).collect();
         let (n, k) = (3 * self.symbolic.order.len(), columns.len());
         let par = parallelism(n);
         let mut memory =
@@ -241,7 +224,7 @@ impl Factor {
                 MemStack::new(&mut memory),
             );
         for (column, x) in columns.iter_mut().zip(x.chunks_exact(3 * self.symbolic.order.len())) {
-            *column = self.symbolic.unpermuted(x);
+            *column = self.unpermuted(x);
         }
     }
 
@@ -262,7 +245,7 @@ impl Factor {
     /// `b` in elimination order, after all rows but those of the tail are eliminated: what is left on these are the
     /// forces to which `b` reduces.
     pub fn swept(&self, b: &[[f64; 3]]) -> Vec<f64> {
-        let mut x = self.symbolic.permuted(b);
+        let mut x = self.permuted(b);
         self.sweep().forward_to(self.symbolic.first_of_tail(), &mut x);
         x
     }
@@ -297,7 +280,7 @@ impl Factor {
         let first = self.symbolic.first_of_tail();
         swept[first..].copy_from_slice(tail);
         self.sweep().backward_from(first, &mut swept);
-        self.symbolic.unpermuted(&swept)
+        self.unpermuted(&swept)
     }
 
     /// Flexibility of `rows`, mm/N, where the rows of the tail are free except for those `held`, by their places

@@ -22,10 +22,5 @@ pub fn buffer(need: StackReq) -> Result<MemBuffer> {
 
 /// The error for a system that cannot provide `bytes` for `what`.
 pub fn out_of_memory(what: &'static str, bytes: usize) -> MtmError {
-    MtmError::OutOfMemory {
-        what,
-        needed_mb: bytes >> 20,
-        limit_mb: None,
-        advice: "use method=\"pcg\", which keeps no factor",
-    }
+    MtmError::out_of_memory(what, bytes, None, "use method=\"pcg\", which keeps no factor")
 }

@@ -109,7 +109,6 @@ pub(crate) struct Indefinite {
     pub direction: Vec<[f64; 3]>,
     /// The error to report if an indefinite matrix was not expected.
     pub error: MtmError,
-    pub iterations: usize,
     pub residual_history: Vec<f64>,
 }
 
@@ -160,8 +159,7 @@ pub(crate) fn pcg_near(
     for (what, rows) in [("right-hand side", b), ("start vector", x0)] {
         check_rows(what, rows, a.n_rows())?;
     }
-    let b_norm = dot(b, b).sqrt();
-    if b_norm == 0.0 {
+    if dot(b, b) == 0.0 {
         return Ok(Reached::Solution(PcgOutcome::at_rest(a.n_rows())));
     }
 
@@ -174,52 +172,36 @@ pub(crate) fn pcg_near(
     };
     let mut decrease = Decrease::default();
     let mut rule = StoppingRule::new(options, state.rz);
-    let mut iterations = 0;
-    let mut history = Vec::new();
     loop {
         if interrupted() {
             return Err(MtmError::Interrupted);
         }
-        let exact = state.rz == 0.0 && state.largest_z == 0.0;
-        if !exact {
+        if state.rz != 0.0 || state.largest_z != 0.0 {
             match in_pool(|| state.step()) {
                 Ok(taken) => decrease.push(taken),
                 Err(error) if state.is_indefinite() => {
-                    return Ok(Reached::Indefinite(Box::new(Indefinite {
-                        solution: state.x,
-                        direction: state.p,
-                        error,
-                        iterations,
-                        residual_history: history,
-                    })));
+                    return Ok(Reached::Indefinite(Box::new(state.indefinite(error))));
                 }
                 Err(error) => return Err(error),
             }
-            iterations += 1;
-            history.push(state.r_norm / b_norm);
         }
-
         let is_enough = match enough {
             Some(StepAccuracy::Error(_)) => goal > options.tolerance && state.error_mm() <= goal,
             Some(StepAccuracy::Energy(share)) => decrease.is_within(share),
             None => false,
         };
         if is_enough {
-            return Ok(Reached::Step(state.outcome(1.0, b_norm, iterations, history)));
+            return Ok(Reached::Step(state.outcome(1.0)));
         }
+        let iterations = state.iterations();
         let excess = || state.excess(options);
         let due = rule.due(iterations, state.rz, state.spectrum, state.error_mm(), excess);
         let Some(due) = due else { continue };
         // At the round-off floor the recurrence drifts from b − A x: only the true residual is reliable.
         in_pool(|| state.replace_residual());
         match rule.verdict(due, iterations, state.error_mm(), state.excess(options)) {
-            Verdict::Converged => {
-                let doubt = due.doubt;
-                return Ok(Reached::Solution(state.outcome(doubt, b_norm, iterations, history)));
-            }
-            Verdict::GiveUp => {
-                return Err(state.not_converged(due, options, iterations));
-            }
+            Verdict::Converged => return Ok(Reached::Solution(state.outcome(due.doubt))),
+            Verdict::GiveUp => return Err(state.not_converged(due, options)),
             Verdict::Restart => state.restart(),
         }
     }

@@ -6,6 +6,7 @@ use crate::algebra::error_bound::{Due, PcgOptions, Spectrum};
 use crate::algebra::row_sums::{ROWS_PER_SUM, advance, dot, dot_and_largest};
 use crate::error::{MtmError, Result, Shortfall};
 
+use super::Indefinite;
 use super::operator::{Operator, Preconditioner};
 
 /// The solution of `pcg` and its accuracy.
@@ -43,6 +44,9 @@ pub(super) struct State<'a> {
     pub(super) r_norm: f64,
     pub(super) largest_z: f64,
     pub(super) spectrum: &'a mut Spectrum,
+    b_norm: f64,
+    /// Relative residual after each iteration, from the recurrence.
+    pub(super) history: Vec<f64>,
 }
 
 impl<'a> State<'a> {
@@ -67,7 +71,14 @@ impl<'a> State<'a> {
             r_norm: 0.0,
             largest_z: 0.0,
             spectrum,
+            b_norm: dot(b, b).sqrt(),
+            history: Vec::new(),
         }
+    }
+
+    /// Iterations so far.
+    pub(super) fn iterations(&self) -> usize {
+        self.history.len()
     }
 
     /// Recomputes `r = b − A x` and `z = M⁻¹ r`.
@@ -106,22 +117,22 @@ impl<'a> State<'a> {
     }
 
     /// `doubt`: see [`Spectrum::doubt`].
-    pub(super) fn outcome(
-        self,
-        doubt: f64,
-        b_norm: f64,
-        iterations: usize,
-        residual_history: Vec<f64>,
-    ) -> PcgOutcome {
+    pub(super) fn outcome(self, doubt: f64) -> PcgOutcome {
         PcgOutcome {
             error_estimate_mm: doubt * self.error_mm(),
             energy_error: doubt * self.energy_error(),
-            residual: self.r_norm / b_norm,
+            residual: self.r_norm / self.b_norm,
             ritz: [self.spectrum.smallest, self.spectrum.largest],
             solution: self.x,
-            iterations,
-            residual_history,
+            iterations: self.history.len(),
+            residual_history: self.history,
         }
+    }
+
+    /// The end at a direction that does not count as constrained.
+    pub(super) fn indefinite(self, error: MtmError) -> Indefinite {
+        let Self { x: solution, p: direction, history: residual_history, .. } = self;
+        Indefinite { solution, direction, error, residual_history }
     }
 
     /// Discards the search directions: the next step follows z alone.
@@ -148,6 +159,7 @@ impl<'a> State<'a> {
         self.rz = rz;
         self.largest_z = largest_z;
         self.spectrum.push(alpha, beta);
+        self.history.push(self.r_norm / self.b_norm);
         let z = &self.z;
         self.p.par_chunks_mut(ROWS_PER_SUM).zip(z.par_chunks(ROWS_PER_SUM)).for_each(|(p, z)| {
             for (p, z) in p.iter_mut().zip(z) {
@@ -171,22 +183,15 @@ impl<'a> State<'a> {
         let node = (0..self.r.len())
             .find(|&j| !self.q[j].iter().chain(&self.z[j]).all(|v| v.is_finite()))
             .unwrap_or(0);
-        MtmError::NotPositiveDefinite {
-            node,
-            detail: format!(
-                "conjugate gradients met pᵀAp = {pq:.3e} and rᵀM⁻¹r = {:.3e}; check whether a part is not constrained",
-                self.rz
-            ),
-        }
+        let rz = self.rz;
+        let why = format!(
+            "conjugate gradients met pᵀAp = {pq:.3e} and rᵀM⁻¹r = {rz:.3e}; check whether a part is not constrained"
+        );
+        MtmError::not_definite(node, why)
     }
 
     /// What kept the iteration from converging: of the three conditions, the one furthest from being met.
-    pub(super) fn not_converged(
-        &self,
-        due: Due,
-        options: &PcgOptions,
-        iterations: usize,
-    ) -> MtmError {
+    pub(super) fn not_converged(&self, due: Due, options: &PcgOptions) -> MtmError {
         let (error, energy) = (due.doubt * self.error_mm(), due.doubt * self.energy_error());
         let by_energy = energy / options.energy_tolerance > error / options.tolerance;
         let shortfall = if by_energy {
@@ -204,7 +209,7 @@ impl<'a> State<'a> {
         } else {
             "rounding prevents a smaller error: use method=\"cholesky\", or allow a larger tolerance"
         };
-        MtmError::NotConverged { method: "pcg", iterations, shortfall, advice }
+        MtmError::NotConverged { method: "pcg", iterations: self.iterations(), shortfall, advice }
     }
 
     /// See [`Spectrum::error_mm`].

@@ -52,7 +52,6 @@ pub(crate) fn trial(
     state.restart();
     let (mut best, mut best_at) = (1.0_f64, 0);
     let (mut looked, mut looked_at, mut restarted) = (1.0_f64, 0_usize, f64::INFINITY);
-    let mut iterations = 0;
     for iteration in 1..=max_iterations {
         if interrupted() {
             return Err(MtmError::Interrupted);
@@ -61,7 +60,6 @@ pub(crate) fn trial(
             break;
         }
         in_pool(|| state.step())?;
-        iterations = iteration;
         let error = farthest(&state.x, &known) / size;
         if error < best {
             (best, best_at) = (error, iteration);
@@ -90,6 +88,7 @@ pub(crate) fn trial(
             state.restart();
         }
     }
+    let iterations = state.iterations();
     Ok(Trial { seen, error: best, iterations })
 }
 

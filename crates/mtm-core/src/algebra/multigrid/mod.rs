@@ -92,10 +92,8 @@ impl Multigrid {
         let modes = rigid_modes(nodes, normals);
         let scaling = Scaling::new(a);
         if let Some(node) = scaling.not_positive {
-            return Err(MtmError::NotPositiveDefinite {
-                node,
-                detail: format!("its diagonal block is {:?}", a.diagonal_block(node)),
-            });
+            let why = format!("its diagonal block is {:?}", a.diagonal_block(node));
+            return Err(MtmError::not_definite(node, why));
         }
         let levels = match options.precision {
             CyclePrecision::Double => Levels::Double(Hierarchy::new(a, &scaling, modes, options)),

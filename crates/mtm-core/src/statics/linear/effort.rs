@@ -17,9 +17,9 @@ pub(crate) struct Effort {
 }
 
 impl Effort {
-    /// Adds the iterations of a solve, with the residual measure of each.
-    pub fn add(&mut self, iterations: usize, history: Vec<f64>) {
-        self.iterations += iterations;
+    /// Adds the iterations of a solve, by the residual measure of each.
+    pub fn add(&mut self, history: Vec<f64>) {
+        self.iterations += history.len();
         self.history.extend(history);
     }
 }

@@ -13,7 +13,7 @@ use crate::algebra::krylov::{
     Trial, pcg_near,
 };
 use crate::algebra::multigrid::{CyclePrecision, Multigrid, MultigridOptions};
-use crate::algebra::relaxation::relax;
+use crate::algebra::relaxation::{NO_SWEEPS, relax};
 use crate::contact::links::Link;
 use crate::error::{MtmError, Result, Shortfall};
 use crate::mechanics::tissue::Tissue;
@@ -175,7 +175,7 @@ impl Iterative {
         let confirmed = self.confirmed((&self.matrix, &begun), &self.trial, solve.interrupted);
         let found = self.solution(&confirmed, b, tolerance)?;
         solve.effort.error_estimate = found.error_estimate_mm;
-        solve.effort.add(found.iterations, found.residual_history);
+        solve.effort.add(found.residual_history);
         self.check_worth(&found.solution, solve)?;
         Ok(found.solution)
     }
@@ -299,14 +299,14 @@ impl Iterative {
                         b[*row] = sub(b[*row], scaled(s.axis, s.stiffness * s.goal));
                     }
                     left_out.extend(out);
-                    solve.effort.add(met.iterations, met.residual_history);
+                    solve.effort.add(met.residual_history);
                     start = met.solution;
                     unheld.push(met.direction);
                 }
             }
         };
         solve.effort.error_estimate = found.error_estimate_mm;
-        solve.effort.add(found.iterations, found.residual_history);
+        solve.effort.add(found.residual_history);
         let mut rows = found.solution;
         let mut is_carried = false;
         if !unheld.is_empty() {
@@ -352,7 +352,7 @@ impl Iterative {
             product.project(&mut forces);
             let pressed = Pressed { a: &product, preconditioner: &*multigrid, links };
             let found = pressed.solve(rows, forces, (share, MOST_PRESSED));
-            solve.effort.add(found.history.len(), found.history);
+            solve.effort.add(found.history);
             rows = found.x;
             if !found.is_indefinite || springs.iter().all(|(_, s)| s.stiffness >= 0.0) {
                 return Ok(Advance { rows, solved: true, is_carried: false });
@@ -385,8 +385,8 @@ impl Iterative {
         loop {
             let found = relax(matrix, b, &x, (goal, most - sweeps), solve.interrupted)
                 .map_err(|e| gave_up(e, most))?;
-            (x, sweeps) = (found.solution, sweeps + found.sweeps);
-            solve.effort.add(found.sweeps, found.steps);
+            (x, sweeps) = (found.solution, sweeps + found.steps.len());
+            solve.effort.add(found.steps);
             let rest: Vec<[f64; 3]> =
                 b.iter().zip(matrix.multiply(&x)).map(|(&b, f)| sub(b, f)).collect();
             let options = PcgOptions {
@@ -485,10 +485,6 @@ impl Extremes {
         Self { lame_ratio: tissue.largest_lame_ratio(), contrast: tissue.contrast() }
     }
 }
-
-/// Remedy reported if sweeps do not converge.
-const NO_SWEEPS: &str =
-    "use method=\"cholesky\" or \"pcg\"; node-wise relaxation is kept for comparison";
 
 /// The error for sweeps that ended before the error was within the tolerance.
 fn no_rest(sweeps: usize, error: f64, tolerance: f64) -> MtmError {

@@ -148,12 +148,8 @@ impl System {
                 return Ok((with(Kept::Factor { factor, contact }), method));
             }
             if options.method.has_factor() {
-                return Err(MtmError::OutOfMemory {
-                    what: "the Cholesky factor",
-                    needed_mb: needed >> 20,
-                    limit_mb: options.memory_limit.map(|bytes| bytes >> 20),
-                    advice: "use method=\"pcg\" or \"auto\"",
-                });
+                let (what, advice) = ("the Cholesky factor", "use method=\"pcg\" or \"auto\"");
+                return Err(MtmError::out_of_memory(what, needed, options.memory_limit, advice));
             }
             method = Method::Pcg;
         }

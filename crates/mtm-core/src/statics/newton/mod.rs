@@ -160,12 +160,9 @@ impl Equilibrium {
             if let Some(limit) = options.memory_limit
                 && symbolic.factor_bytes() > limit
             {
-                return Err(MtmError::OutOfMemory {
-                    what: "the Cholesky factor",
-                    needed_mb: symbolic.factor_bytes() >> 20,
-                    limit_mb: Some(limit >> 20),
-                    advice: "use method=\"pcg\"",
-                });
+                let (needed, advice) = (symbolic.factor_bytes(), "use method=\"pcg\"");
+                let what = "the Cholesky factor";
+                return Err(MtmError::out_of_memory(what, needed, Some(limit), advice));
             }
             TangentSolver::Cholesky(Arc::new(symbolic))
         } else {

@@ -537,10 +537,9 @@ fn own_stiffness(matrix: &BlockMatrix, j: usize) -> f64 {
 /// Replaces the row of the reduced system in an error by its node.
 fn by_node(error: MtmError, unknowns: &[u32]) -> MtmError {
     match error {
-        MtmError::NotPositiveDefinite { node, detail } => MtmError::NotPositiveDefinite {
-            node: unknowns.get(node).map_or(node, |&j| j as usize),
-            detail,
-        },
+        MtmError::NotPositiveDefinite { node, detail } => {
+            MtmError::not_definite(unknowns.get(node).map_or(node, |&j| j as usize), detail)
+        }
         other => other,
     }
 }

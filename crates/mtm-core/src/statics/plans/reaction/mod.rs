@@ -346,8 +346,6 @@ fn by_node(springs: &[Spring], moved: &[f64]) -> Vec<[f64; 3]> {
 
 /// The error for contact forces that drive nodes by more than the body can resist.
 pub(crate) fn unheld() -> MtmError {
-    MtmError::NotPositiveDefinite {
-        node: 0,
-        detail: "contact forces push sliding nodes further than the tissue restrains".into(),
-    }
+    let why = "contact forces push sliding nodes further than the tissue restrains";
+    MtmError::not_definite(0, why)
 }

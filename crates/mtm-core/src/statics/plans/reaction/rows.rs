@@ -84,8 +84,5 @@ pub(super) fn pushes(n: usize, rows: &[ContactRow], forces: &[f64]) -> Vec<[f64;
 
 /// The error for a flexibility without a positive pivot at a row of the system.
 pub(crate) fn singular(row: u32) -> MtmError {
-    MtmError::NotPositiveDefinite {
-        node: row as usize,
-        detail: "the flexibility of the sliding nodes is singular".into(),
-    }
+    MtmError::not_definite(row as usize, "the flexibility of the sliding nodes is singular")
 }
