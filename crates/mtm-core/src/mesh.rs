@@ -66,12 +66,8 @@ impl TetMesh {
     /// Empty arrays, values that are not finite or beyond 1e6 mm, node indices out of range, tets that repeat a node,
     /// are inverted or degenerate, two tets on the same nodes, nodes that no tet uses.
     pub fn new(nodes: Vec<[f64; 3]>, tets: Vec<[u32; 4]>) -> Result<Self> {
-        if nodes.is_empty() {
-            return Err(MtmError::Empty { what: "nodes", kind: ErrorKind::Mesh });
-        }
-        if tets.is_empty() {
-            return Err(MtmError::Empty { what: "tets", kind: ErrorKind::Mesh });
-        }
+        ErrorKind::Mesh.require_entries("nodes", nodes.len())?;
+        ErrorKind::Mesh.require_entries("tets", tets.len())?;
         check_coordinates("nodes", &nodes, ErrorKind::Mesh)?;
         for (row, tet) in tets.iter().enumerate() {
             if let Some(&node) = tet.iter().find(|&&v| v as usize >= nodes.len()) {
@@ -266,24 +262,15 @@ fn check_volumes(nodes: &[[f64; 3]], tets: &[[u32; 4]], volumes: &[f64]) -> Resu
     });
     let Some((tet, edge, limit)) = worst else { return Ok(()) };
     if edge < SHORTEST_EDGE {
-        return Err(ErrorKind::Mesh.out_of_range(
-            "longest edge of tets",
-            tet,
-            edge,
-            "1e-9 mm or more; check the units",
-        ));
+        let allowed = "1e-9 mm or more; check the units";
+        return Err(ErrorKind::Mesh.out_of_range("longest edge of tets", tet, edge, allowed));
     }
     if volumes[tet] < -limit {
         let count = volumes.iter().filter(|&&v| v < 0.0).count();
         return Err(MtmError::InvertedTet { tet, volume: volumes[tet], nodes: tets[tet], count });
     }
-    Err(MtmError::DegenerateTet {
-        tet,
-        volume: volumes[tet],
-        edge,
-        limit: DEGENERATE_RELATIVE_VOLUME,
-        nodes: tets[tet],
-    })
+    let (volume, limit, nodes) = (volumes[tet], DEGENERATE_RELATIVE_VOLUME, tets[tet]);
+    Err(MtmError::DegenerateTet { tet, volume, edge, limit, nodes })
 }
 
 fn check_duplicates(tets: &[[u32; 4]], incident: &Incidence) -> Result<()> {

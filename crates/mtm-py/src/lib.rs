@@ -20,7 +20,7 @@ static MEMORY: mtm_core::HugePages = mtm_core::HugePages;
 /// The compiled core of cmfsim.
 #[pyo3::pymodule]
 mod _core {
-    use mtm_core::{Kinematics, Method};
+    use mtm_core::{Element, FibreLaw, Kinematics, Method, Preset};
     use pyo3::prelude::*;
     use pyo3::types::PyTuple;
 
@@ -52,11 +52,11 @@ mod _core {
         crate::errors::register(module)?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))?;
         module.add("METHODS", PyTuple::new(module.py(), Method::ALL.map(Method::name))?)?;
-        module.add("ELEMENTS", ("p1", "anp", "p2"))?;
+        module.add("ELEMENTS", PyTuple::new(module.py(), Element::ALL.map(Element::name))?)?;
         let kinematics: Vec<&str> = Kinematics::all().map(Kinematics::name).collect();
         module.add("KINEMATICS", PyTuple::new(module.py(), kinematics)?)?;
-        module.add("PRESETS", ("passive", "kim2010", "kim2010-swapped"))?;
-        module.add("LAWS", ("spencer", "picinbono"))?;
+        module.add("PRESETS", PyTuple::new(module.py(), Preset::ALL.map(|preset| preset.0))?)?;
+        module.add("LAWS", PyTuple::new(module.py(), FibreLaw::ALL.map(|law| law.0))?)?;
         module.add("MOST_BOXES", mtm_core::MOST_BOXES)
     }
 }

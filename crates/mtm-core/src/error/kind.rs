@@ -162,8 +162,23 @@ impl ErrorKind {
         MtmError::IndexOutOfRange { what: what.into(), row, item, index, count, kind: self }
     }
 
-    pub(crate) fn unknown(self, what: &'static str, name: &str, known: &'static str) -> MtmError {
-        MtmError::UnknownName { what, found: name.to_owned(), known, kind: self }
+    /// What is called `name` among the `known`.
+    pub(crate) fn named<T>(
+        self,
+        what: &'static str,
+        name: &str,
+        known: impl IntoIterator<Item = (&'static str, T), IntoIter: Clone>,
+    ) -> Result<T> {
+        let known = known.into_iter();
+        known.clone().find(|choice| choice.0 == name).map(|choice| choice.1).ok_or_else(|| {
+            let known = known.map(|choice| choice.0).collect::<Vec<_>>().join(", ");
+            MtmError::UnknownName { what, found: name.to_owned(), known, kind: self }
+        })
+    }
+
+    /// Rejects an empty array.
+    pub(crate) fn require_entries(self, what: &'static str, count: usize) -> Result<()> {
+        if count > 0 { Ok(()) } else { Err(MtmError::Empty { what, kind: self }) }
     }
 
     pub(crate) fn not_together(

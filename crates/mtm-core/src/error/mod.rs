@@ -221,7 +221,7 @@ pub enum MtmError {
     Overflow { what: &'static str, why: &'static str },
     /// A name is not one of those known.
     #[error("{what} \"{found}\" is unknown: use one of {known}")]
-    UnknownName { what: &'static str, found: String, known: &'static str, kind: ErrorKind },
+    UnknownName { what: &'static str, found: String, known: String, kind: ErrorKind },
 }
 
 /// A value as shown in an error: without hundreds of digits.

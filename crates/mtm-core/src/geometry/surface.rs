@@ -116,21 +116,13 @@ impl Surface {
         let kind = ErrorKind::Mesh;
         let allowed = "0 to pi rad";
         kind.require((0.0..=PI).contains(&crease_angle), "crease angle", crease_angle, allowed)?;
-        if vertices.is_empty() {
-            return Err(MtmError::Empty { what: "surface vertices", kind });
-        }
-        if triangles.is_empty() {
-            return Err(MtmError::Empty { what: "surface triangles", kind });
-        }
+        kind.require_entries("surface vertices", vertices.len())?;
+        kind.require_entries("surface triangles", triangles.len())?;
         check_coordinates("surface vertices", &vertices, kind)?;
         for (row, vertex) in triangles.iter().enumerate() {
             if let Some(&index) = vertex.iter().find(|&&v| v as usize >= vertices.len()) {
-                return Err(kind.no_such(
-                    ("surface triangles", row),
-                    "vertex",
-                    index,
-                    vertices.len(),
-                ));
+                let what = ("surface triangles", row);
+                return Err(kind.no_such(what, "vertex", index, vertices.len()));
             }
         }
         let facets = facets(&vertices, &triangles)?;

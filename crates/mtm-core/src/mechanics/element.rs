@@ -20,8 +20,6 @@ pub enum Element {
     Quadratic,
 }
 
-/// Names of the elements.
-pub const ELEMENTS: &str = "p1, anp, p2";
 /// Maximum number of nodes of a tet.
 pub const MOST_NODES: usize = 10;
 /// Corners at the ends of each edge of a tet, in the order of its mid-edge nodes.
@@ -32,14 +30,12 @@ pub const TET_EDGES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], 
 const QUADRATIC_POINTS: [f64; 2] = [0.585_410_196_624_968_5, 0.138_196_601_125_010_5];
 
 impl Element {
+    /// Every element.
+    pub const ALL: [Self; 3] = [Self::Linear, Self::NodalPressure, Self::Quadratic];
+
     /// The element called `name`.
     pub fn from_name(name: &str) -> Result<Self> {
-        match name {
-            "p1" => Ok(Self::Linear),
-            "anp" => Ok(Self::NodalPressure),
-            "p2" => Ok(Self::Quadratic),
-            _ => Err(ErrorKind::Mesh.unknown("element", name, ELEMENTS)),
-        }
+        ErrorKind::Mesh.named("element", name, Self::ALL.map(|element| (element.name(), element)))
     }
 
     /// Its name.

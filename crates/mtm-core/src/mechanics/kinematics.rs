@@ -1,7 +1,5 @@
 //! The strain measure of a solver: linear, corotational or for large deformation.
 
-use std::sync::LazyLock;
-
 use crate::error::{ErrorKind, Result};
 use crate::mechanics::hyperelastic::HyperelasticLaw;
 
@@ -19,10 +17,6 @@ pub enum Kinematics {
     Hyperelastic(HyperelasticLaw),
 }
 
-/// Names of the kinematics, for messages.
-static KINEMATICS: LazyLock<String> =
-    LazyLock::new(|| Kinematics::all().map(Kinematics::name).collect::<Vec<_>>().join(", "));
-
 impl Kinematics {
     /// Large deformation of stable neo-Hookean tissue: the reference.
     pub const NEO_HOOKEAN: Self = Self::Hyperelastic(HyperelasticLaw::NEO_HOOKEAN);
@@ -39,9 +33,8 @@ impl Kinematics {
     /// # Errors
     /// [`crate::MtmError::UnknownName`] with the available names.
     pub fn from_name(name: &str) -> Result<Self> {
-        Self::all()
-            .find(|kinematics| kinematics.name() == name)
-            .ok_or_else(|| ErrorKind::Solver.unknown("kinematics", name, KINEMATICS.as_str()))
+        let known: Vec<_> = Self::all().map(|kinematics| (kinematics.name(), kinematics)).collect();
+        ErrorKind::Solver.named("kinematics", name, known)
     }
 
     /// Its name.

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix6, SymmetricEigen};
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 
 /// Smallest permitted eigenvalue of a stiffness over its largest. Rounding errors of the constants are near
 /// 1e-16; ν = 0.4999 with E_l/E_t = 1e3 is still at 1e-7.
@@ -89,56 +89,44 @@ pub struct Preset {
     pub muscle: FibreElastic,
 }
 
-/// Names of the built-in presets.
-pub const PRESETS: &str = "passive, kim2010, kim2010-swapped";
-/// Names of the fibre laws.
-pub const LAWS: &str = "spencer, picinbono";
-/// Names of the mixing rules.
-pub const MIXINGS: &str = "moduli, stiffness";
-
 impl FibreLaw {
+    /// Every law, by its name.
+    pub const ALL: [(&str, Self); 2] = [("spencer", Self::Spencer), ("picinbono", Self::Picinbono)];
+
     /// The law called `name`.
     pub fn from_name(name: &str) -> Result<Self> {
-        match name {
-            "spencer" => Ok(Self::Spencer),
-            "picinbono" => Ok(Self::Picinbono),
-            _ => Err(unknown("law", name, LAWS)),
-        }
+        ErrorKind::Material.named("law", name, Self::ALL)
     }
 }
 
 impl Mixing {
     /// The rule called `name`.
     pub fn from_name(name: &str) -> Result<Self> {
-        match name {
-            "moduli" => Ok(Self::Moduli),
-            "stiffness" => Ok(Self::Stiffness),
-            _ => Err(unknown("mixing", name, MIXINGS)),
-        }
+        let known = [("moduli", Self::Moduli), ("stiffness", Self::Stiffness)];
+        ErrorKind::Material.named("mixing", name, known)
     }
 }
 
 impl Preset {
+    /// Poisson's ratio of fat, and the moduli of muscle along and across, of every preset by its name.
+    pub const ALL: [(&str, [f64; 3]); 3] = [
+        ("passive", [0.40, 0.06, 0.03]),
+        ("kim2010", [0.46, 0.5, 0.79]),
+        ("kim2010-swapped", [0.46, 0.79, 0.5]),
+    ];
+
     /// The preset called `name`: `passive` has the moduli of muscle at rest (0.03 MPa across, 0.06
     /// along, ν 0.43) and fat that can lose volume (0.003 MPa, ν 0.40; docs/moduli.md); `kim2010` is
     /// Table 1 of Kim et al. (2010) as printed (muscle 0.79 MPa across, 0.5 along, ν 0.43; fat 0.003,
     /// 0.46); `kim2010-swapped` exchanges its muscle's moduli.
     pub fn from_name(name: &str) -> Result<Self> {
-        let (of_fat, young_along, young_across) = match name {
-            "passive" => (0.40, 0.06, 0.03),
-            "kim2010" => (0.46, 0.5, 0.79),
-            "kim2010-swapped" => (0.46, 0.79, 0.5),
-            _ => return Err(unknown("preset", name, PRESETS)),
-        };
+        let [of_fat, young_along, young_across] =
+            ErrorKind::Material.named("preset", name, Self::ALL)?;
         Ok(Self {
             fat: Elastic { young: 0.003, poisson: of_fat },
             muscle: FibreElastic { young_along, young_across, poisson: 0.43 },
         })
     }
-}
-
-fn unknown(what: &'static str, found: &str, known: &'static str) -> MtmError {
-    ErrorKind::Material.unknown(what, found, known)
 }
 
 impl From<Elastic> for Lame {

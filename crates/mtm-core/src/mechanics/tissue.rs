@@ -258,10 +258,7 @@ impl TetMaterial<'_> {
 }
 
 fn check_rows(len: usize) -> Result<()> {
-    if len == 0 {
-        return Err(MtmError::Empty { what: "tissue constants", kind: ErrorKind::Material });
-    }
-    Ok(())
+    ErrorKind::Material.require_entries("tissue constants", len)
 }
 
 fn check_matching(constants: usize, fibres: usize) -> Result<()> {
@@ -311,9 +308,7 @@ fn describe(m: &FibreElastic, law: FibreLaw) -> String {
 
 /// `fibre` with every row that is needed scaled to exactly unit length.
 fn unit_fibres(fibre: &[[f64; 3]], needed: &[bool]) -> Result<Vec<[f64; 3]>> {
-    if fibre.is_empty() {
-        return Err(MtmError::Empty { what: "fibre", kind: ErrorKind::Material });
-    }
+    ErrorKind::Material.require_entries("fibre", fibre.len())?;
     let mut out = Vec::with_capacity(fibre.len());
     for (tet, a) in fibre.iter().enumerate() {
         if !needed[tet] {

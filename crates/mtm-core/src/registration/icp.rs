@@ -30,9 +30,6 @@ const FREE_MOTION: f64 = 1e-10;
 /// Points per parallel task.
 const POINTS_PER_TASK: usize = 64;
 
-/// Names of the methods.
-pub const METHODS: &str = "plane, point";
-
 /// What the moving points are aligned with.
 #[derive(Debug, Clone, Copy)]
 pub enum Fixed<'a> {
@@ -57,11 +54,8 @@ impl IcpMethod {
     /// # Errors
     /// [`MtmError::UnknownName`].
     pub fn from_name(name: &str) -> Result<Self> {
-        match name {
-            "plane" => Ok(Self::Plane),
-            "point" => Ok(Self::Point),
-            _ => Err(ErrorKind::Registration.unknown("icp method", name, METHODS)),
-        }
+        let known = [("plane", Self::Plane), ("point", Self::Point)];
+        ErrorKind::Registration.named("icp method", name, known)
     }
 }
 

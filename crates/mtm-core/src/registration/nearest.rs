@@ -1,6 +1,6 @@
 //! The nearest of many points: a balanced k-d tree (Bentley 1975).
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 use crate::registration::spread::check_coordinates;
 
 /// Number of points below which a box is not split: checking all of them is faster.
@@ -32,11 +32,9 @@ impl PointTree {
     /// Tree of `points` (mm).
     ///
     /// # Errors
-    /// [`MtmError::Empty`], [`MtmError::NotFinite`], [`MtmError::OutOfRange`].
+    /// `Empty`, `NotFinite`, `OutOfRange`.
     pub fn new(points: &[[f64; 3]]) -> Result<Self> {
-        if points.is_empty() {
-            return Err(MtmError::Empty { what: "fixed points", kind: ErrorKind::Registration });
-        }
+        ErrorKind::Registration.require_entries("fixed points", points.len())?;
         check_coordinates("fixed", points)?;
         let mut index: Vec<u32> = (0..points.len() as u32).collect();
         let mut axis = vec![0; points.len()];

@@ -1,7 +1,5 @@
 //! Options of a solver: which method, how accurate, how contact behaves, how much memory.
 
-use std::sync::LazyLock;
-
 use crate::contact::ContactOptions;
 use crate::error::{ErrorKind, Result};
 use crate::mechanics::kinematics::Kinematics;
@@ -30,9 +28,6 @@ pub enum Method {
 /// same near 50 000 unknowns, and at 160 000 the factorisation costs twice as much, in memory too. It solves
 /// each further plan faster at any size; up to this limit that matters more.
 const AUTO_DIRECT_UNKNOWNS: usize = 100_000;
-
-/// Names of the methods, for messages.
-static METHODS: LazyLock<String> = LazyLock::new(|| Method::ALL.map(Method::name).join(", "));
 
 /// Options of a solver.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -78,10 +73,7 @@ impl Method {
     /// # Errors
     /// [`crate::MtmError::UnknownName`] with the available names.
     pub fn from_name(name: &str) -> Result<Self> {
-        Self::ALL
-            .into_iter()
-            .find(|method| method.name() == name)
-            .ok_or_else(|| ErrorKind::Solver.unknown("method", name, METHODS.as_str()))
+        ErrorKind::Solver.named("method", name, Self::ALL.map(|method| (method.name(), method)))
     }
 
     /// Whether it uses a factorisation; [`Method::Auto`] has to be resolved first.
@@ -122,26 +114,19 @@ impl Method {
 
 impl StaticOptions {
     pub(crate) fn check(&self) -> Result<()> {
-        let tolerance = self.tolerance;
-        ErrorKind::Solver.require(
-            tolerance > 0.0 && tolerance < 1.0,
-            "tolerance",
-            tolerance,
-            "above 0 and below 1 (relative)",
-        )?;
-        let within = self.contact.tolerance;
-        ErrorKind::Solver.require(
-            within > 0.0 && within <= MOST_CONTACT_TOLERANCE,
-            "contact_tolerance",
-            within,
-            "above 0, at most 1 mm",
-        )?;
+        let kind = ErrorKind::Solver;
+        let (relative, within) = (self.tolerance, self.contact.tolerance);
+        let (is_share, allowed) =
+            (relative > 0.0 && relative < 1.0, "above 0 and below 1 (relative)");
+        kind.require(is_share, "tolerance", relative, allowed)?;
+        let is_small = within > 0.0 && within <= MOST_CONTACT_TOLERANCE;
+        kind.require(is_small, "contact_tolerance", within, "above 0, at most 1 mm")?;
         let counts = [
             ("max_iterations", self.max_iterations),
             ("contact_iterations", Some(self.contact.max_iterations)),
         ];
         for (what, value) in counts {
-            ErrorKind::Solver.require(value != Some(0), what, 0.0, "1 or more")?;
+            kind.require(value != Some(0), what, 0.0, "1 or more")?;
         }
         Ok(())
     }

@@ -102,7 +102,7 @@ impl PyStaticSolver {
                 return Err(Failure(MtmError::UnknownName {
                     what: "contact",
                     found: found.into(),
-                    known: "bilateral, unilateral",
+                    known: "bilateral, unilateral".into(),
                     kind: ErrorKind::Solver,
                 })
                 .into());

@@ -7,8 +7,6 @@ use crate::geometry::surface::Surface;
 use crate::muscles::equivalent::shape::InsideTest;
 use crate::muscles::fibre::MuscleFibres;
 
-/// Names of the inside tests.
-pub const INSIDE_TESTS: &str = "winding, normal";
 /// Maximum number of samples per tet.
 pub const MOST_SAMPLES: usize = 1 << 20;
 
@@ -50,11 +48,8 @@ impl SamplingOptions {
 impl InsideTest {
     /// The test called `name`.
     pub fn from_name(name: &str) -> Result<Self> {
-        match name {
-            "winding" => Ok(Self::Winding),
-            "normal" => Ok(Self::Normal),
-            _ => Err(ErrorKind::Material.unknown("inside", name, INSIDE_TESTS)),
-        }
+        let known = [("winding", Self::Winding), ("normal", Self::Normal)];
+        ErrorKind::Material.named("inside", name, known)
     }
 }
 

@@ -77,9 +77,7 @@ impl MuscleKind {
     /// [`MtmError::UnknownName`].
     pub fn parse(name: &str) -> Result<Self> {
         let kinds = [Self::Strap, Self::Fan, Self::Ring, Self::Sheet];
-        kinds.into_iter().find(|kind| kind.name() == name).ok_or_else(|| {
-            ErrorKind::Mesh.unknown("kind of muscle", name, "strap, fan, ring, sheet")
-        })
+        ErrorKind::Mesh.named("kind of muscle", name, kinds.map(|kind| (kind.name(), kind)))
     }
 }
 
@@ -129,12 +127,8 @@ impl MuscleFibres {
     pub fn from_surface(surface: &Surface, kind: MuscleKind, boxes: Option<usize>) -> Result<Self> {
         let least = if kind == MuscleKind::Ring { LEAST_ROUND } else { 1 };
         if let Some(count) = boxes.filter(|count| !(least..=MOST_BOXES).contains(count)) {
-            return Err(ErrorKind::Mesh.out_of_range(
-                "number of fibre boxes",
-                0,
-                count as f64,
-                "1 to 64, round an opening 3 to 64",
-            ));
+            let (what, allowed) = ("number of fibre boxes", "1 to 64, round an opening 3 to 64");
+            return Err(ErrorKind::Mesh.out_of_range(what, 0, count as f64, allowed));
         }
         let region = Region::new(surface);
         let moments = region
@@ -164,9 +158,7 @@ impl MuscleFibres {
     /// half extent is negative or all are 0.
     pub fn from_boxes(boxes: Vec<OrientedBox>) -> Result<Self> {
         let kind = ErrorKind::Mesh;
-        if boxes.is_empty() {
-            return Err(MtmError::Empty { what: "fibre boxes", kind });
-        }
+        kind.require_entries("fibre boxes", boxes.len())?;
         let rows = |row: fn(&OrientedBox) -> [f64; 3]| boxes.iter().map(row).collect::<Vec<_>>();
         check_finite_rows("centre of fibre boxes", &rows(|b| b.centre), kind)?;
         check_finite_rows("half extents of fibre boxes", &rows(|b| b.half_extents), kind)?;
@@ -210,21 +202,15 @@ impl MuscleFibres {
     /// of fewer than two different points.
     pub fn with_courses(self, lines: &[Vec<[f64; 3]>]) -> Result<Self> {
         let kind = ErrorKind::Mesh;
-        if lines.is_empty() {
-            return Err(MtmError::Empty { what: "fibre lines", kind });
-        }
+        kind.require_entries("fibre lines", lines.len())?;
         let mut distinct = Vec::with_capacity(lines.len());
         for (index, line) in lines.iter().enumerate() {
             check_finite_rows(&format!("fibre line {index}"), line, kind)?;
             let mut points: Vec<Vec3> = line.iter().map(|&p| Vec3::from(p)).collect();
             points.dedup();
             if points.len() < 2 {
-                return Err(kind.length(
-                    format!("fibre line {index}"),
-                    points.len(),
-                    2,
-                    "a direction needs two different points",
-                ));
+                let why = "a direction needs two different points";
+                return Err(kind.length(format!("fibre line {index}"), points.len(), 2, why));
             }
             distinct.push(points);
         }
