@@ -74,10 +74,12 @@ pub struct SlidingNode {
 /// The sliding nodes of a scene with their contact surfaces at rest.
 #[derive(Debug, Default)]
 pub struct Sliding {
+    /// Segment by segment.
     pub(crate) nodes: Vec<SlidingNode>,
     pub(crate) positions: Vec<[f64; 3]>,
     rest: Vec<Closest>,
-    rest_normals: Vec<[f64; 3]>,
+    /// Unit normal of the contact surface at rest for each.
+    pub(crate) rest_normals: Vec<[f64; 3]>,
     /// Prescribed distance of each node, mm; none for a node that keeps its offset at rest.
     gaps: Vec<Option<f64>>,
     /// Stiffness of each node on its own, N/mm.
@@ -264,16 +266,6 @@ impl Sliding {
             sliding.positions.extend(positions);
         }
         Ok(Some(sliding))
-    }
-
-    /// The sliding nodes, segment by segment.
-    pub fn nodes(&self) -> &[SlidingNode] {
-        &self.nodes
-    }
-
-    /// Unit normal of the contact surface at rest for each sliding node.
-    pub fn rest_normals(&self) -> &[[f64; 3]] {
-        &self.rest_normals
     }
 
     /// Positions of the sliding nodes if they were attached to their segment.

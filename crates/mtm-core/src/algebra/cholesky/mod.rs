@@ -54,8 +54,9 @@ pub struct Symbolic {
 pub struct Factor {
     symbolic: Arc<Symbolic>,
     values: Vec<f64>,
-    /// Relative error with which a known solution was recovered.
-    trial_error: f64,
+    /// Relative error, in the largest component, with which it recovered a known solution: an estimate of the digits
+    /// that the condition of the system leaves.
+    pub trial_error: f64,
 }
 
 impl Symbolic {
@@ -127,12 +128,6 @@ impl Symbolic {
 }
 
 impl Factor {
-    /// Relative error, in the largest component, with which the factor recovered a known solution: an
-    /// estimate of the digits that the condition of the system leaves.
-    pub fn trial_error(&self) -> f64 {
-        self.trial_error
-    }
-
     /// Bytes that it takes.
     pub fn bytes(&self) -> usize {
         self.symbolic.factor_bytes()

@@ -182,7 +182,8 @@ impl FactorPreconditioner {
         Self { kept, row, diagonal }
     }
 
-    /// √(rᵀ z), where z is the approximation of A⁻¹ r.
+    /// √(rᵀ z), where z is the approximation of A⁻¹ r: the energy norm of the forces that it takes for the cause of the
+    /// displacements r.
     pub fn measure(&self, r: &[f64]) -> f64 {
         dot(r, &self.apply(r)).max(0.0).sqrt()
     }

@@ -5,31 +5,17 @@ use std::sync::Arc;
 use crate::algebra::multigrid::Multigrid;
 use crate::statics::options::Interrupt;
 
-/// Counters of the linear solves of one plan.
-#[derive(Default)]
-pub(crate) struct Effort {
-    /// Estimated error of the last solve, mm.
-    pub error_estimate: f64,
-    /// Iterations of all solves.
-    pub iterations: usize,
-    /// Residual measure of each.
-    pub history: Vec<f64>,
-}
-
-impl Effort {
-    /// Adds the iterations of a solve, by the residual measure of each.
-    pub fn add(&mut self, history: Vec<f64>) {
-        self.iterations += history.len();
-        self.history.extend(history);
-    }
-}
-
 /// The solve of one plan.
 pub(crate) struct PlanSolve<'a> {
     /// Reference length of the tolerance: the largest prescribed displacement, mm.
     pub scale: f64,
     pub interrupted: Interrupt<'a>,
-    pub effort: Effort,
+    /// Estimated error of the last linear solve, mm.
+    pub error_estimate: f64,
+    /// Iterations of all solves.
+    pub iterations: usize,
+    /// Residual measure of each.
+    pub history: Vec<f64>,
     /// Error that the answers of the last rounds of contact may have whatever the tolerance, mm.
     pub allowed: f64,
     /// The hierarchy of the body with links that push; none for that of the body alone.
@@ -39,6 +25,18 @@ pub(crate) struct PlanSolve<'a> {
 impl<'a> PlanSolve<'a> {
     /// The record of a solve that has not started.
     pub fn new(scale: f64, interrupted: Interrupt<'a>) -> Self {
-        Self { scale, interrupted, effort: Effort::default(), allowed: 0.0, multigrid: None }
+        let (error_estimate, allowed, iterations, history) = (0.0, 0.0, 0, Vec::new());
+        Self { scale, interrupted, error_estimate, iterations, history, allowed, multigrid: None }
+    }
+
+    /// Adds the iterations of a solve, by the residual measure of each.
+    pub fn add(&mut self, history: Vec<f64>) {
+        self.iterations += history.len();
+        self.history.extend(history);
+    }
+
+    /// Notes that the error is at least this, mm.
+    pub fn leaves(&mut self, error: f64) {
+        self.error_estimate = self.error_estimate.max(error);
     }
 }

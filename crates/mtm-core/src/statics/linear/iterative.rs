@@ -88,15 +88,17 @@ pub(crate) struct Advance {
 
 /// A system without a factorisation: the matrix and a multigrid hierarchy for it.
 pub(crate) struct Iterative {
-    matrix: BlockMatrix,
-    multigrid: Arc<Multigrid>,
+    /// The matrix without constraints.
+    pub matrix: BlockMatrix,
+    /// Its hierarchy, or that of a system with a similar matrix.
+    pub multigrid: Arc<Multigrid>,
     /// Whether sweeps solve the system, and the hierarchy only measures their error.
     sweeps: bool,
     /// Estimated error over the length of the motion.
     tolerance: f64,
     max_iterations: Option<usize>,
     /// Whether estimates need a trial whatever the spectrum shows.
-    doubtful: bool,
+    pub doubtful: bool,
     /// The trial of the system without constraints, once there is one.
     trial: OnceLock<Trial>,
 }
@@ -140,21 +142,6 @@ impl Iterative {
         }
     }
 
-    /// Whether the tissue's contrast is so large that estimates need a trial.
-    pub fn doubtful(&self) -> bool {
-        self.doubtful
-    }
-
-    /// The matrix without constraints.
-    pub fn matrix(&self) -> &BlockMatrix {
-        &self.matrix
-    }
-
-    /// The hierarchy, for a system with a similar matrix.
-    pub fn multigrid(&self) -> &Arc<Multigrid> {
-        &self.multigrid
-    }
-
     /// Bytes of the hierarchy.
     pub fn bytes(&self) -> usize {
         self.multigrid.memory_bytes()
@@ -174,8 +161,8 @@ impl Iterative {
         }
         let confirmed = self.confirmed((&self.matrix, &begun), &self.trial, solve.interrupted);
         let found = self.solution(&confirmed, b, tolerance)?;
-        solve.effort.error_estimate = found.error_estimate_mm;
-        solve.effort.add(found.residual_history);
+        solve.error_estimate = found.error_estimate_mm;
+        solve.add(found.residual_history);
         self.check_worth(&found.solution, solve)?;
         Ok(found.solution)
     }
@@ -186,13 +173,13 @@ impl Iterative {
     /// limit of f64 it may guess far more than anything moves.
     pub fn check_worth(&self, solution: &[[f64; 3]], solve: &PlanSolve<'_>) -> Result<()> {
         let length = solution.iter().fold(solve.scale, |m, v| m.max(norm(*v)));
-        let (value, limit) = (solve.effort.error_estimate, WORTH.max(self.tolerance) * length);
+        let (value, limit) = (solve.error_estimate, WORTH.max(self.tolerance) * length);
         if value <= limit {
             return Ok(());
         }
         Err(MtmError::NotConverged {
             method: if self.sweeps { "relaxation" } else { "pcg" },
-            iterations: solve.effort.iterations,
+            iterations: solve.iterations,
             shortfall: Shortfall::new("the estimated error of a node", value, limit, " mm"),
             advice: "the material contrast is too large for f64: check the moduli, or use \
                      method=\"cholesky\"",
@@ -299,14 +286,14 @@ impl Iterative {
                         b[*row] = sub(b[*row], scaled(s.axis, s.stiffness * s.goal));
                     }
                     left_out.extend(out);
-                    solve.effort.add(met.residual_history);
+                    solve.add(met.residual_history);
                     start = met.solution;
                     unheld.push(met.direction);
                 }
             }
         };
-        solve.effort.error_estimate = found.error_estimate_mm;
-        solve.effort.add(found.residual_history);
+        solve.error_estimate = found.error_estimate_mm;
+        solve.add(found.residual_history);
         let mut rows = found.solution;
         let mut is_carried = false;
         if !unheld.is_empty() {
@@ -352,7 +339,7 @@ impl Iterative {
             product.project(&mut forces);
             let pressed = Pressed { a: &product, preconditioner: &*multigrid, links };
             let found = pressed.solve(rows, forces, (share, MOST_PRESSED));
-            solve.effort.add(found.history);
+            solve.add(found.history);
             rows = found.x;
             if !found.is_indefinite || springs.iter().all(|(_, s)| s.stiffness >= 0.0) {
                 return Ok(Advance { rows, solved: true, is_carried: false });
@@ -386,7 +373,7 @@ impl Iterative {
             let found = relax(matrix, b, &x, (goal, most - sweeps), solve.interrupted)
                 .map_err(|e| gave_up(e, most))?;
             (x, sweeps) = (found.solution, sweeps + found.steps.len());
-            solve.effort.add(found.steps);
+            solve.add(found.steps);
             let rest: Vec<[f64; 3]> =
                 b.iter().zip(matrix.multiply(&x)).map(|(&b, f)| sub(b, f)).collect();
             let options = PcgOptions {
@@ -404,7 +391,7 @@ impl Iterative {
             let largest = left.solution.iter().fold(0.0_f64, |m, e| m.max(norm(*e)));
             let error = largest + left.error_estimate_mm;
             if error <= tolerance {
-                solve.effort.error_estimate = error;
+                solve.error_estimate = error;
                 return Ok(x);
             }
             if sweeps >= most {

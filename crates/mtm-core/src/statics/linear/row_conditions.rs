@@ -38,7 +38,7 @@ impl RowConditions {
         held: impl Iterator<Item = (&'a ContactRow, f64)>,
         springs: &[Spring],
     ) -> Self {
-        let row = |node: usize| sliding.nodes()[node].row as usize;
+        let row = |node: usize| sliding.nodes[node].row as usize;
         Self {
             constraints: held
                 .map(|(r, offset)| Constraint { row: row(r.node), normal: r.normal, offset })

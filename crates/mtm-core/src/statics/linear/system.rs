@@ -23,11 +23,10 @@ use crate::statics::plans::about::Slope;
 use crate::statics::plans::frozen::FrozenContact;
 use crate::statics::plans::reaction::ContactFactor;
 use crate::statics::plans::settling::{
-    ContactSolve, RowLinks, Settled, Unfactored, direct_error, settled_by_flexibility,
-    touching_needs_pcg,
+    ContactSolve, RowLinks, Unfactored, direct_error, settled_by_flexibility, touching_needs_pcg,
 };
 use crate::statics::restraint::Support;
-use crate::statics::solution::Clock;
+use crate::statics::solution::{Clock, TouchResult};
 use crate::vector::add;
 
 /// Maximum number of sliding nodes for which their flexibility is kept: 54 bytes a pair of nodes, 1.9 GB.
@@ -67,25 +66,22 @@ pub(crate) struct BodyRows<'a> {
 }
 
 /// Displacements of the rows after a solve, with contact if nodes slide.
+#[derive(Default)]
 pub(crate) struct SolvedRows {
     /// mm.
     pub rows: Vec<[f64; 3]>,
     pub contact: Option<ContactResult>,
     /// Time that contact took, s.
     pub contact_seconds: f64,
+    /// What touches, and the force of it on each row, N; none without parts that may touch.
+    pub touching: TouchResult,
+    pub pushes: Vec<[f64; 3]>,
 }
 
-impl From<Vec<[f64; 3]>> for SolvedRows {
-    /// Displacements of a body without sliding nodes.
-    fn from(rows: Vec<[f64; 3]>) -> Self {
-        Self { rows, contact: None, contact_seconds: 0.0 }
-    }
-}
-
-impl From<Settled> for SolvedRows {
-    fn from(found: Settled) -> Self {
-        let Settled { rows, contact, contact_seconds } = found;
-        Self { rows, contact: Some(contact), contact_seconds }
+impl SolvedRows {
+    /// Displacements of a body without parts that may touch.
+    pub fn new(rows: Vec<[f64; 3]>, contact: Option<ContactResult>, contact_seconds: f64) -> Self {
+        Self { rows, contact, contact_seconds, ..Self::default() }
     }
 }
 
@@ -119,7 +115,7 @@ impl System {
         let with = |kept: Kept| Self { kept };
         if method.has_factor() {
             let slide_rows: Vec<u32> =
-                body.sliding.iter().flat_map(|s| s.nodes().iter().map(|n| n.row)).collect();
+                body.sliding.iter().flat_map(|s| s.nodes.iter().map(|n| n.row)).collect();
             // If a part is constrained by sliding nodes alone, there is no flexibility without them.
             let (liftable, held) = body.liftable;
             let (n_sliding, n_tail) = (slide_rows.len(), slide_rows.len() + liftable.len());
@@ -142,7 +138,7 @@ impl System {
             if fits {
                 let factor = Arc::new(symbolic.factor(&matrix)?);
                 clock.lap("factor", true);
-                let normals = body.sliding.map_or(&[][..], Sliding::rest_normals);
+                let normals = body.sliding.map_or(&[][..], |s| &s.rest_normals);
                 let contact = ContactFactor::new(&factor, (&slide_rows, normals), held)?;
                 clock.lap("contact_factor", body.sliding.is_some());
                 return Ok((with(Kept::Factor { factor, contact }), method));
@@ -180,7 +176,7 @@ impl System {
     /// The hierarchy, if the system is solved by iteration.
     pub fn multigrid(&self) -> Option<&Arc<Multigrid>> {
         match &self.kept {
-            Kept::Matrix(Unfactored::Iterative(iterative)) => Some(iterative.multigrid()),
+            Kept::Matrix(Unfactored::Iterative(iterative)) => Some(&iterative.multigrid),
             Kept::Matrix(Unfactored::Refactored { .. }) | Kept::Factor { .. } => None,
         }
     }
@@ -198,11 +194,11 @@ impl System {
     pub fn solve(&self, b: &[[f64; 3]], solve: &mut PlanSolve<'_>) -> Result<Vec<[f64; 3]>> {
         match &self.kept {
             Kept::Factor { factor, contact } => {
-                let x = in_pool(|| match contact.flexibility().lifts() {
+                let x = in_pool(|| match contact.flexibility.lifts() {
                     true => contact.answers(factor, b).of_all(&[]),
                     false => factor.solve(b),
                 });
-                solve.effort.error_estimate = direct_error(factor, &x);
+                solve.error_estimate = direct_error(factor, &x);
                 Ok(x)
             }
             Kept::Matrix(Unfactored::Refactored { symbolic, matrix }) => {
@@ -218,7 +214,7 @@ impl System {
         b: &[[f64; 3]],
         settle: &ContactSolve<'_>,
         solve: &mut PlanSolve<'_>,
-    ) -> Result<Settled> {
+    ) -> Result<SolvedRows> {
         match &self.kept {
             Kept::Factor { .. } if !settle.linked.links.is_empty() => {
                 Err(touching_needs_pcg(Method::Cholesky))
@@ -280,8 +276,8 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
         if let Kept::Factor { factor, contact } = &self.kept {
-            if contact.flexibility().lifts() {
-                return all_together(factor, contact.flexibility(), columns, |_, _| Ok(Vec::new()));
+            if contact.flexibility.lifts() {
+                return all_together(factor, &contact.flexibility, columns, |_, _| Ok(Vec::new()));
             }
             factor.solve_many(&mut columns);
             return Ok(columns);
@@ -311,17 +307,17 @@ impl System {
         let Some((sliding, frozen)) = sliding else {
             return self.solve_free_columns(columns, (scales, share), interrupted);
         };
-        let still = vec![[0.0; 3]; sliding.nodes().len()];
+        let still = vec![[0.0; 3]; sliding.nodes.len()];
         let check = || if interrupted() { Err(MtmError::Interrupted) } else { Ok(()) };
         let Frozen { state, slopes } = frozen;
         match &self.kept {
             Kept::Factor { factor, contact } => {
-                let kept = FrozenContact::new(contact.flexibility(), &state.rows, &state.springs)?;
+                let kept = FrozenContact::new(&contact.flexibility, &state.rows, &state.springs)?;
                 let forces = |k: usize, free: &[_]| {
                     Ok(kept.forces(free, &slopes[k].offsets, &frozen.springs(k)))
                 };
                 check()?;
-                all_together(factor, contact.flexibility(), columns, forces)
+                all_together(factor, &contact.flexibility, columns, forces)
             }
             Kept::Matrix(system) => {
                 // All columns have the same constraints, so one trial serves them.
@@ -387,7 +383,7 @@ fn multigrid(matrix: &BlockMatrix, body: &BodyRows<'_>) -> Result<Multigrid> {
     let normals: Vec<(usize, [f64; 3])> = body
         .sliding
         .iter()
-        .flat_map(|s| s.nodes().iter().zip(s.rest_normals()))
+        .flat_map(|s| s.nodes.iter().zip(&s.rest_normals))
         .map(|(node, &n)| (node.row as usize, n))
         .collect();
     let constraints: Vec<Constraint> =

@@ -71,7 +71,7 @@ impl Equilibrium {
             *value = add(*value, *d);
         }
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
-        solve.effort.iterations += 1;
+        solve.iterations += 1;
 
         self.under_conditions(pose, target, solve)
     }

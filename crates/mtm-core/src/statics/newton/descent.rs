@@ -88,7 +88,7 @@ impl Equilibrium {
         // Error of the state once it is small enough: a step as accurate as the last one must be is still to come.
         let mut ending = None;
         // Steps of earlier descents are no sign of how this one converges.
-        let start = solve.effort.history.len();
+        let start = solve.history.len();
         for _ in 0..MAX_STEPS {
             if (solve.interrupted)() {
                 return Err(MtmError::Interrupted);
@@ -100,12 +100,11 @@ impl Equilibrium {
             if kind != first {
                 near = RETRY_EXACT * length;
             }
-            solve.effort.iterations += 1;
+            solve.iterations += 1;
             let before = std::mem::replace(&mut length, step.length());
-            solve.effort.history.push(length);
+            solve.history.push(length);
             let goal = self.options.tolerance * reach(&pose, target);
-            let (lengths, is_stiff) =
-                (&solve.effort.history[start..], self.tissue.contrast > STIFF_PARTS);
+            let (lengths, is_stiff) = (&solve.history[start..], self.tissue.contrast > STIFF_PARTS);
             let left =
                 if is_stiff { left_after(lengths, goal) } else { left_at_rate(length, before) };
             let bound = ending.filter(|_| length <= goal).unwrap_or(left + allowed);
@@ -114,7 +113,7 @@ impl Equilibrium {
                 let end = moved_by(&self.reduction, &pose.u, &step.rows, 1.0);
                 let bound = bound / (1.0 - self.rate(&pose, &end, target, &steps.conditions())?);
                 if bound <= goal {
-                    solve.effort.error_estimate = bound;
+                    solve.error_estimate = bound;
                     return Ok(end);
                 }
                 ending = None;

@@ -91,7 +91,7 @@ impl Body for Followed<'_, '_> {
             let f = forces[j as usize];
             loads.map_or(f, |l| sub(f, l[j as usize]))
         };
-        let nodes = self.sliding.nodes();
+        let nodes = &self.sliding.nodes;
         let displacements = nodes.iter().map(|n| u[n.node as usize]).collect();
         let reactions = nodes.iter().map(|n| reaction(n.node)).collect();
         self.before = std::mem::replace(&mut self.u, u);
@@ -238,17 +238,16 @@ impl Equilibrium {
             tangents,
         };
         let u = vec![[0.0; 3]; prescribed.len()];
-        let settled = |u: &[[f64; 3]], contact: ContactResult| SolvedRows {
-            rows: self.reduction.rows(u),
-            contact: Some(contact),
-            contact_seconds: clock.total(),
+        let settled = |u: &[[f64; 3]], contact: Option<ContactResult>| {
+            let seconds = if contact.is_some() { clock.total() } else { 0.0 };
+            SolvedRows::new(self.reduction.rows(u), contact, seconds)
         };
         let Some(slide) = slide else {
             let u = self.arrive(u, &mut target, solve)?;
-            return Ok(self.reduction.rows(&u).into());
+            return Ok(settled(&u, None));
         };
         match self.slide(&target, slide, solve) {
-            Ok((u, state)) => return Ok(settled(&u, state)),
+            Ok((u, state)) => return Ok(settled(&u, Some(state))),
             // Too large a step: the plan is applied in shares, for every set of normals.
             Err(
                 MtmError::NotConverged { .. }
@@ -265,7 +264,7 @@ impl Equilibrium {
         let (before, interrupted) = (u.clone(), solve.interrupted);
         let mut body = Followed { equilibrium: self, target, sliding, before, u, solve };
         let state = sliding.solve(motions, None, &self.options.contact, interrupted, &mut body)?;
-        Ok(settled(&body.u, state))
+        Ok(settled(&body.u, Some(state)))
     }
 
     /// The state of `target`, reached from the state `u`: first without the energy by which tissue resists being

@@ -18,7 +18,7 @@ use crate::statics::newton::{
     reach,
 };
 use crate::statics::options::{Interrupt, Method, StaticOptions};
-use crate::statics::plans::settling::{ContactSolve, RowLinks, Settled, WarmStart};
+use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart};
 use crate::statics::restraint::Support;
 use crate::statics::solution::Clock;
 use crate::vector::{add, sub};
@@ -68,7 +68,7 @@ impl StepRule for InContact<'_, '_> {
 
     fn resume(&mut self, pose: &Iterate) {
         let ContactResult { displacements, reactions, .. } = &mut self.contact;
-        let nodes = self.slide.sliding.nodes();
+        let nodes = &self.slide.sliding.nodes;
         for ((node, u), force) in nodes.iter().zip(displacements).zip(reactions) {
             (*u, *force) = (pose.u[node.node as usize], pose.slope[node.row as usize]);
         }
@@ -100,12 +100,12 @@ impl Equilibrium {
             self.settled(&rest, (target, slide), start, (kind, first), interrupted)
         })?;
         target.hierarchy.leave_rest(&self.at_rest);
-        solve.effort.iterations += 1;
+        solve.iterations += 1;
         let ahead: Vec<[f64; 3]> = rest.u.iter().zip(&change).map(|(a, b)| add(*a, *b)).collect();
         let pose = self.pose(moved_by(&self.reduction, &ahead, &rows, 1.0), target)?;
         // Error of a step that keeps contact within its required accuracy, mm.
         let fine = slide.sliding.gap_limit(&self.options.contact);
-        let on_walls: Vec<u32> = slide.sliding.nodes().iter().map(|n| n.row).collect();
+        let on_walls: Vec<u32> = slide.sliding.nodes.iter().map(|n| n.row).collect();
         let (equilibrium, before) = (self, first);
         let mut steps =
             InContact { equilibrium, target, slide, contact, before, fine, interrupted };
@@ -168,13 +168,13 @@ impl Equilibrium {
                 linked: RowLinks::default(),
             };
             let mut solve = PlanSolve::new(target.scale, interrupted);
-            let Settled { rows, contact, .. } =
-                system.solve_with_contact(&b, &settle, &mut solve)?;
+            let found = system.solve_with_contact(&b, &settle, &mut solve)?;
+            let (rows, contact) = (found.rows, found.contact.expect("a solve with contact"));
             let step = rows.iter().zip(&here).map(|(x, u)| sub(*x, *u)).collect();
             // Under contact only the hierarchy at rest is kept, for other plans: iterations with that of an earlier
             // tangent cost more than a new one.
             let multigrid = change.and_then(|_| system.multigrid().cloned());
-            let iterations = solve.effort.iterations;
+            let iterations = solve.iterations;
             Ok(HierarchyResult { value: (step, contact), multigrid, iterations })
         })
     }

@@ -63,7 +63,7 @@ impl Equilibrium {
                 TangentSolver::Pcg => {
                     let system = self.by_iteration(matrix, constraints, kept)?;
                     let (rows, iterations) = system.step(&rhs, allowed, interrupted)?;
-                    (rows, Some(system.multigrid().clone()), iterations)
+                    (rows, Some(system.multigrid.clone()), iterations)
                 }
             };
             add_offsets(&mut value, constraints);

@@ -130,7 +130,7 @@ impl StaticSolver {
         columns.fields.push(vec![[0.0; 3]; self.reduction.unknowns.len()]);
         let motions = self.node_kinds.motions(reference)?;
         let motions: Vec<RigidMotion> = motions.iter().filter_map(|m| m.rigid()).copied().collect();
-        let about = ContactEquilibrium { state, sliding: sliding.nodes(), motions: &motions };
+        let about = ContactEquilibrium { state, sliding: &sliding.nodes, motions: &motions };
         let places = self.tensors.element_nodes().positions();
         let mut slopes = Vec::new();
         for (k, field) in columns.fields.iter_mut().enumerate() {

@@ -58,7 +58,7 @@ impl StaticSolver {
         let known: Vec<Option<RigidMotion>> = motions.iter().map(|m| m.rigid().copied()).collect();
         let motions: Vec<RigidMotion> =
             known.iter().map(|m| m.unwrap_or_else(RigidMotion::identity)).collect();
-        let sliding = self.sliding.as_ref().map_or(&[][..], |s| s.nodes());
+        let sliding = self.sliding.as_ref().map_or(&[][..], |s| &s.nodes[..]);
         let about = ContactEquilibrium { state: &solution.contact, sliding, motions: &motions };
         let (mut fields, mut slopes, mut prescribed) = (Vec::new(), Vec::new(), Vec::new());
         for change in changes {

@@ -9,7 +9,7 @@ use crate::algebra::cholesky::{Factor, Symbolic};
 use crate::algebra::constraints::{Constraint, add_offsets, projected_rhs};
 use crate::algebra::krylov::StepAccuracy;
 use crate::algebra::row_sums::in_pool;
-use crate::boundary::Motion;
+use crate::boundary::{Boundary, Motion};
 use crate::contact::links::Link;
 use crate::contact::{Body, Constraints, ContactResult, ContactStart, Response, Sliding};
 use crate::error::{ErrorKind, MtmError, Result};
@@ -17,6 +17,7 @@ use crate::mechanics::kinematics::Kinematics;
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::{Advance, Iterative, KeptForNext, SolveMemory};
 use crate::statics::linear::row_conditions::RowConditions;
+use crate::statics::linear::system::SolvedRows;
 use crate::statics::options::{Method, StaticOptions};
 use crate::statics::plans::reaction::{Answers, ContactFactor};
 use crate::statics::solution::Clock;
@@ -45,7 +46,7 @@ impl Unfactored {
     /// The matrix without constraints.
     pub fn matrix(&self) -> &BlockMatrix {
         match self {
-            Self::Iterative(iterative) => iterative.matrix(),
+            Self::Iterative(iterative) => &iterative.matrix,
             Self::Refactored { matrix, .. } => matrix,
         }
     }
@@ -56,7 +57,7 @@ impl Unfactored {
         b: &[[f64; 3]],
         settle: &ContactSolve<'_>,
         solve: &mut PlanSolve<'_>,
-    ) -> Result<Settled> {
+    ) -> Result<SolvedRows> {
         let clock = Clock::new();
         let ContactSolve { sliding, motions, begin, options, linked } = settle;
         let rows = begin.as_ref().map_or(&[][..], |b| b.rows);
@@ -75,14 +76,13 @@ impl Unfactored {
         let rows = body.last.map_or_else(Vec::new, |last| last.to);
         // A step that need not be exact estimates its own error, whatever the contrast.
         if let Self::Iterative(iterative) = self
-            && iterative.doubtful()
+            && iterative.doubtful
             && linked.share.is_none()
         {
             iterative.check_worth(&rows, body.solve)?;
         }
-        let effort = &mut body.solve.effort;
-        effort.error_estimate = effort.error_estimate.max(left_by(&state));
-        Ok(Settled { rows, contact: state, contact_seconds: clock.total() })
+        body.solve.leaves(left_by(&state));
+        Ok(SolvedRows::new(rows, Some(state), clock.total()))
     }
 
     /// Rows of the projected system, P A P + k (I − P), P = I − n⊗n on held nodes.
@@ -118,7 +118,7 @@ impl Unfactored {
             Self::Refactored { symbolic, matrix } => {
                 let factor = symbolic.factor(&conditions.applied_to(matrix))?;
                 let rows = factor.solve(&rhs);
-                solve.effort.error_estimate = direct_error(&factor, &rows);
+                solve.error_estimate = direct_error(&factor, &rows);
                 Advance { rows, solved: true, is_carried: false }
             }
         };
@@ -166,15 +166,6 @@ impl RowLinks<'_> {
     }
 }
 
-/// Displacements of the rows at contact equilibrium.
-pub(crate) struct Settled {
-    /// mm.
-    pub rows: Vec<[f64; 3]>,
-    pub contact: ContactResult,
-    /// Time that contact took, s.
-    pub contact_seconds: f64,
-}
-
 /// Starting state of a solve with contact: the end of a solve for a similar plan or body.
 pub(crate) struct WarmStart<'a> {
     /// Displacements of the rows.
@@ -189,7 +180,7 @@ pub(crate) fn settled_by_flexibility(
     b: &[[f64; 3]],
     settle: &ContactSolve<'_>,
     solve: &mut PlanSolve<'_>,
-) -> Result<Settled> {
+) -> Result<SolvedRows> {
     let clock = Clock::new();
     let ContactSolve { sliding, motions, begin, options, .. } = settle;
     let first = begin.as_ref().map(|b| &b.contact);
@@ -201,8 +192,8 @@ pub(crate) fn settled_by_flexibility(
     let state = sliding.solve(motions, first, &options.contact, solve.interrupted, &mut body)?;
     let contact_seconds = clock.total();
     let rows = in_pool(|| body.answers.of_all(&state.reactions));
-    solve.effort.error_estimate = direct_error(factor, &rows).max(left_by(&state));
-    Ok(Settled { rows, contact: state, contact_seconds })
+    solve.error_estimate = direct_error(factor, &rows).max(left_by(&state));
+    Ok(SolvedRows::new(rows, Some(state), contact_seconds))
 }
 
 /// The body reduced to its sliding nodes: every other node follows them exactly.
@@ -304,7 +295,7 @@ impl Body for Projected<'_, '_> {
             None => {
                 let mut rows = std::mem::take(&mut self.trail.rows);
                 rows.resize(self.b.len(), [0.0; 3]);
-                for (node, &u) in self.sliding.nodes().iter().zip(c.about) {
+                for (node, &u) in self.sliding.nodes.iter().zip(c.about) {
                     rows[node.row as usize] = u;
                 }
                 let forces = self.forces(&rows);
@@ -324,7 +315,7 @@ impl Body for Projected<'_, '_> {
         };
         let forces = self.forces(&x);
         let of = |rows: &[[f64; 3]]| {
-            self.sliding.nodes().iter().map(|n| rows[n.row as usize]).collect::<Vec<_>>()
+            self.sliding.nodes.iter().map(|n| rows[n.row as usize]).collect::<Vec<_>>()
         };
         let (displacements, reactions) = (of(&x), of(&forces));
         let step = RowStep { from, to: x, forces_from, forces_to: forces };
@@ -355,7 +346,7 @@ pub(crate) fn left_by(state: &ContactResult) -> f64 {
 
 /// Estimate of the largest nodal error of a solution by factorisation, mm.
 pub(crate) fn direct_error(factor: &Factor, x: &[[f64; 3]]) -> f64 {
-    TRIAL_SAFETY * factor.trial_error() * x.iter().fold(0.0_f64, |m, v| m.max(norm(*v)))
+    TRIAL_SAFETY * factor.trial_error * x.iter().fold(0.0_f64, |m, v| m.max(norm(*v)))
 }
 
 /// The error for a method that cannot solve for parts that touch.
@@ -367,9 +358,12 @@ fn not_touching(found: (&'static str, &str), needed: &'static str) -> MtmError {
     ErrorKind::Solver.not_together(found, "a boundary with touching pairs", needed)
 }
 
-/// The method for a boundary with pairs that may touch: every round changes the matrix, and would need a new
+/// The method for `boundary`: with pairs that may touch, every round changes the matrix, and would need a new
 /// factorisation.
-pub(crate) fn method_for_touching(options: &StaticOptions) -> Result<Method> {
+pub(crate) fn method_for(boundary: &Boundary, options: &StaticOptions) -> Result<Method> {
+    if boundary.touching().is_empty() {
+        return Ok(options.method);
+    }
     if options.kinematics != Kinematics::Linear {
         return Err(not_touching(("kinematics", options.kinematics.name()), "linear"));
     }

@@ -20,16 +20,17 @@ use crate::statics::linear::iterative::Extremes;
 use crate::statics::linear::system::{BodyRows, Frozen, SolvedRows, System, not_liftable};
 use crate::statics::newton::{Equilibrium, SlidingBody};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
-use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart, method_for_touching};
+use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart, method_for};
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Support};
-use crate::statics::solution::{Clock, Solution, Timings, TouchResult};
+use crate::statics::solution::{Clock, Solution, Timings};
 use crate::vector::{add, norm, scaled};
 
 /// Multiple of the correction of a solution by factorisation that is taken as the error of the corrected one.
 const CORRECTION_SAFETY: f64 = 2.0;
 
 /// A patient's tensors and node kinds, ready for any plan.
+#[derive(Clone)]
 pub struct StaticSolver {
     pub(crate) tensors: Arc<MassTensors>,
     boundary: Arc<Boundary>,
@@ -44,7 +45,7 @@ pub struct StaticSolver {
     /// Nodes among the unknowns that the boundary holds: the same factor serves plans that free them.
     on_bone: Vec<u32>,
     /// What may touch what.
-    pairs: Option<Pairs>,
+    pairs: Option<Arc<Pairs>>,
     mechanics: Mechanics,
     held: Support,
     /// Coupling of unknown rows with joined nodes: (row, node, tensor).
@@ -53,11 +54,12 @@ pub struct StaticSolver {
 }
 
 /// How the unknown rows are computed for a plan.
+#[derive(Clone)]
 enum Mechanics {
     /// One linear system for every plan.
-    Linear(Box<System>),
+    Linear(Arc<System>),
     /// Newton's method.
-    LargeRotation(Box<Equilibrium>),
+    LargeRotation(Arc<Equilibrium>),
 }
 
 /// A plan in terms of the system.
@@ -93,15 +95,18 @@ fn mechanics_of(
     clock: &mut Clock,
     interrupted: Interrupt<'_>,
 ) -> Result<(Mechanics, Method)> {
+    if interrupted() {
+        return Err(MtmError::Interrupted);
+    }
     if options.kinematics == Kinematics::Linear {
         return System::new(matrix, body, options, clock, interrupted)
-            .map(|(system, method)| (Mechanics::Linear(Box::new(system)), method));
+            .map(|(system, method)| (Mechanics::Linear(Arc::new(system)), method));
     }
     if !body.liftable.0.is_empty() {
         return Err(not_liftable("kinematics", options.kinematics.name().into()));
     }
     Equilibrium::new(tensors.clone(), reduction.clone(), &matrix, options, clock)
-        .map(|(body, method)| (Mechanics::LargeRotation(Box::new(body)), method))
+        .map(|(body, method)| (Mechanics::LargeRotation(Arc::new(body)), method))
 }
 
 impl StaticSolver {
@@ -113,22 +118,17 @@ impl StaticSolver {
     pub fn new(
         tensors: Arc<MassTensors>,
         boundary: Arc<Boundary>,
-        mut options: StaticOptions,
+        options: StaticOptions,
         interrupted: Interrupt<'_>,
     ) -> Result<Self> {
         options.check()?;
-        if !boundary.touching().is_empty() {
-            options.method = method_for_touching(&options)?;
-        }
+        let options = StaticOptions { method: method_for(&boundary, &options)?, ..options };
         let mut clock = Clock::new();
         let mesh = tensors.mesh().clone();
         let places = tensors.element_nodes().positions();
         let node_kinds = with_mid_edges(&tensors, &boundary)?;
         let kinds = node_kinds.kinds(places.len())?;
         let (liftable, held_places) = node_kinds.liftable();
-        if places.len() > mesh.n_nodes() && !liftable.is_empty() {
-            return Err(not_liftable("element", tensors.element_nodes().element().name().into()));
-        }
         let with_liftable = |kind: NodeKind| {
             let mut kinds = kinds.clone();
             liftable.iter().for_each(|&j| kinds[j as usize] = kind);
@@ -141,14 +141,10 @@ impl StaticSolver {
         let normals = corner_normals(sliding.as_ref(), mesh.n_nodes());
         let held = restraint::check(&mesh, |j| rows[j] == NO_ROW, &normals)?;
         clock.lap("restraint", true);
-
         let outer = with_liftable(node_kinds.liftable_kind());
         let couplings = couplings(tensors.matrix(), &reduction.unknowns, &outer).into();
         let matrix = reduction.matrix(tensors.matrix());
         clock.lap("reduce", true);
-        if interrupted() {
-            return Err(MtmError::Interrupted);
-        }
         let tissue = Extremes::of(tensors.tissue());
         let (positions, slides) = (&reduction.rows(places), sliding.as_ref());
         let rows: Vec<u32> = liftable.iter().map(|&j| reduction.row_of[j as usize]).collect();
@@ -158,11 +154,10 @@ impl StaticSolver {
         let made = (&tensors, &reduction, matrix);
         let (mechanics, method) = mechanics_of(made, &body, &options, &mut clock, interrupted)
             .map_err(|e| by_node(e, &reduction.unknowns))?;
-        let refines = method.has_factor()
-            && options.kinematics == Kinematics::Linear
-            && is_doubtful(tissue.contrast);
+        let is_linear = options.kinematics == Kinematics::Linear;
+        let refines = method.has_factor() && is_linear && is_doubtful(tissue.contrast);
         let on_bone = held_places.iter().map(|&place| liftable[place]).collect();
-        let sliding = sliding.map(Arc::new);
+        let (sliding, pairs) = (sliding.map(Arc::new), pairs.map(Arc::new));
         Ok(Self {
             tensors,
             boundary,
@@ -197,22 +192,8 @@ impl StaticSolver {
             }
         };
         let system = system.map_err(|e| by_node(e, &self.reduction.unknowns))?;
-        Ok(Self {
-            tensors: self.tensors.clone(),
-            node_kinds: boundary.clone(),
-            boundary,
-            options: self.options,
-            method: self.method,
-            refines: self.refines,
-            reduction: self.reduction.clone(),
-            sliding: self.sliding.clone(),
-            on_bone,
-            pairs: None,
-            mechanics: Mechanics::Linear(Box::new(system)),
-            held: self.held,
-            couplings: self.couplings.clone(),
-            timings: self.timings.clone(),
-        })
+        let mechanics = Mechanics::Linear(Arc::new(system));
+        Ok(Self { node_kinds: boundary.clone(), boundary, on_bone, mechanics, ..self.clone() })
     }
 
     /// How strain follows from displacement.
@@ -304,7 +285,7 @@ impl StaticSolver {
 
         let mut solve = PlanSolve::new(scale, interrupted);
         let posed = PosedPlan { b: &b, u: &u, loads, motions: &motions, start };
-        let (SolvedRows { rows, contact, contact_seconds }, touching, pushes) =
+        let SolvedRows { rows, contact, contact_seconds, touching, pushes } =
             self.solve_rows(&posed, &mut solve)?;
         clock.lap("solve", true);
         u = self.filled(&u, &rows);
@@ -314,8 +295,7 @@ impl StaticSolver {
             forces = self.forces(&u)?;
         }
         let residual = self.residual(&forces, loads, (contact.as_ref(), &pushes), &b);
-        let effort = solve.effort;
-        if !(residual.is_finite() && effort.error_estimate.is_finite()) {
+        if !(residual.is_finite() && solve.error_estimate.is_finite()) {
             let why = "the plan or the moduli are too large for f64";
             return Err(MtmError::Overflow { what: "the solution", why });
         }
@@ -327,9 +307,9 @@ impl StaticSolver {
             displacements: u,
             forces,
             residual,
-            error_estimate: effort.error_estimate,
-            iterations: effort.iterations,
-            residual_history: effort.history,
+            error_estimate: solve.error_estimate,
+            iterations: solve.iterations,
+            residual_history: solve.history,
             contact: self.contact_result(contact, &motions),
             touching,
             contact_iterations,
@@ -391,8 +371,7 @@ impl StaticSolver {
             u[j as usize] = add(u[j as usize], *d);
             largest = largest.max(norm(*d));
         }
-        let effort = &mut solve.effort;
-        effort.error_estimate = effort.error_estimate.max(CORRECTION_SAFETY * largest);
+        solve.leaves(CORRECTION_SAFETY * largest);
         Ok(())
     }
 
@@ -436,18 +415,13 @@ impl StaticSolver {
     }
 
     /// Displacements of the unknown rows at contact equilibrium, and what touches.
-    fn solve_rows(
-        &self,
-        posed: &PosedPlan<'_>,
-        solve: &mut PlanSolve<'_>,
-    ) -> Result<(SolvedRows, TouchResult, Vec<[f64; 3]>)> {
+    fn solve_rows(&self, posed: &PosedPlan<'_>, solve: &mut PlanSolve<'_>) -> Result<SolvedRows> {
         let &PosedPlan { b, u, loads, motions, start } = posed;
-        if let (Mechanics::Linear(system), Some(pairs)) = (&self.mechanics, &self.pairs) {
-            let found = self.solve_touching((system, pairs), motions, loads, solve);
-            return found.map_err(|e| by_node(e, &self.reduction.unknowns));
-        }
-        let found = match (&self.mechanics, &self.sliding) {
-            (Mechanics::LargeRotation(body), sliding) => {
+        let found = match (&self.mechanics, &self.pairs, &self.sliding) {
+            (Mechanics::Linear(system), Some(pairs), _) => {
+                self.solve_touching((system, pairs), motions, loads, solve)
+            }
+            (Mechanics::LargeRotation(body), _, sliding) => {
                 let slide = sliding.as_ref().map(|sliding| SlidingBody {
                     sliding,
                     motions,
@@ -455,8 +429,10 @@ impl StaticSolver {
                 });
                 body.solve(u, loads, slide.as_ref(), solve)
             }
-            (Mechanics::Linear(system), None) => system.solve(b, solve).map(SolvedRows::from),
-            (Mechanics::Linear(system), Some(sliding)) => {
+            (Mechanics::Linear(system), None, None) => {
+                system.solve(b, solve).map(|rows| SolvedRows::new(rows, None, 0.0))
+            }
+            (Mechanics::Linear(system), None, Some(sliding)) => {
                 let rows =
                     start.map_or_else(Vec::new, |start| self.reduction.rows(&start.displacements));
                 let rest = start.and_then(|start| start.contact.at_rest.as_ref());
@@ -464,11 +440,10 @@ impl StaticSolver {
                 let begin = contact.map(|contact| WarmStart { rows: &rows, contact });
                 let (options, linked) = (&self.options, RowLinks::default());
                 let settle = ContactSolve { sliding, motions, begin, options, linked };
-                system.solve_with_contact(b, &settle, solve).map(SolvedRows::from)
+                system.solve_with_contact(b, &settle, solve)
             }
         };
-        let found = found.map_err(|e| by_node(e, &self.reduction.unknowns))?;
-        Ok((found, TouchResult::default(), Vec::new()))
+        found.map_err(|e| by_node(e, &self.reduction.unknowns))
     }
 
     /// Contact at equilibrium for `plan`: the state about which the linear operator of re-planning is frozen.
@@ -485,7 +460,7 @@ impl StaticSolver {
         let scale = u.iter().fold(0.0_f64, |m, v| m.max(norm(*v)));
         let b = self.coupled(&u);
         let posed = PosedPlan { b: &b, u: &u, loads: None, motions: &motions, start: None };
-        Ok(self.solve_rows(&posed, &mut PlanSolve::new(scale, interrupted))?.0.contact)
+        Ok(self.solve_rows(&posed, &mut PlanSolve::new(scale, interrupted))?.contact)
     }
 
     /// Unknown rows for several right-hand sides, with contact frozen if there is any; see
@@ -512,6 +487,9 @@ fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc
     if edges.is_empty() {
         return Ok(boundary.clone());
     }
+    if !boundary.liftable().0.is_empty() {
+        return Err(not_liftable("element", tensors.element_nodes().element().name().into()));
+    }
     let mesh = tensors.mesh();
     let surface = mesh.boundary_edges();
     let on_surface = |edge: [u32; 2]| surface.binary_search(&edge).is_ok();
@@ -521,7 +499,7 @@ fn with_mid_edges(tensors: &MassTensors, boundary: &Arc<Boundary>) -> Result<Arc
 /// Rest normals of the sliding corner nodes. The tets of a part share whole faces, so its corner nodes decide how it
 /// is constrained.
 fn corner_normals(sliding: Option<&Sliding>, n_corners: usize) -> Vec<(u32, [f64; 3])> {
-    let nodes = sliding.iter().flat_map(|s| s.nodes().iter().zip(s.rest_normals()));
+    let nodes = sliding.iter().flat_map(|s| s.nodes.iter().zip(&s.rest_normals));
     nodes
         .map(|(node, &normal)| (node.node, normal))
         .filter(|(node, _)| (*node as usize) < n_corners)

@@ -32,13 +32,13 @@ impl StaticSolver {
             *rest = sub(*rest, *push);
         }
         if let (Some(sliding), Some(state)) = (&self.sliding, contact) {
-            for (i, node) in sliding.nodes().iter().enumerate() {
+            for (i, node) in sliding.nodes.iter().enumerate() {
                 let push = scaled(state.normals[i], state.forces[i]);
                 rest[node.row as usize] = sub(rest[node.row as usize], push);
                 scale += dot(push, push);
             }
             for row in &state.rows {
-                let j = sliding.nodes()[row.node].node as usize;
+                let j = sliding.nodes[row.node].node as usize;
                 let k = self.tensors.matrix().diagonal_block(j);
                 let way = scaled(row.normal, dot(row.normal, state.displacements[row.node]));
                 let alone = [0, 1, 2].map(|i| dot([k[3 * i], k[3 * i + 1], k[3 * i + 2]], way));

@@ -34,7 +34,7 @@ impl StaticSolver {
     /// Rejects a starting solution of another mesh or boundary.
     pub(crate) fn check_start(&self, start: &Solution) -> Result<()> {
         let n = self.tensors.element_nodes().n_nodes();
-        let nodes = self.sliding.as_ref().map_or(0, |s| s.nodes().len());
+        let nodes = self.sliding.as_ref().map_or(0, |s| s.nodes.len());
         let counts = [
             ("displacements of the start", start.displacements.len(), n),
             ("sliding nodes of the start", start.contact.nodes.len(), nodes),

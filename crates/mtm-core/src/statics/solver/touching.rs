@@ -113,15 +113,14 @@ struct Done {
 }
 
 impl StaticSolver {
-    /// The body at the end of a plan of one motion per segment, what touches, and the contact force on each
-    /// row, N.
+    /// The body at the end of a plan of one motion per segment.
     pub(super) fn solve_touching(
         &self,
         (system, pairs): (&System, &Pairs),
         motions: &[&Motion],
         loads: Option<&[[f64; 3]]>,
         solve: &mut PlanSolve<'_>,
-    ) -> Result<(SolvedRows, TouchResult, Vec<[f64; 3]>)> {
+    ) -> Result<SolvedRows> {
         let rows = BodyRows {
             positions: &self.reduction.rows(self.tensors.element_nodes().positions()),
             sliding: self.sliding.as_deref(),
@@ -140,7 +139,7 @@ impl TouchingPlan<'_> {
     /// # Errors
     /// `ContactNotConverged` if the rounds run out with a gap or penetration that would be visible on a face,
     /// or if a step penetrates however short it is; those of the solves.
-    fn solve(&self, solve: &mut PlanSolve<'_>) -> Result<(SolvedRows, TouchResult, Vec<[f64; 3]>)> {
+    fn solve(&self, solve: &mut PlanSolve<'_>) -> Result<SolvedRows> {
         let clock = Clock::new();
         let sliding = self.rows.sliding;
         let farthest = sliding.map_or(0.0, |s| s.farthest(self.motions)).max(solve.scale);
@@ -158,9 +157,8 @@ impl TouchingPlan<'_> {
             match next {
                 Some((next, done)) if there == 1.0 => {
                     rounds += done.rounds;
-                    let (mut solved, touching, pushes) = self.end(next, &done, rounds, solve)?;
-                    solved.contact_seconds = clock.total();
-                    return Ok((solved, touching, pushes));
+                    let solved = self.end(next, &done, rounds, solve)?;
+                    return Ok(SolvedRows { contact_seconds: clock.total(), ..solved });
                 }
                 Some((next, done)) => {
                     rounds += done.rounds;
@@ -317,7 +315,7 @@ impl TouchingPlan<'_> {
     fn begun(&self, pose: &PartialState) -> Option<ContactStart> {
         let (sliding, state) = (self.rows.sliding?, pose.contact.as_ref()?);
         let at = |node: &SlidingNode, place: &[f64; 3]| add(*place, pose.rows[node.row as usize]);
-        let places = sliding.nodes().iter().zip(&sliding.positions).map(|(n, x)| at(n, x));
+        let places = sliding.nodes.iter().zip(&sliding.positions).map(|(n, x)| at(n, x));
         Some(ContactStart { places: places.collect(), reactions: state.reactions.clone() })
     }
 
@@ -336,7 +334,7 @@ impl TouchingPlan<'_> {
     ) -> Result<(Vec<[f64; 3]>, Option<ContactResult>)> {
         let rows = &pose.rows[..];
         let linked = RowLinks { links: &round.links, share: rough.then_some(ROUGH_SHARE) };
-        let before = solve.effort.iterations;
+        let before = solve.iterations;
         let (rows, contact) = if let Some(sliding) = self.rows.sliding {
             let mut options = self.body.options;
             if rough {
@@ -346,11 +344,11 @@ impl TouchingPlan<'_> {
             let motions = goal.motions;
             let settle = ContactSolve { sliding, motions, begin, options: &options, linked };
             let found = self.system.solve_with_contact(goal.b, &settle, solve)?;
-            (found.rows, Some(found.contact))
+            (found.rows, found.contact)
         } else {
             (self.system.solve_linked(goal.b, linked, rows, solve)?, None)
         };
-        if rough && solve.effort.iterations > before + WORN {
+        if rough && solve.iterations > before + WORN {
             let pushing = round.links.iter().filter(|link| link.pull(&rows) > 0.0);
             let links: Vec<Link> = pushing.cloned().collect();
             solve.multigrid = Some(self.system.multigrid_with(&links, &self.rows)?);
@@ -411,7 +409,7 @@ impl TouchingPlan<'_> {
         done: &Done,
         rounds: usize,
         solve: &mut PlanSolve<'_>,
-    ) -> Result<(SolvedRows, TouchResult, Vec<[f64; 3]>)> {
+    ) -> Result<SolvedRows> {
         let inside = self.pairs.overlap.inside(self.mesh(), &pose.u);
         let overlap = inside.iter().fold(0.0, |m: f64, (_, depth)| m.max(*depth));
         let open = done.left.beside_tissue().max(overlap);
@@ -420,19 +418,18 @@ impl TouchingPlan<'_> {
         }
         // The motion remaining in the last round may be a node's alternation between two facets, and is at
         // least its error.
-        let error = open.max(done.change);
-        solve.effort.error_estimate = solve.effort.error_estimate.max(error);
+        solve.leaves(open.max(done.change));
         let mut met = self.pairs.met(&done.planes, &done.round, &pose.rows);
         // A node that has slid past the border of the other part may have its closest point on the far side.
         let is_inside = |node: u32| inside.binary_search_by_key(&node, |(j, _)| *j).is_ok();
         let close = self.close();
         met.retain(|m| m.is_bone || m.force > 0.0 || m.gap >= -close || is_inside(m.node));
-        let mut forces = vec![[0.0; 3]; pose.rows.len()];
+        let mut pushes = vec![[0.0; 3]; pose.rows.len()];
         for link in &done.round.links {
-            link.add(link.pull(&pose.rows), &mut forces);
+            link.add(link.pull(&pose.rows), &mut pushes);
         }
         let converged = done.converged && overlap <= THROUGH * self.close();
-        let result = TouchResult {
+        let touching = TouchResult {
             nodes: met.iter().map(|m| m.node).collect(),
             gaps: met.iter().map(|m| m.gap).collect(),
             normals: met.iter().map(|m| m.normal).collect(),
@@ -442,7 +439,7 @@ impl TouchingPlan<'_> {
             converged,
         };
         let PartialState { rows, contact, .. } = pose;
-        Ok((SolvedRows { rows, contact, contact_seconds: 0.0 }, result, forces))
+        Ok(SolvedRows { rows, contact, touching, pushes, contact_seconds: 0.0 })
     }
 
     /// The error for touching parts without equilibrium, with the nodes that carry the largest forces.

@@ -25,8 +25,6 @@ use krylov::{Krylov, length};
 use rows::pushes;
 pub(crate) use rows::{ConditionRows, singular};
 
-/// Maximum number of conjugate gradient steps: a new factorisation takes as long as sixty products of the matrix.
-const MOST_PRODUCTS: usize = 60;
 /// Accuracy of a step above which approximate products do for the nodes as well.
 const ROUGH_STEP: f64 = 1e-2;
 /// Maximum number of times that forces found with approximate products are corrected by an exact one; each takes
@@ -49,7 +47,8 @@ const EXACT_SHARE: f64 = 1e-4;
 
 /// Data kept for sliding nodes: their flexibility, and the inverse of its part along the normals at rest.
 pub(crate) struct ContactFactor {
-    flexibility: TailFlexibility,
+    /// The flexibility of the sliding nodes.
+    pub flexibility: TailFlexibility,
     rest: Arc<NormalFactor>,
 }
 
@@ -106,11 +105,6 @@ impl ContactFactor {
             made: None,
         }
     }
-
-    /// The flexibility of the sliding nodes.
-    pub fn flexibility(&self) -> &TailFlexibility {
-        &self.flexibility
-    }
 }
 
 /// Responses of the sliding nodes to the constraints of one plan, each starting from the previous one.
@@ -152,7 +146,7 @@ impl<'a> Answers<'a> {
         if inner.is_made {
             self.made = Some(inner.kept.clone());
         }
-        self.memory = inner.into_memory();
+        self.memory = inner.along.into_memory();
         let (solved, is_carried) = found?;
         let (displacements, reactions) = (self.displacements(), self.pushed.clone());
         Ok(Response { displacements, reactions, slopes: None, solved, is_carried })
@@ -175,7 +169,7 @@ impl<'a> Answers<'a> {
         let mut forces = rows.turned(&self.pushed, c.rows.len());
         self.push(pushes(n, &rows.rows, &forces), precision);
         let mut open = rows.open(&self.displacements(), &forces);
-        let mut measure = inner.measure(&open);
+        let mut measure = inner.preconditioner.measure(&open);
         let aim = if precision == ProductAccuracy::Rough { c.share * measure } else { 0.0 };
         let (mut loads, mut is_carried) = (vec![0.0; unstable.len()], false);
         for round in 0..MOST_ROUNDS {
@@ -193,7 +187,7 @@ impl<'a> Answers<'a> {
             }
             self.push(now, precision);
             open = rows.open(&self.displacements(), &forces);
-            let before = std::mem::replace(&mut measure, inner.measure(&open));
+            let before = std::mem::replace(&mut measure, inner.preconditioner.measure(&open));
             let is_exact = measure <= exact * self.size() || self.is_rounding(&open);
             if is_exact && self.precision == ProductAccuracy::Exact {
                 return Ok((true, is_carried));
@@ -227,7 +221,7 @@ impl<'a> Answers<'a> {
         while size > 0.0 && krylov.basis.len() < MOST_LOAD_STEPS.min(unstable.len()) {
             let mut push = vec![0.0; n];
             push.extend(next.iter().zip(&root).map(|(v, r)| v * r));
-            let there = inner.multiply(&push);
+            let there = inner.along.multiply(&push);
             let goals: Vec<f64> = there[..n].iter().map(|v| -v).collect();
             // Later directions contribute less, so that errors of their responses count less (Simoncini &
             // Szyld 2003).
@@ -263,7 +257,7 @@ impl<'a> Answers<'a> {
         let contact: &'a ContactFactor = self.contact;
         let tail = &contact.flexibility;
         let along = Along::new(tail, rows, unstable, std::mem::take(&mut self.memory));
-        Inner::new(along, rows, (self.diagonal(rows), kept), MOST_PRODUCTS, tail)
+        Inner::new(along, rows, (self.diagonal(rows), kept), tail)
     }
 
     /// Displacements after the last response, mm.
