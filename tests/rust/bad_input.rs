@@ -9,7 +9,7 @@ use crate::meshes::{
 use mtm_core::{
     Elastic, ErrorKind, FibreElastic, FibreLaw, Gap, MassTensors, Method, Mixing, Motion, MtmError,
     Preset, Result, RigidMotion, StaticOptions, Surface, SurfaceMotion, TetMesh, Tissue,
-    WindingOptions, WindingTree,
+    WindingTree,
 };
 
 const BAD: [f64; 3] = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY];
@@ -357,7 +357,7 @@ fn broken_triangles_are_named() {
     let sheet = Surface::new(vertices, vec![[0, 1, 2]]).unwrap();
     for beta in [0.5, f64::NAN] {
         assert_refused!(
-            WindingTree::with_options(&sheet, &WindingOptions { beta }),
+            WindingTree::with_beta(&sheet, beta),
             OutOfRange { .. },
             Mesh,
             "beta",

@@ -134,7 +134,7 @@ pub use geometry::smoothing::smoothed;
 pub use geometry::surface::{Closest, Surface};
 pub use geometry::triangle::{DEGENERATE_AREA, Feature};
 pub use geometry::tube::{TubeEnd, tube_levels};
-pub use geometry::winding::{WindingOptions, WindingTree, winding_number_exact};
+pub use geometry::winding::{WindingTree, winding_number_exact};
 pub use mechanics::element::{Element, ElementNodes};
 pub use mechanics::hyperelastic::HyperelasticLaw;
 pub use mechanics::kinematics::Kinematics;

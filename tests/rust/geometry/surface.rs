@@ -3,9 +3,7 @@
 use std::collections::HashMap;
 use std::f64::consts::PI;
 
-use mtm_core::{
-    Closest, ErrorKind, Feature, MtmError, Surface, SurfaceMotion, WindingOptions, WindingTree,
-};
+use mtm_core::{Closest, ErrorKind, Feature, MtmError, Surface, SurfaceMotion, WindingTree};
 use nalgebra::Vector3;
 
 pub(super) type Vec3 = Vector3<f64>;
@@ -447,7 +445,7 @@ fn bad_surfaces_are_refused_with_the_place() {
     let error = surface.moved(vec![[0.0; 3]; 8]).unwrap_err();
     assert!(matches!(error, MtmError::DegenerateTriangle { triangle: 0, .. }));
     for beta in [0.5, f64::NAN, f64::INFINITY] {
-        let error = WindingTree::with_options(&surface, &WindingOptions { beta });
+        let error = WindingTree::with_beta(&surface, beta);
         assert!(matches!(error, Err(MtmError::OutOfRange { .. })), "{beta}");
     }
 }

@@ -1,7 +1,7 @@
 //! Winding numbers against the exact sum and against what is inside by construction.
 
 use super::surface::{Numbers, Vec3, icosphere, sphere};
-use mtm_core::{Surface, WindingOptions, WindingTree, winding_number_exact};
+use mtm_core::{Surface, WindingTree, winding_number_exact};
 
 #[test]
 fn winding_number_tells_inside_from_outside() {
@@ -40,7 +40,7 @@ fn hierarchical_winding_number_is_close_to_the_exact_sum() {
     points.extend(surface.vertices().iter().take(200).map(|v| v.map(|x| x * 0.98)));
     let exact = winding_number_exact(&surface, &points);
     let worst = |beta: f64| {
-        let tree = WindingTree::with_options(&surface, &WindingOptions { beta }).unwrap();
+        let tree = WindingTree::with_beta(&surface, beta).unwrap();
         let found = tree.winding_number(&points);
         assert!(found.iter().chain(&exact).all(|w| w.is_finite()));
         found.iter().zip(&exact).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)

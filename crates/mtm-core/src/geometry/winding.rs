@@ -17,21 +17,9 @@ const LEAF_TRIANGLES: usize = 8;
 /// and far from overflow and underflow.
 const PRODUCT_RANGE: std::ops::Range<f64> = 1e-100..1e100;
 
-/// How far away a cluster of triangles must be to be replaced by its expansion.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct WindingOptions {
-    /// Distance to the centre of a cluster over its radius above which the expansion is used.
-    ///
-    /// 2, as in Barill et al. 2018; larger is slower and closer to the exact sum (the error falls
-    /// with the third power). At least 1.
-    pub beta: f64,
-}
-
-impl Default for WindingOptions {
-    fn default() -> Self {
-        Self { beta: 2.0 }
-    }
-}
+/// Distance to the centre of a cluster over its radius above which its expansion is used, as in Barill et al. 2018:
+/// a larger one is slower and closer to the exact sum (the error falls with the third power).
+pub(crate) const BETA: f64 = 2.0;
 
 /// A tree over the triangles of a surface that sums their solid angles, replacing distant triangles by clusters
 /// (Barill, Dickson, Schmidt, Levin, Jacobson 2018, "Fast winding numbers for soups and clouds").
@@ -81,25 +69,20 @@ struct Cluster {
 }
 
 impl WindingTree {
-    /// Tree of a surface with the default options.
+    /// Tree of a surface.
     ///
     /// The surface need not be closed, free of overlaps, or consistently oriented.
     pub fn new(surface: &Surface) -> Self {
-        Self::build(surface, WindingOptions::default().beta)
+        Self::build(surface, BETA)
     }
 
-    /// Tree of a surface with given options.
+    /// Tree of a surface that replaces clusters further away than `beta` of their radii, 2 by default.
     ///
     /// # Errors
     /// [`crate::MtmError::OutOfRange`] for a `beta` below 1.
-    pub fn with_options(surface: &Surface, options: &WindingOptions) -> Result<Self> {
-        let beta = options.beta;
-        ErrorKind::Mesh.require(
-            beta.is_finite() && beta >= 1.0,
-            "winding number beta",
-            beta,
-            "1 or more",
-        )?;
+    pub fn with_beta(surface: &Surface, beta: f64) -> Result<Self> {
+        let is_allowed = beta.is_finite() && beta >= 1.0;
+        ErrorKind::Mesh.require(is_allowed, "winding number beta", beta, "1 or more")?;
         Ok(Self::build(surface, beta))
     }
 

@@ -1,7 +1,7 @@
 //! A muscle's surface prepared for many queries: triangles with their boxes, border, winding tree.
 
 use crate::geometry::surface::Surface;
-use crate::geometry::winding::{WindingOptions, WindingTree};
+use crate::geometry::winding::{BETA, WindingTree};
 use crate::muscles::equivalent::aligned_box::AlignedBox;
 use crate::muscles::equivalent::border::Border;
 use crate::vector::Vec3;
@@ -11,7 +11,7 @@ const INSIDE: f64 = 0.5;
 /// Error of a hierarchical winding number, with a margin: the tests hold it below half of this.
 const WINDING_ERROR: f64 = 0.02;
 
-/// [`WindingOptions::beta`] of a surface without a border: its winding number is an integer, so that an error
+/// As [`BETA`], of a surface without a border: its winding number is an integer, so that an error
 /// of a tenth is as good as one of a hundredth.
 const CLOSED_BETA: f64 = 1.4;
 
@@ -65,10 +65,8 @@ impl<'a> MuscleShape<'a> {
         let signed_volume = signed_volume(&corners, &bounds.centre());
         let orientation = if signed_volume < 0.0 { -1.0 } else { 1.0 };
         let border = Border::new(surface);
-        let options = WindingOptions {
-            beta: if border.is_empty() { CLOSED_BETA } else { WindingOptions::default().beta },
-        };
-        let tree = WindingTree::with_options(surface, &options).expect("both betas are allowed");
+        let beta = if border.is_empty() { CLOSED_BETA } else { BETA };
+        let tree = WindingTree::with_beta(surface, beta).expect("both betas are allowed");
         Self { surface, corners, boxes, bounds, border, tree, signed_volume, orientation, test }
     }
 
