@@ -186,14 +186,19 @@ pub fn postorder(parents: &[usize]) -> Vec<u32> {
     order
 }
 
-/// Elimination tree of the graph of `matrix` in the order `order` (position → row): the parent position
-/// of each position, `usize::MAX` for roots (Liu 1986).
-pub fn elimination_tree(matrix: &BlockMatrix, order: &[u32]) -> Vec<usize> {
-    let n = order.len();
-    let mut position = vec![0_u32; n];
+/// Position of each row in the order.
+pub fn positions(order: &[u32]) -> Vec<u32> {
+    let mut position = vec![0_u32; order.len()];
     for (p, &j) in order.iter().enumerate() {
         position[j as usize] = p as u32;
     }
+    position
+}
+
+/// Elimination tree of the graph of `matrix` in the order `order` (position → row): the parent position
+/// of each position, `usize::MAX` for roots (Liu 1986).
+pub fn elimination_tree(matrix: &BlockMatrix, order: &[u32]) -> Vec<usize> {
+    let (n, position) = (order.len(), positions(order));
     let (mut parent, mut ancestor) = (vec![usize::MAX; n], vec![usize::MAX; n]);
     for p in 0..n {
         for &k in matrix.row(order[p] as usize).0 {

@@ -190,9 +190,7 @@ impl TailFlexibility {
             column[0] += softness[c];
         })
     }
-}
 
-impl TailFlexibility {
     /// The flexibility between `directions` (node and unit vector, nodes ascending) in single precision,
     /// with `softness` (mm/N) added to its diagonal, while all liftable nodes are held; `memory`: of an earlier one.
     pub fn rough_flexibility(
@@ -211,17 +209,17 @@ impl TailFlexibility {
             .iter()
             .zip(&scale)
             .map(|(&(node, axis), s)| {
-                std::array::from_fn(|a| (axis[a] * self.rough.scale(3 * node + a) / s) as f32)
+                std::array::from_fn(|a| (axis[a] * self.rough.scale[3 * node + a] / s) as f32)
             })
             .collect();
         let nodes: Vec<usize> = directions.iter().map(|(node, _)| *node).collect();
         let matrix = DenseSymmetric::from_columns_in(memory, nodes.len(), |c, column| {
-            let columns = [0, 1, 2].map(|b| self.rough.column(3 * nodes[c] + b));
+            let columns = [0, 1, 2].map(|b| self.rough.matrix.column(3 * nodes[c] + b));
             let (nodes, weights) = (&nodes[c..], &weights[c..]);
             widest(Project { columns, nodes, weights, column });
             column[0] = 1.0;
         });
-        Rough::from_scaled(matrix, scale)
+        Rough { matrix, scale }
     }
 }
 

@@ -24,13 +24,15 @@ pub use normal::{
     conjugate_gradients, hopeless,
 };
 use spread::Spread;
-use structure::{minimum_degree, positions, supernodal_structure};
+use structure::{minimum_degree, supernodal_structure};
 use sweep::{Supernode, Sweep};
 pub use symmetric::{DenseFactor, DenseSymmetric, ROWS_TO_SHARE, Rough};
 use workspace::{out_of_memory, parallelism};
 
 use crate::algebra::blocks::BlockMatrix;
-use crate::algebra::ordering::{NodeGraph, elimination_tree, nested_dissection, postorder};
+use crate::algebra::ordering::{
+    NodeGraph, elimination_tree, nested_dissection, positions, postorder,
+};
 use crate::error::{MtmError, Result};
 
 /// Relative error of a known solution above which the system counts as singular to working precision.
@@ -113,10 +115,9 @@ impl Symbolic {
             .try_reserve_exact(self.structure.len_val())
             .map_err(|_| out_of_memory("the Cholesky factor", bytes))?;
         let mut values = vec![0.0; self.structure.len_val()];
-        let order = (&self.order[..], &self.position[..]);
         let why = "a pivot of the factorisation is not positive; a part of the body may be a mechanism, or \
                    the material contrast too large for f64";
-        numeric::factor(&self.structure, &self.tree, matrix, order, &mut values)
+        numeric::factor(self, matrix, &mut values)
             .map_err(|index| MtmError::not_definite(self.order[index / 3] as usize, why))?;
         Factor { symbolic: self.clone(), values, trial_error: 0.0 }.tried(matrix)
     }
@@ -196,8 +197,8 @@ impl Factor {
     /// A⁻¹ b.
     pub fn solve(&self, b: &[[f64; 3]]) -> Vec<[f64; 3]> {
         let mut x = self.permuted(b);
-        self.forward(&mut x);
-        self.backward(&mut x);
+        self.sweep().forward(&mut x);
+        self.sweep().backward(&mut x);
         self.unpermuted(&x)
     }
 
@@ -223,16 +224,7 @@ impl Factor {
         }
     }
 
-    /// x ← L⁻¹ x in elimination order.
-    pub fn forward(&self, x: &mut [f64]) {
-        self.sweep().forward(x);
-    }
-
-    /// x ← L⁻ᵀ x in elimination order.
-    pub fn backward(&self, x: &mut [f64]) {
-        self.sweep().backward(x);
-    }
-
+    /// Sweeps of vectors in elimination order.
     pub fn sweep(&self) -> Sweep<'_> {
         Sweep::new((&self.symbolic.structure, &self.values), &self.symbolic.tree)
     }

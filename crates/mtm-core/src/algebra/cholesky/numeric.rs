@@ -14,6 +14,7 @@ use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 use faer::{Accum, MatMut, Par};
 
+use super::Symbolic;
 use crate::algebra::blocks::BlockMatrix;
 
 /// Multiplications below which a subtree is not worth another thread.
@@ -89,22 +90,14 @@ impl Tree {
 type Update = (usize, Vec<f64>);
 
 struct Work<'a> {
-    structure: &'a SymbolicSupernodalCholesky<usize>,
-    tree: &'a Tree,
+    symbolic: &'a Symbolic,
     matrix: &'a BlockMatrix,
-    order: &'a [u32],
-    position: &'a [u32],
 }
 
 /// Fills `values` (zeros) with the factor; on failure, the column of the first pivot that is not positive.
-pub fn factor(
-    structure: &SymbolicSupernodalCholesky<usize>,
-    tree: &Tree,
-    matrix: &BlockMatrix,
-    (order, position): (&[u32], &[u32]),
-    values: &mut [f64],
-) -> Result<(), usize> {
-    let work = Work { structure, tree, matrix, order, position };
+pub fn factor(symbolic: &Symbolic, matrix: &BlockMatrix, values: &mut [f64]) -> Result<(), usize> {
+    let work = Work { symbolic, matrix };
+    let Symbolic { structure, tree, .. } = symbolic;
     let start = structure.col_ptr_for_val();
     let (inner, tail) = values.split_at_mut(start[tree.tail]);
     let alone = rayon::current_num_threads() > 1;
@@ -130,7 +123,7 @@ impl Work<'_> {
         first: usize,
         alone: bool,
     ) -> Result<Vec<Update>, usize> {
-        let start = self.structure.col_ptr_for_val();
+        let start = self.symbolic.structure.col_ptr_for_val();
         if let Some(cut) = self.cut(roots) {
             let middle = roots[cut - 1] + 1;
             let (left, right) = values.split_at_mut(start[middle] - start[first]);
@@ -156,10 +149,11 @@ impl Work<'_> {
     /// How many of `roots` to give to one thread so that two have the same amount of work; nothing if the
     /// smaller share is not worth a thread.
     fn cut(&self, roots: &[usize]) -> Option<usize> {
-        let work: f64 = roots.iter().map(|&r| self.tree.work[r]).sum();
+        let work: f64 = roots.iter().map(|&r| self.symbolic.tree.work[r]).sum();
         let (mut cut, mut done) = (0, 0.0);
-        while cut + 1 < roots.len() && done + 0.5 * self.tree.work[roots[cut]] < 0.5 * work {
-            done += self.tree.work[roots[cut]];
+        while cut + 1 < roots.len() && done + 0.5 * self.symbolic.tree.work[roots[cut]] < 0.5 * work
+        {
+            done += self.symbolic.tree.work[roots[cut]];
             cut += 1;
         }
         let lesser = done.min(work - done);
@@ -179,7 +173,7 @@ impl Work<'_> {
         first: usize,
         alone: bool,
     ) -> Result<Vec<f64>, usize> {
-        let (tree, start) = (self.tree, self.structure.col_ptr_for_val());
+        let (tree, start) = (&self.symbolic.tree, self.symbolic.structure.col_ptr_for_val());
         let mut shared = Some(root);
         while let Some(t) = shared
             && self.cut(&tree.children[t]).is_none()
@@ -216,16 +210,16 @@ impl Work<'_> {
         updates: Vec<Update>,
         alone: bool,
     ) -> Result<Vec<f64>, usize> {
-        let node = self.structure.supernode(s);
+        let node = self.symbolic.structure.supernode(s);
         let (begin, pattern) = (node.start(), node.pattern());
-        let end = self.structure.supernode_end()[s];
+        let end = self.symbolic.structure.supernode_end()[s];
         let (width, height) = (end - begin, pattern.len());
         let rows = width + height;
         self.gather(begin, end, pattern, own);
         let children: Vec<(Runs, Vec<f64>)> = updates
             .into_iter()
             .map(|(child, values)| {
-                let child = self.structure.supernode(child).pattern();
+                let child = self.symbolic.structure.supernode(child).pattern();
                 (Runs::new(child, begin, end, pattern), values)
             })
             .collect();
@@ -268,10 +262,10 @@ impl Work<'_> {
     fn gather(&self, begin: usize, end: usize, pattern: &[usize], own: &mut [f64]) {
         let (width, rows) = (end - begin, end - begin + pattern.len());
         for p in begin / 3..end / 3 {
-            let row = self.order[p] as usize;
+            let row = self.symbolic.order[p] as usize;
             let (columns, blocks) = self.matrix.row(row);
             for (&k, block) in columns.iter().zip(blocks) {
-                let q = self.position[k as usize] as usize;
+                let q = self.symbolic.position[k as usize] as usize;
                 if q < p {
                     continue;
                 }

@@ -7,7 +7,7 @@ use faer::sparse::linalg::{SymbolicSupernodalParams, amd};
 
 use super::workspace::{buffer, out_of_memory};
 use crate::algebra::blocks::BlockMatrix;
-use crate::algebra::ordering::NodeGraph;
+use crate::algebra::ordering::{NodeGraph, positions};
 use crate::error::Result;
 
 /// Approximate minimum degree order of a graph (Amestoy, Davis & Duff 1996).
@@ -56,15 +56,6 @@ pub fn supernodal_structure(
         SymbolicSupernodalParams::default(),
     )
     .map_err(|_| out_of_memory("the structure of the factor", 8 * rows.len()))
-}
-
-/// Position of each row in the order.
-pub fn positions(order: &[u32]) -> Vec<u32> {
-    let mut position = vec![0_u32; order.len()];
-    for (p, &j) in order.iter().enumerate() {
-        position[j as usize] = p as u32;
-    }
-    position
 }
 
 /// Upper triangle of the permuted pattern in scalar columns: start and rows.

@@ -211,28 +211,12 @@ impl<T: Number> DenseSymmetric<T> {
 /// A positive definite matrix in single precision: half as much to read.
 pub struct Rough {
     /// Scaled to ones on the diagonal, so that its numbers are in range whatever the units.
-    matrix: DenseSymmetric<f32>,
+    pub(super) matrix: DenseSymmetric<f32>,
     /// Square root of each diagonal entry.
-    scale: Vec<f64>,
+    pub(super) scale: Vec<f64>,
 }
 
 impl Rough {
-    /// A matrix D A D with `scale` on the diagonal of D, from A with ones on its diagonal.
-    pub(super) fn from_scaled(matrix: DenseSymmetric<f32>, scale: Vec<f64>) -> Self {
-        Self { matrix, scale }
-    }
-
-    /// Column `c` of A in D A D, from the diagonal down.
-    #[inline(always)]
-    pub(super) fn column(&self, c: usize) -> &[f32] {
-        self.matrix.column(c)
-    }
-
-    /// Square root of the diagonal entry of row `r`.
-    pub(super) fn scale(&self, r: usize) -> f64 {
-        self.scale[r]
-    }
-
     /// The memory of the matrix, for another.
     pub fn into_memory(self) -> Vec<f32> {
         self.matrix.values
@@ -291,10 +275,9 @@ impl DenseFactor {
     pub fn projected(&self, mut columns: Vec<f64>) -> DenseSymmetric {
         let size = columns.len() / self.size.max(1);
         let par = parallelism(self.size);
-        let lower = MatRef::from_column_major_slice(&self.values, self.size, self.size);
         // B ← L⁻¹ B, then Bᵀ B.
         let b = MatMut::from_column_major_slice_mut(&mut columns, self.size, size);
-        solve_lower_triangular_in_place(lower, b, par);
+        solve_lower_triangular_in_place(self.lower(), b, par);
         let b = MatRef::from_column_major_slice(&columns, self.size, size);
         let mut values = vec![0.0; size * size];
         triangular::matmul(

@@ -50,7 +50,7 @@ impl DenseCholesky {
 
     pub(super) fn solve<F: Real>(&self, r: &[[F; MODES]], x: &mut [[F; MODES]]) {
         let n = self.size;
-        let mut y: Vec<f64> = r.as_flattened().iter().map(|r| r.wide()).collect();
+        let mut y: Vec<f64> = r.as_flattened().iter().map(|&r| r.into()).collect();
         for i in 0..n {
             let row = &self.factor[i * n..i * n + n];
             y[i] = (y[i] - short_dot(&row[..i], &y[..i])) / row[i];

@@ -1,5 +1,6 @@
 //! The levels and the cycle through them.
 
+use std::fmt::Debug;
 use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
@@ -94,38 +95,53 @@ impl<P: Precision> Hierarchy<P> {
         let smoother = Smoother::new(options.smoother_degree);
         Self { finest, coarse, coarsest, smoother, workspaces: Mutex::new(Vec::new()) }
     }
+}
 
+/// A cycle through the levels of a hierarchy, in some precision.
+pub(super) trait Cycle: Debug + Send + Sync {
     /// Number of rows of each level, the finest first.
-    pub(super) fn level_rows(&self) -> Vec<usize> {
+    fn level_rows(&self) -> Vec<usize>;
+
+    /// Bytes of the levels.
+    fn memory_bytes(&self) -> usize;
+
+    /// Minimum memory traffic of one cycle, bytes: every matrix and vector once per pass over it.
+    fn traffic_bytes(&self) -> usize;
+
+    /// `z = Sᵀ M⁻¹ S r` for the scaling S of the finest level and the cycle M⁻¹ of the scaled one.
+    fn apply(&self, scaling: &[[[f64; 3]; 3]], r: &[[f64; 3]], z: &mut [[f64; 3]]);
+}
+
+impl<P: Precision> Cycle for Hierarchy<P> {
+    fn level_rows(&self) -> Vec<usize> {
         let mut rows = vec![self.finest.matrix.n_rows()];
         rows.extend(self.coarse.iter().map(|l| l.matrix.n_rows()));
         rows.extend(self.coarsest.as_ref().map(|c| c.size / MODES));
         rows
     }
 
-    /// Bytes of the levels.
-    pub(super) fn memory_bytes(&self) -> usize {
+    fn memory_bytes(&self) -> usize {
         self.finest.memory_bytes()
             + self.coarse.iter().map(Level::memory_bytes).sum::<usize>()
             + self.coarsest.as_ref().map_or(0, |c| 8 * c.size * c.size)
     }
 
-    /// Minimum memory traffic of one cycle, bytes: every matrix and vector once per pass over it.
-    pub(super) fn traffic_bytes(&self) -> usize {
+    fn traffic_bytes(&self) -> usize {
         let passes = self.smoother.passes();
         self.finest.traffic_bytes(passes)
             + self.coarse.iter().map(|l| l.traffic_bytes(passes)).sum::<usize>()
             + self.coarsest.as_ref().map_or(0, |c| 2 * 8 * c.size * c.size / 2)
     }
 
-    /// `z = Sᵀ M⁻¹ S r` for the scaling S of the finest level and the cycle M⁻¹ of the scaled one.
-    pub(super) fn apply(&self, scaling: &[[[f64; 3]; 3]], r: &[[f64; 3]], z: &mut [[f64; 3]]) {
+    fn apply(&self, scaling: &[[[f64; 3]; 3]], r: &[[f64; 3]], z: &mut [[f64; 3]]) {
         let pooled = self.workspaces.lock().unwrap_or_else(PoisonError::into_inner).pop();
         let mut work = pooled.unwrap_or_else(|| self.new_workspace());
         self.cycle(scaling, (r, z), &mut work);
         self.workspaces.lock().unwrap_or_else(PoisonError::into_inner).push(work);
     }
+}
 
+impl<P: Precision> Hierarchy<P> {
     fn correct_coarse(&self, depth: usize, work: &mut [Vectors<MODES, P::Real>]) {
         let Some((vectors, rest)) = work.split_first_mut() else { return };
         match self.coarse.get(depth) {
@@ -180,7 +196,7 @@ impl<P: Precision> Hierarchy<P> {
         z.par_chunks_mut(rows).zip(fine.x.par_chunks(rows).zip(scaling.par_chunks(rows))).for_each(
             |(z, (x, scaling))| {
                 for ((z, x), s) in z.iter_mut().zip(x).zip(scaling) {
-                    *z = transposed_times(s, &x.map(|v| unit * v.wide()));
+                    *z = transposed_times(s, &x.map(|v| unit * v.into()));
                 }
             },
         );

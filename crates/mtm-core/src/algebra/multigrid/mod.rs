@@ -29,8 +29,8 @@ use crate::algebra::krylov::Preconditioner;
 use crate::algebra::row_sums::in_pool;
 use crate::error::{ErrorKind, MtmError, Result};
 
-use hierarchy::Hierarchy;
 pub use hierarchy::MultigridOptions;
+use hierarchy::{Cycle, Hierarchy};
 pub use precision::CyclePrecision;
 use precision::{Double, Single};
 use rigid_modes::rigid_modes;
@@ -44,14 +44,7 @@ use scaling::Scaling;
 pub struct Multigrid {
     /// S of the finest level: r̃ = S r, z = Sᵀ z̃.
     scaling: Vec<[[f64; 3]; 3]>,
-    levels: Levels,
-}
-
-/// The levels in either precision.
-#[derive(Debug)]
-enum Levels {
-    Double(Hierarchy<Double>),
-    Single(Hierarchy<Single>),
+    levels: Box<dyn Cycle>,
 }
 
 impl Multigrid {
@@ -72,13 +65,8 @@ impl Multigrid {
         let why = "one per block row of the matrix";
         ErrorKind::Solver.require_length("node coordinates", nodes.len(), a.n_rows(), why)?;
         if let Some(row) = normals.iter().position(|(j, _)| *j >= a.n_rows()) {
-            let index = normals[row].0 as u32;
-            return Err(ErrorKind::Solver.no_such(
-                ("normals", row),
-                "block row",
-                index,
-                a.n_rows(),
-            ));
+            let (what, index) = (("normals", row), normals[row].0 as u32);
+            return Err(ErrorKind::Solver.no_such(what, "block row", index, a.n_rows()));
         }
         in_pool(|| Self::build(a, nodes, normals, options))
     }
@@ -95,46 +83,36 @@ impl Multigrid {
             let why = format!("its diagonal block is {:?}", a.diagonal_block(node));
             return Err(MtmError::not_definite(node, why));
         }
-        let levels = match options.precision {
-            CyclePrecision::Double => Levels::Double(Hierarchy::new(a, &scaling, modes, options)),
-            CyclePrecision::Single => Levels::Single(Hierarchy::new(a, &scaling, modes, options)),
+        let levels: Box<dyn Cycle> = match options.precision {
+            CyclePrecision::Double => {
+                Box::new(Hierarchy::<Double>::new(a, &scaling, modes, options))
+            }
+            CyclePrecision::Single => {
+                Box::new(Hierarchy::<Single>::new(a, &scaling, modes, options))
+            }
         };
         Ok(Self { scaling: scaling.inverse_factors, levels })
     }
 
     /// Number of rows of each level, the finest first.
     pub fn level_rows(&self) -> Vec<usize> {
-        match &self.levels {
-            Levels::Double(levels) => levels.level_rows(),
-            Levels::Single(levels) => levels.level_rows(),
-        }
+        self.levels.level_rows()
     }
 
     /// Bytes held by the hierarchy.
     pub fn memory_bytes(&self) -> usize {
-        let levels = match &self.levels {
-            Levels::Double(levels) => levels.memory_bytes(),
-            Levels::Single(levels) => levels.memory_bytes(),
-        };
-        self.scaling.len() * 72 + levels
+        self.scaling.len() * 72 + self.levels.memory_bytes()
     }
 
     /// Minimum memory traffic of one application, bytes: every matrix and vector once per pass over it.
     pub fn traffic_bytes(&self) -> usize {
-        let levels = match &self.levels {
-            Levels::Double(levels) => levels.traffic_bytes(),
-            Levels::Single(levels) => levels.traffic_bytes(),
-        };
         // The scaling, r in and z out, and the scaled vector in between.
-        self.scaling.len() * (2 * 72 + 4 * 24) + levels
+        self.scaling.len() * (2 * 72 + 4 * 24) + self.levels.traffic_bytes()
     }
 }
 
 impl Preconditioner for Multigrid {
     fn apply(&self, r: &[[f64; 3]], z: &mut [[f64; 3]]) {
-        in_pool(|| match &self.levels {
-            Levels::Double(levels) => levels.apply(&self.scaling, r, z),
-            Levels::Single(levels) => levels.apply(&self.scaling, r, z),
-        });
+        in_pool(|| self.levels.apply(&self.scaling, r, z));
     }
 }

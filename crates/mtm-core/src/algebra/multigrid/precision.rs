@@ -25,15 +25,12 @@ pub trait Real:
     + AddAssign
     + SubAssign
     + PartialEq
+    + From<f32>
+    + From<i16>
+    + Into<f64>
 {
     /// The number nearest to `value`.
     fn of(value: f64) -> Self;
-    /// The number nearest to `value`.
-    fn of_single(value: f32) -> Self;
-    /// `value`, exactly.
-    fn of_short(value: i16) -> Self;
-    /// This number, exactly.
-    fn wide(self) -> f64;
 }
 
 impl Real for f64 {
@@ -41,36 +38,12 @@ impl Real for f64 {
     fn of(value: f64) -> Self {
         value
     }
-    #[inline(always)]
-    fn of_single(value: f32) -> Self {
-        Self::from(value)
-    }
-    #[inline(always)]
-    fn of_short(value: i16) -> Self {
-        Self::from(value)
-    }
-    #[inline(always)]
-    fn wide(self) -> f64 {
-        self
-    }
 }
 
 impl Real for f32 {
     #[inline(always)]
     fn of(value: f64) -> Self {
         value as Self
-    }
-    #[inline(always)]
-    fn of_single(value: f32) -> Self {
-        value
-    }
-    #[inline(always)]
-    fn of_short(value: i16) -> Self {
-        Self::from(value)
-    }
-    #[inline(always)]
-    fn wide(self) -> f64 {
-        f64::from(self)
     }
 }
 
@@ -95,7 +68,7 @@ impl Stored for f32 {
     }
     #[inline(always)]
     fn raw<F: Real>(self) -> F {
-        F::of_single(self)
+        F::from(self)
     }
 }
 
@@ -110,7 +83,7 @@ impl Stored for i16 {
     }
     #[inline(always)]
     fn raw<F: Real>(self) -> F {
-        F::of_short(self)
+        F::from(self)
     }
 }
 
