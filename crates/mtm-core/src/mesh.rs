@@ -17,7 +17,9 @@ const SHORTEST_EDGE: f64 = 1e-9;
 
 /// The four faces of a tet, outward when the tet is positively oriented.
 pub(crate) const FACES: [[usize; 3]; 4] = [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]];
-/// The six edges of a tet with the two vertices opposite each.
+/// Corners at the ends of each edge of a tet, in the order of its mid-edge nodes.
+pub(crate) const TET_EDGES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
+/// The same edges with the two vertices opposite each.
 const EDGES: [[usize; 4]; 6] =
     [[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2], [1, 2, 0, 3], [1, 3, 0, 2], [2, 3, 0, 1]];
 
@@ -296,9 +298,13 @@ fn check_duplicates(tets: &[[u32; 4]], incident: &Incidence) -> Result<()> {
 
 /// Volume of a tet, mm³; negative if it is inverted.
 pub(crate) fn signed_volume(nodes: &[[f64; 3]], tet: &[u32; 4]) -> f64 {
-    let x0 = nodes[tet[0] as usize];
-    let [e1, e2, e3] = [1, 2, 3].map(|k| sub(nodes[tet[k] as usize], x0));
-    dot(cross(e1, e2), e3) / 6.0
+    sixfold_volume(tet.map(|v| nodes[v as usize])) / 6.0
+}
+
+/// Six times the volume of a tet with these corners.
+pub(crate) fn sixfold_volume(x: [[f64; 3]; 4]) -> f64 {
+    let [e1, e2, e3] = [1, 2, 3].map(|k| sub(x[k], x[0]));
+    dot(cross(e1, e2), e3)
 }
 
 /// The edge between two nodes, whichever way it is named.

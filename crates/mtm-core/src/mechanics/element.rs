@@ -5,7 +5,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::error::{ErrorKind, Result};
-use crate::mesh::{Incidence, TetGeometry, TetMesh, ascending};
+use crate::mesh::{Incidence, TET_EDGES, TetGeometry, TetMesh, ascending};
 use crate::vector::{add, scaled};
 
 /// How displacement and pressure vary in a tet.
@@ -22,8 +22,6 @@ pub enum Element {
 
 /// Maximum number of nodes of a tet.
 pub const MOST_NODES: usize = 10;
-/// Corners at the ends of each edge of a tet, in the order of its mid-edge nodes.
-pub const TET_EDGES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
 
 /// Barycentric coordinates of the four points of a rule that is exact to degree two, with weights V/4
 /// (Hammer & Stroud 1956): (5 + 3√5)/20 at one corner, (5 − √5)/20 at the others.

@@ -7,7 +7,8 @@
 use std::sync::OnceLock;
 
 use crate::algebra::blocks::Block;
-use crate::mechanics::element::{MOST_NODES, TET_EDGES};
+use crate::mechanics::element::MOST_NODES;
+use crate::mesh::TET_EDGES;
 
 /// Means over the tet of c_p^A c_q^B: `[A][B][p][q]`.
 type Weights = [[[[f64; 4]; 4]; MOST_NODES]; MOST_NODES];

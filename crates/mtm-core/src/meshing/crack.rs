@@ -48,12 +48,9 @@ pub fn part(mesh: &TetMesh, surface: &Surface) -> Result<Parted> {
     let sides = sides(&clipped, surface, &heights);
     let (mut tets, mut copied) = (tets, Vec::new());
     double(&clipped, (&sides, &on_surface), &mut tets, &mut copied);
-    ErrorKind::Mesh.require(
-        !copied.is_empty(),
-        "nodes doubled by the parting surface",
-        0.0,
-        "1 or more: the surface must run through the tissue, in the frame of the mesh",
-    )?;
+    let allowed = "1 or more: the surface must run through the tissue, in the frame of the mesh";
+    let what = "nodes doubled by the parting surface";
+    ErrorKind::Mesh.require(!copied.is_empty(), what, 0.0, allowed)?;
     let first_cut = mesh.n_nodes();
     let mut parents = cut;
     for &j in &copied {

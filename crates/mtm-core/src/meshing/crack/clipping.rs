@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
-use crate::mesh::{FACES, ascending};
-use crate::meshing::stuffing::cut::{pairs, positive};
+use crate::mesh::{FACES, TET_EDGES, ascending};
+use crate::meshing::stuffing::cut::positive;
 use crate::vector::towards;
 
 /// Tets divided where they cross a surface.
@@ -39,7 +39,7 @@ pub fn clip(tets: &[[u32; 4]], heights: &[Option<f64>], nodes: &mut Vec<[f64; 3]
             out.push(tet);
             continue;
         }
-        for [a, b] in pairs().filter(|&[a, b]| signs[a] * signs[b] < 0) {
+        for [a, b] in TET_EDGES.into_iter().filter(|&[a, b]| signs[a] * signs[b] < 0) {
             let ends = ascending(tet[a], tet[b]);
             on_edges.entry(ends).or_insert_with(|| {
                 let [h, other] = ends.map(|j| heights[j as usize].unwrap_or(0.0));
@@ -97,7 +97,7 @@ impl Corners<'_> {
             let corners = [(*p, *r), (*q, *r), (*q, *s), (*p, *s)];
             return corners.into_iter().filter_map(|(a, b)| self.crossing(a, b)).collect();
         }
-        let on_edges = pairs().filter_map(|[a, b]| self.crossing(a, b));
+        let on_edges = TET_EDGES.into_iter().filter_map(|[a, b]| self.crossing(a, b));
         with(0).map(|c| self.tet[c]).chain(on_edges).collect()
     }
 

@@ -3,8 +3,8 @@
 use rayon::prelude::*;
 
 use crate::geometry::surface::Surface;
-use crate::mesh::{TetMesh, ascending};
-use crate::meshing::stuffing::cut::{pairs, shape};
+use crate::mesh::{TET_EDGES, TetMesh, ascending};
+use crate::meshing::stuffing::cut::shape;
 use crate::vector::{distinct, norm, of_each, sub, towards};
 
 use super::height;
@@ -100,7 +100,7 @@ fn forget_around_rim(mesh: &TetMesh, heights: &mut [Option<f64>]) {
         .with_min_len(1024)
         .flat_map_iter(|tet| {
             let heights = &*heights;
-            pairs().map(|[a, b]| [tet[a], tet[b]]).filter(move |[a, b]| {
+            TET_EDGES.into_iter().map(|[a, b]| [tet[a], tet[b]]).filter(move |[a, b]| {
                 let [h, other] = [a, b].map(|j| heights[*j as usize].unwrap_or(0.0));
                 let [x, y] = [a, b].map(|j| mesh.nodes()[*j as usize]);
                 h * other < 0.0 && h.abs() + other.abs() > (1.0 + ROUNDING) * norm(sub(y, x))

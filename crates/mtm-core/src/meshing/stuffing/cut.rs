@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 
-use crate::mesh::{FACES, Incidence};
+use crate::mesh::{FACES, Incidence, TET_EDGES, sixfold_volume};
 use crate::vector::{add, cross, dot, norm, scaled, sub};
 
 use super::lattice::{Lattice, Place};
@@ -92,7 +92,7 @@ impl<'a> Crossings<'a> {
             .par_iter()
             .flat_map_iter(|tet| {
                 let signs = &signs;
-                pairs().filter_map(move |[a, b]| {
+                TET_EDGES.into_iter().filter_map(move |[a, b]| {
                     let [v, w] = [tet[a], tet[b]];
                     let crosses = signs[v as usize] * signs[w as usize] < 0;
                     crosses.then(|| u64::from(v.min(w)) << 32 | u64::from(v.max(w)))
@@ -282,20 +282,10 @@ pub fn positive(tet: [u32; 4], place: impl Fn(u32) -> [f64; 3]) -> [u32; 4] {
     if sixfold_volume(tet.map(place)) < 0.0 { [tet[0], tet[1], tet[3], tet[2]] } else { tet }
 }
 
-fn sixfold_volume(x: [[f64; 3]; 4]) -> f64 {
-    let [e1, e2, e3] = [1, 2, 3].map(|k| sub(x[k], x[0]));
-    dot(cross(e1, e2), e3)
-}
-
 /// The three tets of a prism given by its columns; a column's diagonals run from its top to the
 /// bottoms of those after it.
 fn prism([[a, a1], [b, b1], [c, c1]]: [[u32; 2]; 3]) -> [[u32; 4]; 3] {
     [[a, b, c, c1], [a, b, b1, c1], [a, a1, b1, c1]]
-}
-
-/// The edges of a tet, by corner.
-pub fn pairs() -> impl Iterator<Item = [usize; 2]> {
-    [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]].into_iter()
 }
 
 fn is_along_axis(p: Place, q: Place) -> bool {
@@ -307,15 +297,17 @@ fn is_along_axis(p: Place, q: Place) -> bool {
 pub fn shape(x: [[f64; 3]; 4]) -> f64 {
     let sixfold = sixfold_volume(x);
     if sixfold <= 0.0 {
-        let longest = pairs().map(|[a, b]| norm(sub(x[b], x[a]))).fold(0.0, f64::max);
+        let longest = TET_EDGES.into_iter().map(|[a, b]| norm(sub(x[b], x[a]))).fold(0.0, f64::max);
         return if longest > 0.0 { sixfold / longest.powi(3) } else { 0.0 };
     }
     // Between outward normals n and m of two faces the dihedral angle is the supplement of theirs.
     let normals = FACES
         .map(|[a, b, c]| cross(sub(x[b], x[a]), sub(x[c], x[a])))
         .map(|n| scaled(n, 1.0 / norm(n)));
-    let largest_cosine =
-        pairs().map(|[f, g]| -dot(normals[f], normals[g])).fold(f64::NEG_INFINITY, f64::max);
+    let largest_cosine = TET_EDGES
+        .into_iter()
+        .map(|[f, g]| -dot(normals[f], normals[g]))
+        .fold(f64::NEG_INFINITY, f64::max);
     // The arc cosine is inaccurate near 0 (1e-8 rad), where a tet is useless however flat; better shapes are
     // far from there, and equal shapes give equal values.
     largest_cosine.clamp(-1.0, 1.0).acos()

@@ -99,12 +99,8 @@ pub fn stuff(
     let mut stuffed = cut(&lattice, level, cover.origin, cover.unit);
     drop(lattice);
     let allowed = "below about the thickness of the tissue, or more refinements: no tet fits";
-    ErrorKind::Mesh.require(
-        !stuffed.tets.is_empty(),
-        "edge_length",
-        options.edge_length,
-        allowed,
-    )?;
+    let is_filled = !stuffed.tets.is_empty();
+    ErrorKind::Mesh.require(is_filled, "edge_length", options.edge_length, allowed)?;
     let dropped_tets = improve(&mut stuffed, level);
     let dropped = keep_bodies(&mut stuffed, options.least_body);
     let mesh = TetMesh::new(stuffed.nodes, stuffed.tets)?;
@@ -150,18 +146,10 @@ fn boundary_error(mesh: &TetMesh, level: &LevelImage, reach: f64) -> (f64, f64) 
 
 fn check(options: &StuffingOptions) -> Result<()> {
     let kind = ErrorKind::Mesh;
-    kind.require(
-        options.edge_length > 0.0 && options.edge_length.is_finite(),
-        "edge_length",
-        options.edge_length,
-        "above 0 mm and finite",
-    )?;
-    kind.require(
-        options.refinements <= MAX_REFINEMENTS,
-        "refinements",
-        f64::from(options.refinements),
-        "0 to 3",
-    )?;
+    let (edge, refinements) = (options.edge_length, options.refinements);
+    kind.require(edge > 0.0 && edge.is_finite(), "edge_length", edge, "above 0 mm and finite")?;
+    let are_few = refinements <= MAX_REFINEMENTS;
+    kind.require(are_few, "refinements", f64::from(refinements), "0 to 3")?;
     kind.require(options.least_body >= 0.0, "least_body", options.least_body, "0 mm³ or more")?;
     Ok(())
 }
@@ -176,12 +164,9 @@ fn check_halvings(halvings: &Halvings<'_>, n_voxels: usize, refinements: u32) ->
     }
     let needed = halvings.needed.unwrap_or_default();
     if let Some(index) = needed.iter().position(|&count| u32::from(count) > refinements) {
-        return Err(kind.out_of_range(
-            "needed refinements",
-            index,
-            f64::from(needed[index]),
-            "0 to the refinements of the options: request fewer or allow more",
-        ));
+        let allowed = "0 to the refinements of the options: request fewer or allow more";
+        let found = f64::from(needed[index]);
+        return Err(kind.out_of_range("needed refinements", index, found, allowed));
     }
     Ok(())
 }
