@@ -15,7 +15,7 @@ use crate::algebra::blocks::{Block, BlockMatrix};
 use crate::mechanics::material::{Lame, Spencer, Voigt, voigt_eigenvalues, voigt_matrix};
 use crate::mechanics::tissue::{TetMaterial, Tissue};
 use crate::mesh::TetMesh;
-use crate::vector::add;
+use crate::vector::{add, distinct};
 
 /// The volumetric split of a material, κ and C − κ I⊗I, which is positive definite: κ = K_R − e/3 with K_R = 1/(I : C⁻¹ : I) its bulk modulus under pressure
 /// and e the smallest eigenvalue of C; λ if the tissue is isotropic and λ ≥ 0.
@@ -212,20 +212,14 @@ impl Patches {
     }
 
     /// Patches that contain corner `j`, ascending.
-    pub fn round(&self, mesh: &TetMesh, j: usize, out: &mut Vec<u32>) {
-        out.clear();
-        for &t in mesh.tets_of_node(j) {
-            out.extend(self.of_tet[t as usize].iter().filter(|&&p| p != NO_PATCH));
-        }
-        out.sort_unstable();
-        out.dedup();
+    fn round(&self, mesh: &TetMesh, j: usize) -> Vec<u32> {
+        let all = mesh.tets_of_node(j).iter().flat_map(|&t| self.of_tet[t as usize]);
+        distinct(all.filter(|&p| p != NO_PATCH))
     }
 
     /// Nodes that share a patch with corner `j`, appended to `out`.
     pub fn neighbours(&self, mesh: &TetMesh, j: usize, out: &mut Vec<u32>) {
-        let mut patches = Vec::new();
-        self.round(mesh, j, &mut patches);
-        for &p in &patches {
+        for p in self.round(mesh, j) {
             for &t in self.tets_of(p as usize) {
                 out.extend_from_slice(&mesh.tets()[t as usize]);
             }
@@ -233,7 +227,7 @@ impl Patches {
     }
 
     /// Adds Σ_a w_a d_j⊗d_k to the blocks of row `j`.
-    pub fn add_row(
+    fn add_row(
         &self,
         mesh: &TetMesh,
         gradients: &PatchGradients,
@@ -241,9 +235,7 @@ impl Patches {
         columns: &[u32],
         blocks: &mut [Block],
     ) {
-        let mut patches = Vec::new();
-        self.round(mesh, j, &mut patches);
-        for &p in &patches {
+        for p in self.round(mesh, j) {
             let p = p as usize;
             let range = gradients.start[p]..gradients.start[p + 1];
             let (nodes, rows) = (&gradients.nodes[range.clone()], &gradients.gradients[range]);

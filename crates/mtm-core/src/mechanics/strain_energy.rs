@@ -166,16 +166,6 @@ impl StrainEnergy {
         })
     }
 
-    /// Takes the memory of the last state and tangent; another thread's call meanwhile starts with none.
-    fn take_scratch(&self) -> TetValues {
-        std::mem::take(&mut *locked(&self.memory.values))
-    }
-
-    /// Keeps `scratch` for the next state and tangent.
-    fn keep_scratch(&self, scratch: TetValues) {
-        *locked(&self.memory.values) = scratch;
-    }
-
     /// Energy and forces under displacements of all nodes, mm.
     ///
     /// # Errors
@@ -185,7 +175,8 @@ impl StrainEnergy {
         let nodes = self.nodes();
         let averaged = self.averaged(u);
         let n_own = nodes.of_tet(0).len();
-        let mut scratch = self.take_scratch();
+        // Another thread's call meanwhile starts with none.
+        let mut scratch = std::mem::take(&mut *locked(&self.memory.values));
         scratch.forces.resize(nodes.mesh().n_tets() * n_own, [0.0; 3]);
         let energies: Vec<f64> = scratch
             .forces
@@ -210,7 +201,7 @@ impl StrainEnergy {
                 sum
             })
             .collect();
-        self.keep_scratch(scratch);
+        *locked(&self.memory.values) = scratch;
         let energy: f64 = energies.iter().sum();
         Ok(EnergyState { energy: energy + averaged.map_or(0.0, |a| a.energy), forces })
     }
@@ -265,12 +256,10 @@ impl StrainEnergy {
     /// # Errors
     /// Displacements of the wrong number, or not finite.
     pub fn stiffness(&self, u: &[[f64; 3]], kind: TangentKind) -> Result<BlockMatrix> {
-        self.tensors.check_displacements(u)?;
-        let (mut scratch, mut tangents) = (self.take_scratch(), self.begin(0.0));
-        let matrix = self.assembled(u, kind, &mut tangents, scratch.matrix.take());
-        self.keep_scratch(scratch);
+        let mut tangents = self.begin(0.0);
+        let matrix = self.with_stiffness(u, kind, &mut tangents, BlockMatrix::clone);
         self.end(tangents);
-        Ok(matrix)
+        matrix
     }
 
     /// The result of `read` for the tangent stiffness under displacements of all nodes, the next of a series.
@@ -283,38 +272,23 @@ impl StrainEnergy {
         read: impl FnOnce(&BlockMatrix) -> T,
     ) -> Result<T> {
         self.tensors.check_displacements(u)?;
-        let mut scratch = self.take_scratch();
-        let matrix = self.assembled(u, kind, tangents, scratch.matrix.take());
-        let result = read(&matrix);
-        scratch.matrix = Some(matrix);
-        self.keep_scratch(scratch);
-        Ok(result)
-    }
-
-    /// The tangent stiffness, in the `memory` of an earlier one if there is one.
-    fn assembled(
-        &self,
-        u: &[[f64; 3]],
-        kind: TangentKind,
-        tangents: &mut PointTangents,
-        memory: Option<BlockMatrix>,
-    ) -> BlockMatrix {
-        let nodes = self.nodes();
-        let mesh = nodes.mesh();
-        let averaged = self.averaged(u);
+        let (nodes, averaged) = (self.nodes(), self.averaged(u));
         self.find_tangents(u, averaged.as_ref(), kind, tangents);
+        let mut scratch = std::mem::take(&mut *locked(&self.memory.values));
         let pattern = self.tensors.matrix();
-        let mut matrix = memory.unwrap_or_else(|| {
+        let mut matrix = scratch.matrix.take().unwrap_or_else(|| {
             BlockMatrix::from_pattern(pattern.row_start.clone(), pattern.columns.clone())
         });
         matrix.row_tasks().into_par_iter().for_each(|task| {
             widest(Fill { nodes, tangents: &tangents.values, task });
         });
         if let (Some(patches), Some(averaged)) = (self.tensors.patches(), &averaged) {
-            let gradients = patches.gradients(mesh, |t| averaged.slopes[t]);
-            patches.add_to(mesh, &gradients, &mut matrix);
+            let gradients = patches.gradients(nodes.mesh(), |t| averaged.slopes[t]);
+            patches.add_to(nodes.mesh(), &gradients, &mut matrix);
         }
-        matrix
+        let result = read(&matrix);
+        *locked(&self.memory.values) = TetValues { matrix: Some(matrix), ..scratch };
+        Ok(result)
     }
 
     /// The `tangents` at displacements `u`. Definite ones are kept where F has hardly changed; with pressures,
