@@ -257,11 +257,9 @@ impl Boundary {
         let (liftable, own) = &self.liftable;
         let is_liftable = |node: &u32| liftable.binary_search(node).is_ok();
         if let Some(node) = nodes.iter().find(|node| !is_liftable(node)) {
-            return Err(ErrorKind::Boundary.not_together(
-                ("held node", &node.to_string()),
-                "a solver for other plans",
-                "nodes that its boundary was given as liftable",
-            ));
+            let needed = "nodes that its boundary was given as liftable";
+            let held = ("held node", &node.to_string()[..]);
+            return Err(ErrorKind::Boundary.not_together(held, "a solver for other plans", needed));
         }
         let mut out = self.clone();
         let (held, given) = match *own {

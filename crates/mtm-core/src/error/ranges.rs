@@ -1,12 +1,12 @@
 //! Rows of three that must be finite and within the range of what a head can have.
 
-use crate::error::{ErrorKind, MtmError, Result};
+use crate::error::{ErrorKind, Result};
 
 /// Rejects NaN and infinity in rows of three, stating the row.
 pub(crate) fn check_finite_rows(what: &str, rows: &[[f64; 3]], kind: ErrorKind) -> Result<()> {
     for (index, row) in rows.iter().enumerate() {
         if let Some(&value) = row.iter().find(|v| !v.is_finite()) {
-            return Err(MtmError::NotFinite { what: what.to_owned(), index, value, kind });
+            return Err(kind.not_finite(what, index, value));
         }
     }
     Ok(())
@@ -43,13 +43,7 @@ fn check_rows_within(
     check_finite_rows(what, rows, kind)?;
     for (index, row) in rows.iter().enumerate() {
         if let Some(&value) = row.iter().find(|v| v.abs() > largest) {
-            return Err(MtmError::OutOfRange {
-                what: what.to_owned(),
-                index,
-                value,
-                allowed,
-                kind,
-            });
+            return Err(kind.out_of_range(what, index, value, allowed));
         }
     }
     Ok(())

@@ -360,18 +360,10 @@ fn check_landmarks(source: &[[f64; 3]], target: &[[f64; 3]], smoothing: f64) -> 
     let kind = ErrorKind::Registration;
     let n = source.len();
     kind.require_length("target landmarks", target.len(), n, "one for each source landmark")?;
-    check_count(
-        "a thin-plate spline",
-        n,
-        LEAST_LANDMARKS,
-        "landmarks that do not lie in one plane",
-    )?;
-    kind.require(
-        n <= MOST_LANDMARKS,
-        "number of landmarks",
-        n as f64,
-        "4 to 4096; take fewer points, spread evenly",
-    )?;
+    let shape = "landmarks that do not lie in one plane";
+    check_count("a thin-plate spline", n, LEAST_LANDMARKS, shape)?;
+    let allowed = "4 to 4096; take fewer points, spread evenly";
+    kind.require(n <= MOST_LANDMARKS, "number of landmarks", n as f64, allowed)?;
     let allowed = "0 mm or more, finite";
     kind.require(smoothing.is_finite() && smoothing >= 0.0, "smoothing", smoothing, allowed)?;
     check_coordinates("source landmarks", source)?;

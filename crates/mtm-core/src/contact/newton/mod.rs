@@ -57,13 +57,8 @@ impl Sliding {
         interrupted: &(dyn Fn() -> bool + Sync),
         body: &mut dyn Body,
     ) -> Result<ContactResult> {
-        let allowed = "1 or more";
-        ErrorKind::Solver.require(
-            options.max_iterations > 0,
-            "contact_iterations",
-            0.0,
-            allowed,
-        )?;
+        let has_steps = options.max_iterations > 0;
+        ErrorKind::Solver.require(has_steps, "contact_iterations", 0.0, "1 or more")?;
         let seats = Seats::new(self, motions)?;
         let problem = ContactProblem { sliding: self, seats: &seats, options };
         let mut state = problem.start(begin);

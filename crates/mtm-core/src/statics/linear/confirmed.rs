@@ -110,15 +110,12 @@ impl Confirmed<'_> {
 
 /// The error for a known solution that was recovered with an error above the tolerance.
 fn not_confirmed(trial: &Trial, options: &PcgOptions, relative: f64) -> MtmError {
+    let (quantity, unit) = ("the error in recovering a known solution", " of the displacements");
+    let limit = options.slack / TRIAL_SAFETY * relative;
     MtmError::NotConverged {
         method: "pcg",
         iterations: trial.iterations,
-        shortfall: Shortfall::new(
-            "the error in recovering a known solution",
-            trial.error,
-            options.slack / TRIAL_SAFETY * relative,
-            " of the displacements",
-        ),
+        shortfall: Shortfall::new(quantity, trial.error, limit, unit),
         advice: "stiff and soft tissue, or slender parts, are beyond conjugate gradients: use \
                  method=\"cholesky\", or allow a larger tolerance",
     }

@@ -395,7 +395,9 @@ impl Iterative {
                 return Ok(x);
             }
             if sweeps >= most {
-                return Err(no_rest(most, error, tolerance));
+                let quantity = "the measured error of a node";
+                let shortfall = Shortfall::new(quantity, error, tolerance, " mm");
+                return Err(not_swept(most, shortfall));
             }
             goal *= (0.5 * tolerance / error).min(0.5);
         }
@@ -474,24 +476,14 @@ impl Extremes {
 }
 
 /// The error for sweeps that ended before the error was within the tolerance.
-fn no_rest(sweeps: usize, error: f64, tolerance: f64) -> MtmError {
-    MtmError::NotConverged {
-        method: "relaxation",
-        iterations: sweeps,
-        shortfall: Shortfall::new("the measured error of a node", error, tolerance, " mm"),
-        advice: NO_SWEEPS,
-    }
+fn not_swept(iterations: usize, shortfall: Shortfall) -> MtmError {
+    MtmError::NotConverged { method: "relaxation", iterations, shortfall, advice: NO_SWEEPS }
 }
 
 /// An error of a relaxation step, in terms of the caller's tolerance.
 fn gave_up(error: MtmError, sweeps: usize) -> MtmError {
     match error {
-        MtmError::NotConverged { shortfall, .. } => MtmError::NotConverged {
-            method: "relaxation",
-            iterations: sweeps,
-            shortfall,
-            advice: NO_SWEEPS,
-        },
+        MtmError::NotConverged { shortfall, .. } => not_swept(sweeps, shortfall),
         other => other,
     }
 }

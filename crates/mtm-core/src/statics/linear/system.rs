@@ -38,17 +38,12 @@ const OPERATOR_SPRING_SHARE: f64 = 1e-5;
 /// One row of three for each unknown node.
 type Rows = Vec<[f64; 3]>;
 
-/// What is kept from one plan to the next.
-enum Kept {
+/// The system of the unknown nodes, ready for any right-hand side: what is kept from one plan to the next.
+pub(crate) enum System {
     /// The factorisation, and the data for solving contact at the sliding nodes, if there are any.
     Factor { factor: Arc<Factor>, contact: ContactFactor },
     /// The matrix, in which sliding nodes are constrained.
     Matrix(Unfactored),
-}
-
-/// The system of the unknown nodes, ready for any right-hand side.
-pub(crate) struct System {
-    kept: Kept,
 }
 
 /// The rows of a body that form a system.
@@ -112,7 +107,6 @@ impl System {
         interrupted: Interrupt<'_>,
     ) -> Result<(Self, Method)> {
         let mut method = options.method.for_unknowns(3 * matrix.n_rows());
-        let with = |kept: Kept| Self { kept };
         if method.has_factor() {
             let slide_rows: Vec<u32> =
                 body.sliding.iter().flat_map(|s| s.nodes.iter().map(|n| n.row)).collect();
@@ -133,7 +127,7 @@ impl System {
             let fits = options.memory_limit.is_none_or(|limit| needed <= limit);
             if fits && n_sliding > 0 && !kept {
                 let refactored = Unfactored::Refactored { symbolic, matrix };
-                return Ok((with(Kept::Matrix(refactored)), method));
+                return Ok((Self::Matrix(refactored), method));
             }
             if fits {
                 let factor = Arc::new(symbolic.factor(&matrix)?);
@@ -141,7 +135,7 @@ impl System {
                 let normals = body.sliding.map_or(&[][..], |s| &s.rest_normals);
                 let contact = ContactFactor::new(&factor, (&slide_rows, normals), held)?;
                 clock.lap("contact_factor", body.sliding.is_some());
-                return Ok((with(Kept::Factor { factor, contact }), method));
+                return Ok((Self::Factor { factor, contact }, method));
             }
             if options.method.has_factor() {
                 let (what, advice) = ("the Cholesky factor", "use method=\"pcg\" or \"auto\"");
@@ -158,7 +152,7 @@ impl System {
         };
         let iterative = Iterative::new(matrix, multigrid, body.tissue, method, options);
         clock.lap("preconditioner", true);
-        Ok((with(Kept::Matrix(Unfactored::Iterative(Box::new(iterative)))), method))
+        Ok((Self::Matrix(Unfactored::Iterative(Box::new(iterative))), method))
     }
 
     /// The same system with other rows `held`, by their places among those that may be lifted.
@@ -166,34 +160,33 @@ impl System {
     /// # Errors
     /// Any method without a factor.
     pub fn holding(&self, held: &[usize]) -> Result<Self> {
-        let Kept::Factor { factor, contact } = &self.kept else {
+        let Self::Factor { factor, contact } = self else {
             return Err(not_liftable("method", "one without a factorisation".into()));
         };
-        let kept = Kept::Factor { factor: factor.clone(), contact: contact.holding(held)? };
-        Ok(Self { kept })
+        Ok(Self::Factor { factor: factor.clone(), contact: contact.holding(held)? })
     }
 
     /// The hierarchy, if the system is solved by iteration.
     pub fn multigrid(&self) -> Option<&Arc<Multigrid>> {
-        match &self.kept {
-            Kept::Matrix(Unfactored::Iterative(iterative)) => Some(&iterative.multigrid),
-            Kept::Matrix(Unfactored::Refactored { .. }) | Kept::Factor { .. } => None,
+        match self {
+            Self::Matrix(Unfactored::Iterative(iterative)) => Some(&iterative.multigrid),
+            Self::Matrix(Unfactored::Refactored { .. }) | Self::Factor { .. } => None,
         }
     }
 
     /// Bytes of the factor or preconditioner.
     pub fn bytes(&self) -> usize {
-        match &self.kept {
-            Kept::Factor { factor, contact } => factor.bytes() + contact.bytes(),
-            Kept::Matrix(Unfactored::Refactored { symbolic, .. }) => symbolic.factor_bytes(),
-            Kept::Matrix(Unfactored::Iterative(iterative)) => iterative.bytes(),
+        match self {
+            Self::Factor { factor, contact } => factor.bytes() + contact.bytes(),
+            Self::Matrix(Unfactored::Refactored { symbolic, .. }) => symbolic.factor_bytes(),
+            Self::Matrix(Unfactored::Iterative(iterative)) => iterative.bytes(),
         }
     }
 
     /// A⁻¹ b without contact.
     pub fn solve(&self, b: &[[f64; 3]], solve: &mut PlanSolve<'_>) -> Result<Vec<[f64; 3]>> {
-        match &self.kept {
-            Kept::Factor { factor, contact } => {
+        match self {
+            Self::Factor { factor, contact } => {
                 let x = in_pool(|| match contact.flexibility.lifts() {
                     true => contact.answers(factor, b).of_all(&[]),
                     false => factor.solve(b),
@@ -201,10 +194,10 @@ impl System {
                 solve.error_estimate = direct_error(factor, &x);
                 Ok(x)
             }
-            Kept::Matrix(Unfactored::Refactored { symbolic, matrix }) => {
+            Self::Matrix(Unfactored::Refactored { symbolic, matrix }) => {
                 Ok(symbolic.factor(matrix)?.solve(b))
             }
-            Kept::Matrix(Unfactored::Iterative(iterative)) => iterative.solve(b, solve),
+            Self::Matrix(Unfactored::Iterative(iterative)) => iterative.solve(b, solve),
         }
     }
 
@@ -215,14 +208,14 @@ impl System {
         settle: &ContactSolve<'_>,
         solve: &mut PlanSolve<'_>,
     ) -> Result<SolvedRows> {
-        match &self.kept {
-            Kept::Factor { .. } if !settle.linked.links.is_empty() => {
+        match self {
+            Self::Factor { .. } if !settle.linked.links.is_empty() => {
                 Err(touching_needs_pcg(Method::Cholesky))
             }
-            Kept::Factor { factor, contact } => {
+            Self::Factor { factor, contact } => {
                 settled_by_flexibility(factor, contact, b, settle, solve)
             }
-            Kept::Matrix(system) => system.settled(b, settle, solve),
+            Self::Matrix(system) => system.settled(b, settle, solve),
         }
     }
 
@@ -231,7 +224,7 @@ impl System {
     /// # Errors
     /// Any method except conjugate gradients.
     pub fn multigrid_with(&self, links: &[Link], body: &BodyRows<'_>) -> Result<Arc<Multigrid>> {
-        let Kept::Matrix(kept) = &self.kept else {
+        let Self::Matrix(kept) = self else {
             return Err(touching_needs_pcg(Method::Cholesky));
         };
         Ok(Arc::new(multigrid(&with_links(kept.matrix(), links), body)?))
@@ -248,7 +241,7 @@ impl System {
         start: &[[f64; 3]],
         solve: &mut PlanSolve<'_>,
     ) -> Result<Rows> {
-        let Kept::Matrix(Unfactored::Iterative(iterative)) = &self.kept else {
+        let Self::Matrix(Unfactored::Iterative(iterative)) = self else {
             return Err(touching_needs_pcg(Method::Cholesky));
         };
         let conditions = RowConditions { constraints: Vec::new(), springs: Vec::new() };
@@ -275,7 +268,7 @@ impl System {
         (scales, share): (&[f64], Option<f64>),
         interrupted: Interrupt<'_>,
     ) -> Result<Vec<Vec<[f64; 3]>>> {
-        if let Kept::Factor { factor, contact } = &self.kept {
+        if let Self::Factor { factor, contact } = self {
             if contact.flexibility.lifts() {
                 return all_together(factor, &contact.flexibility, columns, |_, _| Ok(Vec::new()));
             }
@@ -285,8 +278,8 @@ impl System {
         let linked = RowLinks { share, ..RowLinks::default() };
         let solve = |(b, &scale): (&Rows, &f64)| {
             let mut solve = PlanSolve::new(scale, interrupted);
-            match (&self.kept, share) {
-                (Kept::Matrix(Unfactored::Iterative(_)), Some(_)) => {
+            match (self, share) {
+                (Self::Matrix(Unfactored::Iterative(_)), Some(_)) => {
                     self.solve_linked(b, linked, &[], &mut solve)
                 }
                 _ => self.solve(b, &mut solve),
@@ -310,8 +303,8 @@ impl System {
         let still = vec![[0.0; 3]; sliding.nodes.len()];
         let check = || if interrupted() { Err(MtmError::Interrupted) } else { Ok(()) };
         let Frozen { state, slopes } = frozen;
-        match &self.kept {
-            Kept::Factor { factor, contact } => {
+        match self {
+            Self::Factor { factor, contact } => {
                 let kept = FrozenContact::new(&contact.flexibility, &state.rows, &state.springs)?;
                 let forces = |k: usize, free: &[_]| {
                     Ok(kept.forces(free, &slopes[k].offsets, &frozen.springs(k)))
@@ -319,7 +312,7 @@ impl System {
                 check()?;
                 all_together(factor, &contact.flexibility, columns, forces)
             }
-            Kept::Matrix(system) => {
+            Self::Matrix(system) => {
                 // All columns have the same constraints, so one trial serves them.
                 let mut trail = SolveMemory::default();
                 let solve = |((k, b), &scale): ((usize, &Rows), &f64)| {

@@ -143,18 +143,11 @@ impl Equilibrium {
         options: &StaticOptions,
         clock: &mut Clock,
     ) -> Result<(Self, Method)> {
-        let method = match options.method {
-            Method::Relaxation => {
-                return Err(ErrorKind::Solver.not_together(
-                    ("method", options.method.name()),
-                    "large deformation",
-                    "auto, cholesky or pcg",
-                ));
-            }
-            method @ (Method::Auto | Method::Cholesky | Method::Pcg) => {
-                method.for_unknowns(3 * matrix.n_rows())
-            }
-        };
+        if options.method.sweeps() {
+            let (found, needed) = (("method", options.method.name()), "auto, cholesky or pcg");
+            return Err(ErrorKind::Solver.not_together(found, "large deformation", needed));
+        }
+        let method = options.method.for_unknowns(3 * matrix.n_rows());
         let solver = if method.has_factor() {
             let symbolic = Symbolic::new(matrix, &[])?;
             if let Some(limit) = options.memory_limit

@@ -81,7 +81,11 @@ fn contacts_of(
     mode: ContactMode,
 ) -> Result<(Option<Sliding>, Option<Pairs>)> {
     let (mesh, places) = (tensors.mesh(), tensors.element_nodes().positions());
-    let stiffness = |j: usize| own_stiffness(tensors.matrix(), j);
+    // Of a node on its own: a third of the trace of K_jj.
+    let stiffness = |j: usize| {
+        let own = tensors.matrix().diagonal_block(j);
+        (own[0] + own[4] + own[8]) / 3.0
+    };
     let sliding = Sliding::new(kinds, mesh, places, rows, stiffness, mode)?;
     Ok((sliding, Pairs::new(kinds, mesh, places, rows, stiffness)?))
 }
@@ -504,12 +508,6 @@ fn corner_normals(sliding: Option<&Sliding>, n_corners: usize) -> Vec<(u32, [f64
         .map(|(node, &normal)| (node.node, normal))
         .filter(|(node, _)| (*node as usize) < n_corners)
         .collect()
-}
-
-/// Mean stiffness of node `j` on its own, a third of the trace of K_jj, N/mm.
-fn own_stiffness(matrix: &BlockMatrix, j: usize) -> f64 {
-    let own = matrix.diagonal_block(j);
-    (own[0] + own[4] + own[8]) / 3.0
 }
 
 /// Replaces the row of the reduced system in an error by its node.

@@ -13,10 +13,11 @@ impl StaticSolver {
             return Err(self.not_linear(result));
         }
         if !self.node_kinds.touching().is_empty() {
+            let needed = "none, since contacts change with the plan (solve takes them)";
             return Err(ErrorKind::Solver.not_together(
                 ("boundary", "touching pairs"),
                 result,
-                "none, since contacts change with the plan (solve takes them)",
+                needed,
             ));
         }
         Ok(())
@@ -24,11 +25,8 @@ impl StaticSolver {
 
     /// The error for kinematics that are no linear map, which `result` needs.
     pub(crate) fn not_linear(&self, result: &'static str) -> MtmError {
-        ErrorKind::Solver.not_together(
-            ("kinematics", self.kinematics().name()),
-            result,
-            "linear, since the others are no linear map (solve takes them)",
-        )
+        let needed = "linear, since the others are no linear map (solve takes them)";
+        ErrorKind::Solver.not_together(("kinematics", self.kinematics().name()), result, needed)
     }
 
     /// Rejects a starting solution of another mesh or boundary.
