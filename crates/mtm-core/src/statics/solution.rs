@@ -34,6 +34,26 @@ impl TouchResult {
     }
 }
 
+/// Displacements of the rows after a solve, with contact if nodes slide.
+#[derive(Default)]
+pub(crate) struct SolvedRows {
+    /// mm.
+    pub rows: Vec<[f64; 3]>,
+    pub contact: Option<ContactResult>,
+    /// Time that contact took, s.
+    pub contact_seconds: f64,
+    /// What touches, and the force of it on each row, N; none without parts that may touch.
+    pub touching: TouchResult,
+    pub pushes: Vec<[f64; 3]>,
+}
+
+impl SolvedRows {
+    /// Displacements of a body without parts that may touch.
+    pub fn new(rows: Vec<[f64; 3]>, contact: Option<ContactResult>, contact_seconds: f64) -> Self {
+        Self { rows, contact, contact_seconds, ..Self::default() }
+    }
+}
+
 /// Displacements under one plan.
 #[derive(Debug, Clone)]
 pub struct Solution {

@@ -117,7 +117,9 @@ impl Symbolic {
         let mut values = vec![0.0; self.structure.len_val()];
         let why = "a pivot of the factorisation is not positive; a part of the body may be a mechanism, or \
                    the material contrast too large for f64";
-        numeric::factor(self, matrix, &mut values)
+        let Self { order, position, structure, tree, .. } = &**self;
+        numeric::Work { structure, tree, matrix, order, position }
+            .factor(&mut values)
             .map_err(|index| MtmError::not_definite(self.order[index / 3] as usize, why))?;
         Factor { symbolic: self.clone(), values, trial_error: 0.0 }.tried(matrix)
     }

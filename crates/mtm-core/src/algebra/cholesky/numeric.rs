@@ -14,7 +14,6 @@ use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 use faer::{Accum, MatMut, Par};
 
-use super::Symbolic;
 use crate::algebra::blocks::BlockMatrix;
 
 /// Multiplications below which a subtree is not worth another thread.
@@ -89,31 +88,34 @@ impl Tree {
 /// pattern.
 type Update = (usize, Vec<f64>);
 
-struct Work<'a> {
-    symbolic: &'a Symbolic,
-    matrix: &'a BlockMatrix,
-}
-
-/// Fills `values` (zeros) with the factor; on failure, the column of the first pivot that is not positive.
-pub fn factor(symbolic: &Symbolic, matrix: &BlockMatrix, values: &mut [f64]) -> Result<(), usize> {
-    let work = Work { symbolic, matrix };
-    let Symbolic { structure, tree, .. } = symbolic;
-    let start = structure.col_ptr_for_val();
-    let (inner, tail) = values.split_at_mut(start[tree.tail]);
-    let alone = rayon::current_num_threads() > 1;
-    let mut updates = work.subtrees(&tree.roots, inner, 0, alone)?;
-    let mut rest = tail;
-    for s in tree.tail..structure.n_supernodes() {
-        let (own, after) = rest.split_at_mut(start[s + 1] - start[s]);
-        rest = after;
-        let (mine, others) = updates.into_iter().partition(|(c, _)| tree.children[s].contains(c));
-        updates = others;
-        updates.push((s, work.supernode(s, own, mine, alone)?));
-    }
-    Ok(())
+/// A factorisation of `matrix`, whose row `order[p]` has the position p.
+pub struct Work<'a> {
+    pub structure: &'a SymbolicSupernodalCholesky<usize>,
+    pub tree: &'a Tree,
+    pub matrix: &'a BlockMatrix,
+    pub order: &'a [u32],
+    pub position: &'a [u32],
 }
 
 impl Work<'_> {
+    /// Fills `values` (zeros) with the factor; on failure, the column of the first pivot that is not positive.
+    pub fn factor(&self, values: &mut [f64]) -> Result<(), usize> {
+        let (tree, start) = (self.tree, self.structure.col_ptr_for_val());
+        let (inner, tail) = values.split_at_mut(start[tree.tail]);
+        let alone = rayon::current_num_threads() > 1;
+        let mut updates = self.subtrees(&tree.roots, inner, 0, alone)?;
+        let mut rest = tail;
+        for s in tree.tail..self.structure.n_supernodes() {
+            let (own, after) = rest.split_at_mut(start[s + 1] - start[s]);
+            rest = after;
+            let (mine, others) =
+                updates.into_iter().partition(|(c, _)| tree.children[s].contains(c));
+            updates = others;
+            updates.push((s, self.supernode(s, own, mine, alone)?));
+        }
+        Ok(())
+    }
+
     /// Factorises the subtrees of `roots`, whose values begin with those of supernode `first`; returns their
     /// updates, in order.
     fn subtrees(
@@ -123,7 +125,7 @@ impl Work<'_> {
         first: usize,
         alone: bool,
     ) -> Result<Vec<Update>, usize> {
-        let start = self.symbolic.structure.col_ptr_for_val();
+        let start = self.structure.col_ptr_for_val();
         if let Some(cut) = self.cut(roots) {
             let middle = roots[cut - 1] + 1;
             let (left, right) = values.split_at_mut(start[middle] - start[first]);
@@ -149,11 +151,10 @@ impl Work<'_> {
     /// How many of `roots` to give to one thread so that two have the same amount of work; nothing if the
     /// smaller share is not worth a thread.
     fn cut(&self, roots: &[usize]) -> Option<usize> {
-        let work: f64 = roots.iter().map(|&r| self.symbolic.tree.work[r]).sum();
+        let work: f64 = roots.iter().map(|&r| self.tree.work[r]).sum();
         let (mut cut, mut done) = (0, 0.0);
-        while cut + 1 < roots.len() && done + 0.5 * self.symbolic.tree.work[roots[cut]] < 0.5 * work
-        {
-            done += self.symbolic.tree.work[roots[cut]];
+        while cut + 1 < roots.len() && done + 0.5 * self.tree.work[roots[cut]] < 0.5 * work {
+            done += self.tree.work[roots[cut]];
             cut += 1;
         }
         let lesser = done.min(work - done);
@@ -173,7 +174,7 @@ impl Work<'_> {
         first: usize,
         alone: bool,
     ) -> Result<Vec<f64>, usize> {
-        let (tree, start) = (&self.symbolic.tree, self.symbolic.structure.col_ptr_for_val());
+        let (tree, start) = (self.tree, self.structure.col_ptr_for_val());
         let mut shared = Some(root);
         while let Some(t) = shared
             && self.cut(&tree.children[t]).is_none()
@@ -210,16 +211,16 @@ impl Work<'_> {
         updates: Vec<Update>,
         alone: bool,
     ) -> Result<Vec<f64>, usize> {
-        let node = self.symbolic.structure.supernode(s);
+        let node = self.structure.supernode(s);
         let (begin, pattern) = (node.start(), node.pattern());
-        let end = self.symbolic.structure.supernode_end()[s];
+        let end = self.structure.supernode_end()[s];
         let (width, height) = (end - begin, pattern.len());
         let rows = width + height;
         self.gather(begin, end, pattern, own);
         let children: Vec<(Runs, Vec<f64>)> = updates
             .into_iter()
             .map(|(child, values)| {
-                let child = self.symbolic.structure.supernode(child).pattern();
+                let child = self.structure.supernode(child).pattern();
                 (Runs::new(child, begin, end, pattern), values)
             })
             .collect();
@@ -262,10 +263,10 @@ impl Work<'_> {
     fn gather(&self, begin: usize, end: usize, pattern: &[usize], own: &mut [f64]) {
         let (width, rows) = (end - begin, end - begin + pattern.len());
         for p in begin / 3..end / 3 {
-            let row = self.symbolic.order[p] as usize;
+            let row = self.order[p] as usize;
             let (columns, blocks) = self.matrix.row(row);
             for (&k, block) in columns.iter().zip(blocks) {
-                let q = self.symbolic.position[k as usize] as usize;
+                let q = self.position[k as usize] as usize;
                 if q < p {
                     continue;
                 }

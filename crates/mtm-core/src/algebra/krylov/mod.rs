@@ -18,7 +18,7 @@ pub use crate::algebra::error_bound::PcgOptions;
 pub(crate) use crate::algebra::error_bound::Spectrum;
 pub use operator::{Operator, Preconditioner};
 pub use state::PcgOutcome;
-use state::State;
+use state::{Indefinite, State};
 pub(crate) use trial::{Trial, trial};
 
 /// Number of last iterations whose decrease of the energy estimates the remaining decrease.
@@ -100,16 +100,6 @@ pub(crate) enum Reached {
     Step(PcgOutcome),
     /// The matrix is indefinite, or nearly so.
     Indefinite(Box<Indefinite>),
-}
-
-/// The end of an iteration at a direction that does not count as constrained.
-pub(crate) struct Indefinite {
-    /// The solution reached so far.
-    pub solution: Vec<[f64; 3]>,
-    pub direction: Vec<[f64; 3]>,
-    /// The error to report if an indefinite matrix was not expected.
-    pub error: MtmError,
-    pub residual_history: Vec<f64>,
 }
 
 impl Reached {

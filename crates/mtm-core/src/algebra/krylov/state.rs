@@ -6,7 +6,6 @@ use crate::algebra::error_bound::{Due, PcgOptions, Spectrum};
 use crate::algebra::row_sums::{ROWS_PER_SUM, advance, dot, dot_and_largest};
 use crate::error::{MtmError, Result, Shortfall};
 
-use super::Indefinite;
 use super::operator::{Operator, Preconditioner};
 
 /// The solution of `pcg` and its accuracy.
@@ -28,6 +27,16 @@ pub struct PcgOutcome {
     /// Smallest and largest Ritz values of `M⁻¹ A` observed: their ratio is the condition number of the
     /// preconditioned system.
     pub ritz: [f64; 2],
+}
+
+/// The end of an iteration at a direction that does not count as constrained.
+pub(crate) struct Indefinite {
+    /// The solution reached so far.
+    pub solution: Vec<[f64; 3]>,
+    pub direction: Vec<[f64; 3]>,
+    /// The error to report if an indefinite matrix was not expected.
+    pub error: MtmError,
+    pub residual_history: Vec<f64>,
 }
 
 /// The vectors and coefficients of the iteration.

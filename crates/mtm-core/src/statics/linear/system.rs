@@ -26,7 +26,7 @@ use crate::statics::plans::settling::{
     ContactSolve, RowLinks, Unfactored, direct_error, settled_by_flexibility, touching_needs_pcg,
 };
 use crate::statics::restraint::Support;
-use crate::statics::solution::{Clock, TouchResult};
+use crate::statics::solution::{Clock, SolvedRows};
 use crate::vector::add;
 
 /// Maximum number of sliding nodes for which their flexibility is kept: 54 bytes a pair of nodes, 1.9 GB.
@@ -58,26 +58,6 @@ pub(crate) struct BodyRows<'a> {
     pub tissue: Extremes,
     /// The hierarchy of a similar matrix under the same conditions, if there is one.
     pub multigrid: Option<Arc<Multigrid>>,
-}
-
-/// Displacements of the rows after a solve, with contact if nodes slide.
-#[derive(Default)]
-pub(crate) struct SolvedRows {
-    /// mm.
-    pub rows: Vec<[f64; 3]>,
-    pub contact: Option<ContactResult>,
-    /// Time that contact took, s.
-    pub contact_seconds: f64,
-    /// What touches, and the force of it on each row, N; none without parts that may touch.
-    pub touching: TouchResult,
-    pub pushes: Vec<[f64; 3]>,
-}
-
-impl SolvedRows {
-    /// Displacements of a body without parts that may touch.
-    pub fn new(rows: Vec<[f64; 3]>, contact: Option<ContactResult>, contact_seconds: f64) -> Self {
-        Self { rows, contact, contact_seconds, ..Self::default() }
-    }
 }
 
 /// Contact constraints that stay the same for several right-hand sides.

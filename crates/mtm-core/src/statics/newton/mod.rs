@@ -24,11 +24,10 @@ use crate::mechanics::tensors::MassTensors;
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::Extremes;
 use crate::statics::linear::row_conditions::RowConditions;
-use crate::statics::linear::system::SolvedRows;
 use crate::statics::newton::hierarchy::SharedHierarchy;
 use crate::statics::options::{Method, StaticOptions};
 use crate::statics::reduction::{ReducedPattern, Reduction};
-use crate::statics::solution::Clock;
+use crate::statics::solution::{Clock, SolvedRows};
 use crate::vector::{add, between, dot, norm, scaled, sub};
 
 pub(crate) use sliding::SlidingBody;

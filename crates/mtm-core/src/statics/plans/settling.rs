@@ -17,10 +17,9 @@ use crate::mechanics::kinematics::Kinematics;
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::{Advance, Iterative, KeptForNext, SolveMemory};
 use crate::statics::linear::row_conditions::RowConditions;
-use crate::statics::linear::system::SolvedRows;
 use crate::statics::options::{Method, StaticOptions};
 use crate::statics::plans::reaction::{Answers, ContactFactor};
-use crate::statics::solution::Clock;
+use crate::statics::solution::{Clock, SolvedRows};
 use crate::vector::{between, dot, norm, sub};
 
 /// Tolerance of contact as a share of the error allowed in an iterative solve: contact cannot converge further

@@ -17,13 +17,13 @@ use crate::mechanics::tensors::MassTensors;
 use crate::statics::linear::confirmed::is_doubtful;
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::Extremes;
-use crate::statics::linear::system::{BodyRows, Frozen, SolvedRows, System, not_liftable};
+use crate::statics::linear::system::{BodyRows, Frozen, System, not_liftable};
 use crate::statics::newton::{Equilibrium, SlidingBody};
 use crate::statics::options::{Interrupt, Method, StaticOptions};
 use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart, method_for};
 use crate::statics::reduction::{NO_ROW, Reduction};
 use crate::statics::restraint::{self, Support};
-use crate::statics::solution::{Clock, Solution, Timings};
+use crate::statics::solution::{Clock, Solution, SolvedRows, Timings};
 use crate::vector::{add, norm, scaled};
 
 /// Multiple of the correction of a solution by factorisation that is taken as the error of the corrected one.

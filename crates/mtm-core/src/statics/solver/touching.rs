@@ -18,9 +18,9 @@ use crate::geometry::motion::SurfaceMotion;
 use crate::mesh::TetMesh;
 use crate::statics::linear::effort::PlanSolve;
 use crate::statics::linear::iterative::Extremes;
-use crate::statics::linear::system::{BodyRows, SolvedRows, System};
+use crate::statics::linear::system::{BodyRows, System};
 use crate::statics::plans::settling::{ContactSolve, RowLinks, WarmStart};
-use crate::statics::solution::{Clock, TouchResult};
+use crate::statics::solution::{Clock, SolvedRows, TouchResult};
 use crate::statics::solver::StaticSolver;
 use crate::vector::{add, norm, scaled, sub};
 
