@@ -142,11 +142,15 @@ impl Equilibrium {
         options: &StaticOptions,
         clock: &mut Clock,
     ) -> Result<(Self, Method)> {
-        if options.method.sweeps() {
-            let (found, needed) = (("method", options.method.name()), "auto, cholesky or pcg");
-            return Err(ErrorKind::Solver.not_together(found, "large deformation", needed));
-        }
-        let method = options.method.for_unknowns(3 * matrix.n_rows());
+        let method = match options.method {
+            sweeps @ Method::Relaxation => {
+                let (found, needed) = (("method", sweeps.name()), "auto, cholesky or pcg");
+                return Err(ErrorKind::Solver.not_together(found, "large deformation", needed));
+            }
+            method @ (Method::Auto | Method::Cholesky | Method::Pcg) => {
+                method.for_unknowns(3 * matrix.n_rows())
+            }
+        };
         let solver = if method.has_factor() {
             let symbolic = Symbolic::new(matrix, &[])?;
             if let Some(limit) = options.memory_limit
