@@ -1,20 +1,22 @@
-"""Headers of DICOM files: the few elements that place a slice, read by this module's own code.
+"""Headers of DICOM files: the few elements that place a slice, read by pydicom.
 
-Only what stands before the pixels is read. Nested sequences are read as well, for the frames of an
-enhanced multi-frame image are placed there. Pixels are decoded elsewhere, by a third-party reader.
+Only what stands before the pixels is read. Sequences that place the frames of an enhanced
+multi-frame image are read as well. Pixels are decoded elsewhere, by ITK.
 """
 
+import io
 import re
 import struct
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.errors import ImageInputError
+from cmfsim.errors import ImageError, ImageInputError, third_party
 
 # Pixels whose lowest value is shown white (PS3.3 C.7.6.3.1), and the element that states it.
 SHOWN_INVERTED = "MONOCHROME1"
@@ -23,43 +25,42 @@ INVERTED = re.compile(
 )
 # Elements that are kept, by their tag.
 NAMES: Mapping[int, str] = {
-    0x00020010: "transfer_syntax", 0x00041220: "directory_records", 0x00080008: "image_type",
-    0x00080016: "sop_class", 0x00080022: "acquisition_date", 0x00080032: "acquisition_time",
-    0x00080060: "modality", 0x0008103E: "series_description", 0x00100020: "patient_id",
-    0x00180050: "thickness", 0x00180088: "slice_spacing", 0x00181120: "gantry_tilt",
-    0x0020000D: "study_uid", 0x0020000E: "series_uid", 0x00200011: "series_number",
-    0x00200012: "acquisition_number", 0x00200013: "instance_number", 0x00200032: "position",
-    0x00200037: "orientation", 0x00200052: "frame_of_reference", 0x00280002: "samples",
-    0x00280004: "photometric", 0x00280008: "n_frames", 0x00280010: "rows", 0x00280011: "columns",
-    0x00280030: "pixel_spacing", 0x00280100: "bits", 0x00281052: "intercept", 0x00281053: "slope",
-    0x00281054: "rescale_type", 0x3004000C: "frame_offsets",
+    0x00080008: "image_type", 0x00080016: "sop_class", 0x00080060: "modality",
+    0x0008103E: "series_description", 0x00100020: "patient_id", 0x00180050: "thickness",
+    0x00180088: "slice_spacing", 0x00181120: "gantry_tilt", 0x0020000D: "study_uid",
+    0x0020000E: "series_uid", 0x00200011: "series_number", 0x00200012: "acquisition_number",
+    0x00200032: "position", 0x00200037: "orientation", 0x00200052: "frame_of_reference",
+    0x00280002: "samples", 0x00280004: "photometric", 0x00280008: "n_frames", 0x00280010: "rows",
+    0x00280011: "columns", 0x00280030: "pixel_spacing", 0x00280100: "bits",
+    0x00281052: "intercept", 0x00281053: "slope", 0x00281054: "rescale_type",
+    0x3004000C: "frame_offsets",
 }  # fmt: skip
-# Sequences that are read, and what is in them.
-SEQUENCES: Mapping[int, str] = {
-    0x52009229: "shared", 0x52009230: "per_frame", 0x00209111: "content",
-    0x00209113: "plane_position", 0x00209116: "plane_orientation", 0x00289110: "pixel_measures",
-    0x00289145: "value_transformation",
-}  # fmt: skip
+# What an enhanced image states of all frames and of each, and the sequences in these.
+SHARED, PER_FRAME = 0x52009229, 0x52009230
+WITHIN = frozenset({0x00209111, 0x00209113, 0x00209116, 0x00289110, 0x00289145})
+TAGS = [*NAMES, SHARED, PER_FRAME]
 # Whole numbers of 16 bits in binary; all others are text.
 BINARY = frozenset({"samples", "rows", "columns", "bits"})
-PIXELS = 0x7FE00010
-FLOAT_PIXELS = frozenset({0x7FE00008, 0x7FE00009})
-ITEM, ITEM_END, SEQUENCE_END = 0xFFFEE000, 0xFFFEE00D, 0xFFFEE0DD
+# Pixels, and those of real numbers.
+PIXELS = frozenset({0x7FE00010, 0x7FE00008, 0x7FE00009})
 UNDEFINED = 0xFFFFFFFF
-# Value representations whose length takes four bytes, after two that are reserved.
-LONG = frozenset((b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"))  # fmt: skip # noqa: E501
 # All value representations.
-KINDS = LONG | frozenset(
-    re.findall(rb"[A-Z]{2}", b"AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US")
-)
-EXPLICIT_BIG, DEFLATED, IMPLICIT = "1.2.840.10008.1.2.2", "1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2"  # fmt: skip # noqa: E501
+KINDS = frozenset(re.findall(
+    "[A-Z]{2}", "AE AS AT CS DA DS DT FD FL IS LO LT OB OD OF OL OV OW PN SH SL SQ SS ST SV TM UC "
+    "UI UL UN UR US UT UV"
+))  # fmt: skip
+# Classes of CT images, of one frame and several.
+CT = "1.2.840.10008.5.1.4.1.1.2"
 PREAMBLE = 128
-# The group that states how all others are written.
-META_GROUP = 2
-# Longer values are none that is kept, bytes; deeper nesting and more elements are no image's.
+# Longer values are none that is kept, bytes; more elements are no image's, nor so many odd ones.
 MOST_VALUE = 2**16
-MOST_DEPTH = 16
-MOST_ELEMENTS = 3_000_000
+MOST_ELEMENTS = 1_000_000
+MOST_ODD = 100
+
+REWRITE = (
+    "rewrite the files with a DICOM converter (such as gdcmconv or dcmconv), or export the series "
+    "again"
+)
 
 Tags = Mapping[str, str | int]
 
@@ -70,7 +71,8 @@ class DicomHeader:
 
     tags: By name; absent where the file does not state it.
     frames: What an enhanced multi-frame image states of each frame, in the order of its pixels.
-    odd: The first byte of each private element of no known kind, and that after its last.
+    odd: The first byte of each private element of no known kind and that after its last, in the
+        file without those before.
     """
 
     path: Path
@@ -88,9 +90,9 @@ class DicomHeader:
         inverted = self.text("photometric") == SHOWN_INVERTED
         if not (self.odd or inverted):
             return None
-        data, ends = self.path.read_bytes(), [0, *(end for _, end in self.odd)]
-        starts = [*(start for start, _ in self.odd), len(data)]
-        data = b"".join(data[a:b] for a, b in zip(ends, starts, strict=True))
+        data = self.path.read_bytes()
+        for start, end in self.odd:
+            data = data[:start] + data[end:]
         if not inverted:
             return data
         data, count = INVERTED.subn(rb"\1MONOCHROME2", data, count=1)
@@ -116,14 +118,6 @@ class DicomHeader:
         return numbers_of(self.text(name), count)
 
 
-@dataclass
-class _Found:
-    """What one data set holds so far."""
-
-    tags: dict[str, str | int] = field(default_factory=dict)
-    sequences: dict[str, list["_Found"]] = field(default_factory=dict)
-
-
 def numbers_of(text: str, count: int) -> NDArray[np.float64] | None:
     r"""The finite numbers of a text "1\2\3"; None where it holds something else."""
     try:
@@ -136,25 +130,35 @@ def numbers_of(text: str, count: int) -> NDArray[np.float64] | None:
 def dicom_header(path: Path) -> DicomHeader | None:
     """What a DICOM file states; None where the file is no DICOM.
 
-    Raises `ImageError`: A DICOM file that is cut short, damaged or packed as a whole.
+    Raises `ImageError`: A DICOM file that is cut short, damaged or packed as a whole; pydicom is
+        not installed.
     """
-    with path.open("rb") as stream:
-        begin = stream.read(PREAMBLE + 4)
+    with path.open("rb", buffering=0) as file:
+        begin = file.read(PREAMBLE + 4)
         marked = begin[PREAMBLE:] == b"DICM"
-        if not marked:
-            if not _bare(begin):
-                return None
-            stream.seek(0)
+        if not (marked or _bare(begin)):
+            return None
+        reader = third_party("pydicom.filereader", "DICOM is read", "imaging", ImageError)
+        raw: Any = file
+        odd: list[tuple[int, int]] = []
         try:
-            return _Reader(path, stream).header()
-        except (EOFError, struct.error, ValueError) as error:
+            while len(odd) <= MOST_ODD:
+                with _Stream(raw) as stream, warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    elements = _Elements(stream)
+                    found = reader.read_partial(stream, elements, force=True, specific_tags=TAGS)
+                    if elements.odd is None:
+                        return _header(path, found, elements, tuple(odd))
+                    odd.append(elements.odd)
+                    raw = stream.without(*elements.odd)
+            message = f"has more than {MOST_ODD} elements of no known kind (VR): {REWRITE}"
+            raise _RefusedError(message)  # noqa: TRY301 (told as the others)
+        except Exception as error:  # (whatever pydicom stumbles over)
             if not marked:
                 return None
-            if isinstance(error, ImageInputError):
-                raise
-            raise ImageInputError(
-                f"{path.name}: is cut short or damaged ({error}); copy it again"
-            ) from error
+            what = f"is cut short or damaged ({error}); copy it again"
+            what = str(error) if isinstance(error, _RefusedError) else what
+            raise ImageInputError(f"{path.name}: {what}") from error
 
 
 def _bare(begin: bytes) -> bool:
@@ -166,203 +170,164 @@ def _bare(begin: bytes) -> bool:
     return group in {2, 8} and element <= 0x60 and (explicit or length < MOST_VALUE)
 
 
-class _Reader:
-    """Walks through the elements of one file."""
+class _RefusedError(Exception):
+    """What another program has to change in a file."""
 
-    def __init__(self, path: Path, stream: BinaryIO) -> None:
-        self.path = path
-        self.stream = stream
-        self.size = path.stat().st_size
-        self.order = "<"
-        self.explicit = True
-        self.elements = 0
-        self.pixels: int | None = None
-        self.depth = 0
-        self.odd: list[tuple[int, int]] = []
 
-    def header(self) -> DicomHeader:
-        found = _Found()
-        begin = self.stream.tell()
-        first = self.stream.read(8)
-        self.stream.seek(begin)
-        if len(first) == 8 and struct.unpack("<H", first[:2])[0] == META_GROUP:
-            self._data_set(found, self.size, 0, stop_after_meta=True)
-            syntax = str(found.tags.get("transfer_syntax", ""))
-            if syntax == DEFLATED:
-                raise ImageInputError(
-                    f"{self.path.name}: is compressed as a whole (deflated transfer syntax): "
-                    "export it uncompressed"
-                )
-            self.order = ">" if syntax == EXPLICIT_BIG else "<"
-            self.explicit = syntax != IMPLICIT
-        else:
-            self.explicit = first[4:6].isalpha()
-        self._data_set(found, self.size, 0)
-        self._check_pixels(found)
-        # What all frames share, and what each states itself.
-        shared = _flat(found.sequences.get("shared", []))
-        each = found.sequences.get("per_frame", [])
-        frames = tuple({**shared, **_flat([item])} for item in each)
-        has_pixels = self.pixels is not None
-        return DicomHeader(self.path, found.tags, has_pixels, frames, tuple(self.odd))
+class _Stream(io.BufferedReader):
+    """A file that ends in an error where pydicom would go on without what is missing."""
 
-    def _data_set(
-        self, found: _Found, end: int, depth: int, *, stop_after_meta: bool = False
-    ) -> None:
-        """Reads elements until an end, an end mark, or the pixels."""
-        if depth > MOST_DEPTH:
-            message = f"sequences are nested deeper than {MOST_DEPTH}"
+    # Which bytes in memory have none, and pydicom asks for.
+    name = ""
+
+    def __init__(self, raw: Any) -> None:
+        super().__init__(raw)
+        self.size = self.seek(0, io.SEEK_END)
+        self.seek(0)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """So many bytes, or none at the end of the file."""
+        if size is None or size < 0:
+            # pydicom would unpack all that follows, whatever its size.
+            message = "is compressed as a whole (deflated transfer syntax): export it uncompressed"
+            raise _RefusedError(message)
+        data = super().read(size)
+        # The head of an element, of 8 bytes, is asked for until there is none.
+        if len(data) < size and (data or size > 8):
+            message = f"it ends at byte {self.size}"
             raise ValueError(message)
-        while self.stream.tell() < end:
-            if stop_after_meta and self._next_group() != META_GROUP:
-                return
-            self.depth = depth
-            tag, kind, length = self._element()
-            if tag in {ITEM_END, SEQUENCE_END}:
-                return
-            if (tag == PIXELS or tag in FLOAT_PIXELS) and depth == 0:
-                self.pixels = length
-                return
-            if kind == b"SQ" or length == UNDEFINED:
-                explicit = self.explicit
-                # A sequence of unknown kind is written without kinds inside.
-                self.explicit = explicit and kind != b"UN"
-                self._sequence(found, tag, length, depth)
-                self.explicit = explicit
-                continue
-            if length > self.size - self.stream.tell():
-                message = f"element {tag:08x} has {length} bytes, more than are left"
-                raise EOFError(message)
-            name = NAMES.get(tag)
-            if name is None or length > MOST_VALUE:
-                self.stream.seek(length, 1)
-            else:
-                found.tags[name] = self._value(name, self._bytes(length))
+        return data
 
-    def _next_group(self) -> int:
-        """The group of the element to come: what follows the first group has another encoding."""
-        group = self._bytes(2)
-        self.stream.seek(-2, 1)
-        return int(struct.unpack("<H", group)[0])
+    def without(self, start: int, end: int) -> io.BytesIO:
+        """The file without some of its bytes."""
+        self.seek(0)
+        data = self.read(self.size)
+        return io.BytesIO(data[:start] + data[end:])
 
-    def _element(self) -> tuple[int, bytes, int]:
-        """Tag, value representation (empty where it is not stated) and length of an element."""
-        self.elements += 1
-        if self.elements > MOST_ELEMENTS:
+
+class _Elements:
+    """Looks at each element before pydicom reads it, and stops at the pixels.
+
+    pixels: The length of the pixels, perhaps UNDEFINED; None where there are none.
+    left: Bytes from there to the end of the file.
+    odd: The first byte of a private element of no known kind and that after its last.
+    """
+
+    def __init__(self, stream: _Stream) -> None:
+        self.stream = stream
+        self.explicit = False
+        self.count = 0
+        self.pixels: int | None = None
+        self.left = 0
+        self.odd: tuple[int, int] | None = None
+
+    def __call__(self, tag: int, kind: str | None, length: int) -> bool:
+        """Whether pydicom stops before an element, whose value begins where the stream is."""
+        self.count += 1
+        self.explicit |= kind in KINDS
+        self.left = self.stream.size - self.stream.tell()
+        if self.explicit and kind is None:
+            self.odd = self._span_of_no_kind(tag)
+            return True
+        if tag in PIXELS:
+            self.pixels = length
+            return True
+        if self.left < length != UNDEFINED:
+            message = f"element {tag:08x} has {length} bytes, more than are left"
+            raise ValueError(message)
+        if self.count > MOST_ELEMENTS:
             message = f"more than {MOST_ELEMENTS} elements"
             raise ValueError(message)
-        head = self._bytes(8)
-        group, element = struct.unpack(f"{self.order}HH", head[:4])
-        tag = group << 16 | element
-        if not self.explicit or group == 0xFFFE:
-            return tag, b"SQ" if tag in SEQUENCES else b"", self._long(head[4:])
-        kind = head[4:6]
-        if kind in LONG:
-            return tag, kind, self._long(self._bytes(4))
-        if not kind.isalpha():
-            return tag, b"UN", self._length_of_no_kind(tag, head)
-        return tag, kind, struct.unpack(f"{self.order}H", head[6:])[0]
+        return False
 
-    def _length_of_no_kind(self, tag: int, head: bytes) -> int:
-        """The length of an element whose kind is none, if what follows it shows which it is.
+    def _span_of_no_kind(self, tag: int) -> tuple[int, int]:
+        """The bytes of an element whose kind is none, if what follows it shows how many they are.
 
         Such elements are private ones, that no reader needs. Programs write their lengths in two
         bytes, in four, or as where no kind is stated.
         """
-        begin = self.stream.tell()
-        if tag >> 16 & 1 and len(more := self.stream.read(4)) == 4:
-            (short,) = struct.unpack(f"{self.order}H", head[6:])
-            starts = (begin, short), (begin, self._long(head[4:])), (begin + 4, self._long(more))
-            for start, length in starts:
-                if self._is_followed(tag, start + length):
-                    self.stream.seek(start)
-                    if self.depth == 0:
-                        self.odd.append((begin - 8, start + length))
-                    return length
-        raise ImageInputError(
-            f"{self.path.name}: its element {tag >> 16:04x},{tag & 0xFFFF:04x} has no known value "
-            "representation (VR), and what follows it is not found: rewrite the files with a DICOM "
-            "converter (such as gdcmconv or dcmconv), or export the series again"
+        begin = self.stream.tell() - 8
+        self.stream.seek(begin)
+        head = self.stream.read(min(12, self.left + 8))
+        order = "<" if struct.unpack("<HH", head[:4]) == (tag >> 16, tag & 0xFFFF) else ">"
+        if tag >> 16 & 1 and len(head) == 12:
+            for size, form in ((8, "6xH"), (8, "4xI"), (12, "8xI")):
+                end = begin + size + struct.unpack_from(order + form, head)[0]
+                if self._is_element(order, tag, end):
+                    return begin, end
+        message = (
+            f"its element {tag >> 16:04x},{tag & 0xFFFF:04x} has no known value representation "
+            f"(VR), and what follows it is not found: {REWRITE}"
         )
+        raise _RefusedError(message)
 
-    def _is_followed(self, tag: int, place: int) -> bool:
-        """Whether a place is that of an element after this one, of a known kind."""
-        if place + 8 > self.size:
+    def _is_element(self, order: str, before: int, place: int) -> bool:
+        """Whether an element of a known kind, that may follow another, begins at a place."""
+        if place + 8 > self.stream.size:
             return False
         self.stream.seek(place)
-        head = self.stream.read(8)
-        group, element = struct.unpack(f"{self.order}HH", head[:4])
-        return group << 16 | element > tag and head[4:6] in KINDS
+        group, element, kind = struct.unpack(f"{order}HH2s2x", self.stream.read(8))
+        return group << 16 | element > before and kind.decode("latin-1") in KINDS
 
-    def _sequence(self, found: _Found, tag: int, length: int, depth: int) -> None:
-        """Reads the items of a sequence, or passes over it."""
-        begin = self.stream.tell()
-        name = SEQUENCES.get(tag)
-        if length != UNDEFINED:
-            if length > self.size - begin:
-                message = f"sequence {tag:08x} has {length} bytes, more than are left"
-                raise EOFError(message)
-            if name is None:
-                self.stream.seek(length, 1)
-                return
-        end = self.size if length == UNDEFINED else begin + length
-        items = found.sequences.setdefault(name or "", [])
-        while self.stream.tell() < end:
-            mark, _, size = self._element()
-            if mark == SEQUENCE_END:
-                return
-            if mark != ITEM:
-                message = f"sequence {tag:08x} holds {mark:08x} in place of an item"
-                raise ValueError(message)
-            item = _Found()
-            stop = self.size if size == UNDEFINED else self.stream.tell() + size
-            if name is None and size != UNDEFINED:
-                self.stream.seek(min(stop, self.size))
-                continue
-            self._data_set(item, min(stop, self.size), depth + 1)
-            if name is not None:
-                items.append(item)
 
-    def _value(self, name: str, data: bytes) -> str | int:
-        if name in BINARY:
-            if len(data) < 2:
-                message = f"{name} is empty"
-                raise ValueError(message)
-            return int(struct.unpack(f"{self.order}H", data[:2])[0])
-        return data.decode("latin-1").strip("\0 ")
-
-    def _long(self, data: bytes) -> int:
-        return int(struct.unpack(f"{self.order}I", data)[0])
-
-    def _bytes(self, count: int) -> bytes:
-        data = self.stream.read(count)
-        if len(data) < count:
-            message = f"it ends at byte {self.size}"
-            raise EOFError(message)
-        return data
-
-    def _check_pixels(self, found: _Found) -> None:
-        """Refuses a file that holds fewer pixels than it states: readers give zeros for them."""
-        if self.pixels is None or self.pixels == UNDEFINED:
-            return
-        left = self.size - self.stream.tell()
-        tags = found.tags
-        needed = self.pixels
-        if all(name in tags for name in ("rows", "columns", "bits")):
-            frames = numbers_of(str(tags.get("n_frames", "") or "1"), 1)
+def _header(
+    path: Path, found: Any, elements: _Elements, odd: tuple[tuple[int, int], ...]
+) -> DicomHeader:
+    """The header of what pydicom read; an error if the file holds fewer pixels than it states."""
+    tags = _tags(found)
+    frames: tuple[Tags, ...] = ()
+    if PER_FRAME in found:
+        shared = {} if SHARED not in found else _of_items(found[SHARED])
+        frames = tuple({**shared, **_tags(item)} for item in found[PER_FRAME].value)
+    header = DicomHeader(path, tags, elements.pixels is not None, frames, odd)
+    size = {"rows", "columns"} & tags.keys()
+    kind = header.text("sop_class") or str(found.file_meta.get("MediaStorageSOPClassUID", ""))
+    is_image = size or kind.startswith(CT) or not elements.count
+    if len(size) < 2 if header.has_pixels else is_image:
+        message = "it has no pixels, or does not state their rows and columns"
+        raise ValueError(message)
+    if elements.pixels not in {None, UNDEFINED}:
+        needed = elements.pixels or 0
+        if "bits" in tags:
+            # Readers give zeros for pixels that are not there.
             each = int(tags["rows"]) * int(tags["columns"]) * int(tags.get("samples", 1))
-            needed = each * (int(tags["bits"]) // 8) * (1 if frames is None else int(frames[0]))
-        if left < needed:
-            message = f"{left} of {needed} bytes of pixels"
-            raise EOFError(message)
+            needed = each * (int(tags["bits"]) // 8) * header.count
+        if elements.left < needed:
+            message = f"{elements.left} of {needed} bytes of pixels"
+            raise ValueError(message)
+    return header
 
 
-def _flat(items: list[_Found]) -> dict[str, str | int]:
+def _tags(found: Any) -> dict[str, str | int]:
+    """The values of a data set and of the sequences in it that are kept."""
     tags: dict[str, str | int] = {}
-    for item in items:
-        tags |= item.tags
-        for inner in item.sequences.values():
-            tags |= _flat(inner)
+    # As they stand in the file: pydicom refuses numbers that are not written by its rules.
+    for element in found.elements():
+        if element.VR is None and not element.is_implicit_VR:
+            message = f"element {element.tag:08x} is of no known kind (VR)"
+            raise ValueError(message)
+        if (name := NAMES.get(element.tag)) is not None:
+            data = element.value or b""
+            if data and len(data) != element.length:
+                message = f"element {element.tag:08x} has {len(data)} of {element.length} bytes"
+                raise ValueError(message)
+            if len(data) > MOST_VALUE:
+                continue
+            if name in BINARY:
+                order = "<" if element.is_little_endian else ">"
+                tags[name] = int(struct.unpack_from(f"{order}H", data)[0])
+            else:
+                tags[name] = data.decode("latin-1").strip("\0 ")
+        elif element.tag in WITHIN:
+            tags |= _of_items(found[element.tag])
+    return tags
+
+
+def _of_items(sequence: Any) -> dict[str, str | int]:
+    """The values of all items of a sequence."""
+    tags: dict[str, str | int] = {}
+    for item in sequence.value:
+        tags |= _tags(item)
     return tags
 
 

@@ -9,6 +9,8 @@ from small_scans import codes, noisy, refused, same, smooth
 
 import cmfsim
 from benches.scenes import ct_variants as variants
+from cmfsim import ImageError
+from cmfsim.io.images.dicom_headers import dicom_header
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.images.image_grids import of_slices
 from dicom_series import axial, tilted, write_classic_frames, write_series
@@ -325,6 +327,28 @@ def test_other_files_are_skipped_and_a_damaged_slice_is_not(tmp_path):
     refused(tmp_path / "ct", "1.2.3_0007.dcm", "cut short")
     last.write_bytes(last.read_bytes()[:300])
     refused(tmp_path / "ct", "1.2.3_0007.dcm", "cut short")
+
+
+@pytest.mark.parametrize("explicit", [False, True])
+def test_a_slice_cut_short_anywhere_is_never_left_out(tmp_path, explicit):
+    """Where an element ends, what is left is a whole DICOM file, but no image."""
+    if explicit:
+        explicit_series(tmp_path / "ct")
+    else:
+        write_series(tmp_path / "ct", axial(noisy()))
+    path = min((tmp_path / "ct").iterdir())
+    data = path.read_bytes()
+    for end in range(132, len(data), 2):
+        path.write_bytes(data[:end])
+        with pytest.raises(ImageError, match=path.name):
+            dicom_header(path)
+
+
+def test_a_slice_that_does_not_state_its_size_is_refused_by_name(tmp_path):
+    explicit_series(tmp_path / "ct")
+    path = tmp_path / "ct" / "3.dcm"
+    path.write_bytes(path.read_bytes().replace(b"\x28\0\x10\0US", b"\x28\0\x0f\0US", 1))
+    refused(tmp_path / "ct", "3.dcm", "rows and columns")
 
 
 def test_a_slice_without_a_place_is_refused_by_name(tmp_path):
