@@ -1,4 +1,4 @@
-"""Images: NRRD, NIfTI and MetaImage by our own readers, DICOM's pixels and writing by ITK."""
+"""Images: which reader a file has by its content; DICOM's pixels, and writing, by ITK."""
 
 import glob
 import shutil

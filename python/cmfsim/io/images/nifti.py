@@ -1,7 +1,8 @@
-"""NIfTI files, header and voxels, plain or packed by gzip: no third-party reader is needed.
+"""NIfTI files, plain or packed by gzip: headers by nibabel, with what is checked of them.
 
 ITK reads zeros where a file is cut short, drops the shear of a tilted scan or refuses it, and never
-comes to an end where the affine is infinite.
+comes to an end where the affine is infinite. nibabel corrects headers without a word, unless it is
+told not to, and reads a file that is longer than its header states.
 """
 
 import gzip
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.errors import ImageInputError
+from cmfsim.errors import ImageError, ImageInputError, third_party
 from cmfsim.io.images.image_headers import (
     KNOWN,
     MOST_PACKED,
@@ -32,15 +33,8 @@ from cmfsim.values.finding import Finding
 PLACES_AGREE = 0.25
 # Spacings stated twice agree up to this part.
 SPACINGS_AGREE = 0.01
-# The longer of both NIfTI headers, bytes.
-NIFTI_HEADER = 544
-# NIfTI's data types of one real number per voxel.
-NIFTI_TYPES: Mapping[int, str] = {
-    2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8",
-    1280: "u8",
-}  # fmt: skip
-# NIfTI's types of several numbers per voxel: complex numbers and colours.
-NIFTI_VECTORS: Mapping[int, int] = {32: 2, 128: 3, 1792: 2, 2304: 4}
+# The modules of nibabel, by the length of the headers that each reads, bytes.
+MODULES: Mapping[int, str] = {348: "nifti1", 540: "nifti2"}
 # NIfTI's units of length (the low three bits of xyzt_units), mm.
 NIFTI_UNITS: Mapping[int, float] = {1: 1000.0, 2: 1.0, 3: 0.001}
 # Codes of a NIfTI map to a template's space, in which lengths are not the patient's.
@@ -52,6 +46,7 @@ MOST_START = 1 << 30
 EXTENSION = 4
 # Quaternions are written in single precision.
 UNIT_PART = 1e-3
+TURN = ("quatern_b", "quatern_c", "quatern_d", "qoffset_x", "qoffset_y", "qoffset_z")
 GZIP = b"\x1f\x8b"
 # Bytes that are unpacked at a time.
 CHUNK = 1 << 22
@@ -89,7 +84,7 @@ def read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], tuple[Fin
         packed = file.read(2) == GZIP
     try:
         with gzip.open(path, "rb") if packed else path.open("rb") as stream:
-            header = _header(path, stream.read(NIFTI_HEADER))
+            header = _header(path, stream.read(max(MODULES)))
             values, left = _voxels(path, stream, header, packed=packed)
     except (EOFError, OSError, zlib.error) as error:
         raise ImageInputError(
@@ -114,7 +109,7 @@ def _order(header: bytes) -> str | None:
     """The byte order of a NIfTI or Analyze header; None if it is neither."""
     if len(header) < 4:
         return None
-    return next((o for o in "<>" if struct.unpack(f"{o}i", header[:4])[0] in {348, 540}), None)
+    return next((o for o in "<>" if struct.unpack(f"{o}i", header[:4])[0] in MODULES), None)
 
 
 def _header(path: Path, data: bytes) -> _Header:
@@ -125,30 +120,26 @@ def _header(path: Path, data: bytes) -> _Header:
             f"{path.name}: is not a readable image (no NIfTI header, or cut short); {KNOWN}"
         )
 
-    def at(form: str, place: int) -> tuple[Any, ...]:
-        return struct.unpack_from(f"{order}{form}", data, place)
-
-    long = first == 540
-    _check_magic(path, data[4:8] if long else data[344:348])
-    kind, bits = at("hh", 12 if long else 70)
-    shape = [int(n) for n in at("8q" if long else "8h", 16 if long else 40)]
-    size = _size(path, shape, int(kind))
-    spacing = np.array(at("8d" if long else "8f", 104 if long else 76))[:4]
-    start = float(at("q" if long else "f", 168 if long else 108)[0])
-    scale = at("dd" if long else "ff", 176 if long else 112)
-    units = int(at("i", 500)[0]) if long else data[123]
-    codes = at("ii" if long else "hh", 344 if long else 252)
-    turn = np.array(at("6d" if long else "6f", 352 if long else 256))
-    rows = np.array(at("12d" if long else "12f", 400 if long else 280)).reshape(3, 4)
+    module = f"nibabel.{MODULES[first]}"
+    of_kind = third_party(module, "NIfTI is read", "imaging", ImageError)
+    header = getattr(of_kind, f"Nifti{module[-1]}Header")(data[:first], order, check=False)
+    at = header.structarr
+    _check_magic(path, bytes(at["magic"].item())[:4].ljust(4, b"\0"))
+    dtype, size = _dtype(path, header), _size(path, at["dim"].tolist())
+    spacing = at["pixdim"][:4].astype(np.float64)
+    start, units = float(at["vox_offset"]), int(at["xyzt_units"])
+    scale = float(at["scl_slope"]), float(at["scl_inter"])
+    codes = int(at["qform_code"]), int(at["sform_code"])
+    turn = np.array([at[name] for name in TURN], dtype=np.float64)
+    rows = np.array([at[f"srow_{axis}"] for axis in "xyz"], dtype=np.float64)
     ignored = []
-    dtype = np.dtype(order + NIFTI_TYPES[int(kind)])
-    if bits != 8 * dtype.itemsize:
+    if (bits := int(at["bitpix"])) != 8 * dtype.itemsize:
         # The type says it as well, and the length of the file is compared with it.
         ignored.append(f"bitpix {bits}, which its data type contradicts")
     if not math.isfinite(scale[0]):
         # As nibabel and ITK take it.
         ignored.append(f"scl_slope {scale[0]}: values are as they are stored")
-        scale = (1.0, 0.0)
+        scale = 1.0, 0.0
     if start == 0.0:
         ignored.append("vox_offset 0: voxels begin after the header")
         start = first + EXTENSION
@@ -167,10 +158,10 @@ def _header(path: Path, data: bytes) -> _Header:
         size,
         dtype,
         int(start),
-        (float(scale[0]), float(scale[1])),
+        scale,
         unit * spacing[1:],
         -1.0 if spacing[0] < 0.0 else 1.0,
-        (int(codes[0]), int(codes[1])),
+        codes,
         turn,
         unit * rows,
         units & 7 in NIFTI_UNITS,
@@ -211,14 +202,24 @@ def _check_magic(path: Path, magic: bytes) -> None:
         )
 
 
-def _size(path: Path, shape: list[int], kind: int) -> tuple[int, int, int]:
+def _dtype(path: Path, header: Any) -> np.dtype[Any]:
+    """The type of a voxel: one real number."""
+    kind = int(header["datatype"])
+    try:
+        dtype: np.dtype[Any] = header.get_data_dtype()
+    except Exception as error:  # (a number that is no type is a KeyError)
+        raise ImageInputError(f"{path.name}: data type {kind} is unknown") from error
+    if components := len(dtype.names or "") or 2 * (dtype.kind == "c"):
+        check_shape(path.name, [2, 2, 2], components)
+    if dtype.kind not in "iuf":
+        raise ImageInputError(f"{path.name}: data type {kind}: whole or real numbers are needed")
+    return dtype
+
+
+def _size(path: Path, shape: list[int]) -> tuple[int, int, int]:
     if not 1 <= shape[0] <= 7 or min(shape[1 : shape[0] + 1]) < 1:
         raise ImageInputError(f"{path.name}: has {shape[0]} axes of {shape[1:]} voxels")
     size = shape[1 : shape[0] + 1]
-    if kind in NIFTI_VECTORS:
-        check_shape(path.name, size, NIFTI_VECTORS[kind])
-    if kind not in NIFTI_TYPES:
-        raise ImageInputError(f"{path.name}: data type {kind}: whole or real numbers are needed")
     check_shape(path.name, size)
     return size[0], size[1], size[2]
 
@@ -304,14 +305,8 @@ def _from_quaternion(path: Path, header: _Header) -> NDArray[np.float64]:
             f"{path.name}: the quaternion of its qform is {(b, c, d)}, longer than 1: convert the "
             "DICOM series again"
         )
-    a = math.sqrt(max(0.0, rest))
-    rotation = np.array(
-        [
-            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
-            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
-            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
-        ]
-    ) / (a * a + b * b + c * c + d * d)
+    quaternion = third_party("nibabel.quaternions", "NIfTI is read", "imaging", ImageError)
+    rotation = quaternion.quat2mat((math.sqrt(max(0.0, rest)), b, c, d))
     steps = header.spacing * np.array([1.0, 1.0, header.hand])
     return np.column_stack([rotation * steps, header.turn[3:]])
 
