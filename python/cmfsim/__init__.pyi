@@ -110,10 +110,10 @@ from cmfsim.io.meshes.plain_mesh import repair_tets as repair_tets
 from cmfsim.io.objects import from_meshio as from_meshio
 from cmfsim.io.objects import from_nibabel as from_nibabel
 from cmfsim.io.objects import from_pyvista as from_pyvista
-from cmfsim.io.results.calibrations import read_calibration as read_calibration
-from cmfsim.io.results.calibrations import write_calibration as write_calibration
 from cmfsim.io.results.populations import Population as Population
 from cmfsim.io.results.populations import PopulationEntry as PopulationEntry
+from cmfsim.io.results.populations import read_calibration as read_calibration
+from cmfsim.io.results.populations import write_calibration as write_calibration
 from cmfsim.lab.benchmark import BenchmarkTable as BenchmarkTable
 from cmfsim.lab.benchmark import SkinPrediction as SkinPrediction
 from cmfsim.lab.benchmark import read_skin_prediction as read_skin_prediction

@@ -22,7 +22,7 @@ from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.drafting import CASE_FILE, init_case, read_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
-from cmfsim.io.results.calibrations import read_calibration
+from cmfsim.io.results.populations import read_calibration
 from cmfsim.io.results.predictions import predictions_of
 from cmfsim.io.results.result_files import is_model_file
 from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts

@@ -8,7 +8,7 @@ from typing import Any
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
-from cmfsim.io.cases.case_plans import matrix_rows, plan_head
+from cmfsim.io.cases.case_tables import matrix_rows, plan_head
 from cmfsim.io.files.reading_writing import toml_module
 from cmfsim.io.files.texts import toml_lines
 from cmfsim.values.checks import Floats

@@ -13,7 +13,7 @@ import dicom_series
 import phantom_case
 import shared_values
 from cmfsim.cli import main
-from cmfsim.io.results.dicom_pdf import write_dicom_pdf
+from cmfsim.io.images.dicom_series import write_dicom_pdf
 from cmfsim.pipeline.building.inputs import input_hash
 from cmfsim.report.chart_page import A4, SITES, draw_chart_page
 

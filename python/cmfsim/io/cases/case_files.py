@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io.cases import case_tables
-from cmfsim.io.cases.case_plans import is_achieved, osteotomies_of, plan_of
+from cmfsim.io.cases.case_tables import is_achieved, osteotomies_of, plan_of
 from cmfsim.io.cases.tables import CaseChanges, Table, read_tables
 from cmfsim.io.files.reading_writing import is_there
 from cmfsim.values import case_parts

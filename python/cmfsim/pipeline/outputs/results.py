@@ -22,7 +22,7 @@ from cmfsim.evaluation import error_table
 from cmfsim.io import Case, replacing, replacing_files
 from cmfsim.io.cases.case_files import CASE_FILE
 from cmfsim.io.files.summaries import hashes_of, write_summary
-from cmfsim.io.results.dicom_pdf import write_dicom_pdf
+from cmfsim.io.images.dicom_series import write_dicom_pdf
 from cmfsim.io.results.metrics import (
     CHART_PAGE_FILE,
     DICOM_PAGE_FILE,
