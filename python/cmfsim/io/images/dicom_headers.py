@@ -52,10 +52,14 @@ KINDS = frozenset(re.findall(
 # Classes of CT images, of one frame and several.
 CT = "1.2.840.10008.5.1.4.1.1.2"
 PREAMBLE = 128
-# Longer values are none that is kept, bytes; more elements are no image's, nor so many odd ones.
+# Longer values are none that is kept, bytes. No image takes more reads of its file, has a longer
+# sequence or more items in one, for each of which pydicom takes 1.3 kB, or so many odd elements.
 MOST_VALUE = 2**16
-MOST_ELEMENTS = 1_000_000
+MOST_READS = 1_000_000
+MOST_SEQUENCE, MOST_ITEMS = 2**25, 300_000
 MOST_ODD = 100
+# What begins an item, in both orders of bytes.
+ITEMS = (b"\xfe\xff\x00\xe0", b"\xff\xfe\xe0\x00")
 
 REWRITE = (
     "rewrite the files with a DICOM converter (such as gdcmconv or dcmconv), or export the series "
@@ -182,6 +186,7 @@ class _Stream(io.BufferedReader):
 
     def __init__(self, raw: Any) -> None:
         super().__init__(raw)
+        self.reads = 0
         self.size = self.seek(0, io.SEEK_END)
         self.seek(0)
 
@@ -195,6 +200,10 @@ class _Stream(io.BufferedReader):
         # The head of an element, of 8 bytes, is asked for until there is none.
         if len(data) < size and (data or size > 8):
             message = f"it ends at byte {self.size}"
+            raise ValueError(message)
+        self.reads += 1
+        if self.reads > MOST_READS:
+            message = "it has more elements than any image"
             raise ValueError(message)
         return data
 
@@ -235,9 +244,6 @@ class _Elements:
         if self.left < length != UNDEFINED:
             message = f"element {tag:08x} has {length} bytes, more than are left"
             raise ValueError(message)
-        if self.count > MOST_ELEMENTS:
-            message = f"more than {MOST_ELEMENTS} elements"
-            raise ValueError(message)
         return False
 
     def _span_of_no_kind(self, tag: int) -> tuple[int, int]:
@@ -275,10 +281,8 @@ def _header(
 ) -> DicomHeader:
     """The header of what pydicom read; an error if the file holds fewer pixels than it states."""
     tags = _tags(found)
-    frames: tuple[Tags, ...] = ()
-    if PER_FRAME in found:
-        shared = {} if SHARED not in found else _of_items(found[SHARED])
-        frames = tuple({**shared, **_tags(item)} for item in found[PER_FRAME].value)
+    shared = _tags_of_items(found, SHARED)
+    frames = tuple({**shared, **_tags(item)} for item in _items(found, PER_FRAME))
     header = DicomHeader(path, tags, elements.pixels is not None, frames, odd)
     size = {"rows", "columns"} & tags.keys()
     kind = header.text("sop_class") or str(found.file_meta.get("MediaStorageSOPClassUID", ""))
@@ -319,16 +323,29 @@ def _tags(found: Any) -> dict[str, str | int]:
             else:
                 tags[name] = data.decode("latin-1").strip("\0 ")
         elif element.tag in WITHIN:
-            tags |= _of_items(found[element.tag])
+            tags |= _tags_of_items(found, element.tag)
     return tags
 
 
-def _of_items(sequence: Any) -> dict[str, str | int]:
+def _tags_of_items(found: Any, tag: int) -> dict[str, str | int]:
     """The values of all items of a sequence."""
     tags: dict[str, str | int] = {}
-    for item in sequence.value:
+    for item in _items(found, tag):
         tags |= _tags(item)
     return tags
+
+
+def _items(found: Any, tag: int) -> Any:
+    """The items of a sequence; none where there is none."""
+    if tag not in found:
+        return ()
+    raw = found.get_item(tag).value
+    if isinstance(raw, bytes) and (
+        len(raw) > MOST_SEQUENCE or max(map(raw.count, ITEMS)) > MOST_ITEMS
+    ):
+        message = f"its sequence {tag:08x} is longer than any image has"
+        raise ValueError(message)
+    return found[tag].value
 
 
 # More frames than this are no head's.
