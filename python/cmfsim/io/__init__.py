@@ -29,11 +29,11 @@ from cmfsim.io.meshes.surfaces import read_moved_surface as read_moved_surface
 from cmfsim.io.meshes.surfaces import read_surface as read_surface
 from cmfsim.io.meshes.surfaces import read_surface_file as read_surface_file
 from cmfsim.io.meshes.surfaces import write_surface as write_surface
-from cmfsim.io.results.metrics import write_metrics as write_metrics
 from cmfsim.io.results.predictions import read_parts as read_parts
 from cmfsim.io.results.predictions import write_prediction as write_prediction
 from cmfsim.io.results.result_files import read_result as read_result
 from cmfsim.io.results.result_files import result_suffixes as result_suffixes
+from cmfsim.io.results.result_files import write_metrics as write_metrics
 from cmfsim.io.results.result_files import write_model as write_model
 from cmfsim.io.results.result_files import write_result as write_result
 from cmfsim.io.slicer.output import write_slicer_bundle as write_slicer_bundle

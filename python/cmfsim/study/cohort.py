@@ -17,7 +17,7 @@ from cmfsim.evaluation import NO_CHANGE, DistanceStatistics, ErrorTable
 from cmfsim.io import Case, CaseChanges, Cohort, finish_writing, replacing_files
 from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.files.summaries import checked_file
-from cmfsim.io.results.metrics import (
+from cmfsim.io.results.result_files import (
     AGAIN,
     SkinErrors,
     read_evaluation,

@@ -27,7 +27,7 @@ from cmfsim.io.files.summaries import (
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.surfaces import write_surface
 from cmfsim.io.meshes.vtk_writing import write_tets, write_triangles
-from cmfsim.io.results.metrics import (
+from cmfsim.io.results.result_files import (
     CHART_PAGE_FILE,
     DICOM_PAGE_FILE,
     EVALUATION_FILE,
@@ -35,8 +35,8 @@ from cmfsim.io.results.metrics import (
     is_evaluation_file,
     read_evaluation,
     read_picture,
+    write_result,
 )
-from cmfsim.io.results.result_files import write_result
 from cmfsim.values.checks import AnyPath
 from cmfsim.values.moduli import MOST_POISSON, YOUNG_RANGE
 from cmfsim.values.prediction import MODELS, Prediction

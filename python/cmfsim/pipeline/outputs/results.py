@@ -23,16 +23,6 @@ from cmfsim.io import Case, replacing, replacing_files
 from cmfsim.io.cases.case_files import CASE_FILE
 from cmfsim.io.files.summaries import hashes_of, write_summary
 from cmfsim.io.images.dicom_series import write_dicom_pdf
-from cmfsim.io.results.metrics import (
-    CHART_PAGE_FILE,
-    DICOM_PAGE_FILE,
-    EVALUATION_FILE,
-    REPORT_FILE,
-    read_evaluation,
-    read_evaluation_picture,
-    skin_errors_file,
-    write_skin_errors,
-)
 from cmfsim.io.results.predictions import (
     fill_prediction,
     is_prediction_file,
@@ -44,6 +34,16 @@ from cmfsim.io.results.predictions import (
     read_prediction_picture,
     stale_results,
     write_timings,
+)
+from cmfsim.io.results.result_files import (
+    CHART_PAGE_FILE,
+    DICOM_PAGE_FILE,
+    EVALUATION_FILE,
+    REPORT_FILE,
+    read_evaluation,
+    read_evaluation_picture,
+    skin_errors_file,
+    write_skin_errors,
 )
 from cmfsim.io.slicer.output import SLICER_FILE, write_slicer_bundle
 from cmfsim.pictures import (

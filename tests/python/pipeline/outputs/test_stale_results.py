@@ -16,8 +16,8 @@ from cmfsim.cli import main
 from cmfsim.cli.study_commands import _plan_text
 from cmfsim.io import finish_writing, read_parts
 from cmfsim.io.meshes.mesh_files import read_mesh
-from cmfsim.io.results.metrics import read_evaluation
 from cmfsim.io.results.predictions import predictions_of, read_prediction
+from cmfsim.io.results.result_files import read_evaluation
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
 from cmfsim.pipeline.outputs.results import write_case_report, write_results
 from head_case import HeadCase

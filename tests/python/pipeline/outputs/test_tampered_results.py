@@ -11,8 +11,8 @@ from test_stale_results import PNG, as_model, case, evaluation, no_pictures, pre
 
 import cmfsim
 from cmfsim.cli import main
-from cmfsim.io.results.metrics import EVALUATION_FILE, read_evaluation
 from cmfsim.io.results.predictions import read_prediction
+from cmfsim.io.results.result_files import EVALUATION_FILE, read_evaluation
 from shared_values import without_drawings
 
 MUTANTS = 150
