@@ -235,7 +235,7 @@ class _Elements:
         self.count += 1
         self.explicit |= kind in KINDS
         self.left = self.stream.size - self.stream.tell()
-        if self.explicit and kind is None:
+        if self.explicit and kind not in KINDS:
             self.odd = self._span_of_no_kind(tag)
             return True
         if tag in PIXELS:
@@ -307,7 +307,7 @@ def _tags(found: Any) -> dict[str, str | int]:
     tags: dict[str, str | int] = {}
     # As they stand in the file: pydicom refuses numbers that are not written by its rules.
     for element in found.elements():
-        if element.VR is None and not element.is_implicit_VR:
+        if not (element.VR in KINDS or getattr(element, "is_implicit_VR", False)):
             message = f"element {element.tag:08x} is of no known kind (VR)"
             raise ValueError(message)
         if (name := NAMES.get(element.tag)) is not None:
