@@ -25,10 +25,11 @@ INVERTED = re.compile(
 )
 # Elements that are kept, by their tag.
 NAMES: Mapping[int, str] = {
-    0x00080008: "image_type", 0x00080016: "sop_class", 0x00080060: "modality",
-    0x0008103E: "series_description", 0x00100020: "patient_id", 0x00180050: "thickness",
-    0x00180088: "slice_spacing", 0x00181120: "gantry_tilt", 0x0020000D: "study_uid",
-    0x0020000E: "series_uid", 0x00200011: "series_number", 0x00200012: "acquisition_number",
+    0x00080008: "image_type", 0x00080016: "sop_class", 0x00080020: "study_date",
+    0x00080060: "modality", 0x0008103E: "series_description", 0x00100020: "patient_id",
+    0x00180050: "thickness", 0x00180088: "slice_spacing", 0x00181120: "gantry_tilt",
+    0x0020000D: "study_uid", 0x0020000E: "series_uid", 0x00200011: "series_number",
+    0x00200012: "acquisition_number",
     0x00200032: "position", 0x00200037: "orientation", 0x00200052: "frame_of_reference",
     0x00280002: "samples", 0x00280004: "photometric", 0x00280008: "n_frames", 0x00280010: "rows",
     0x00280011: "columns", 0x00280030: "pixel_spacing", 0x00280100: "bits",

@@ -86,6 +86,22 @@ def read_dicom_folder(
     series: UID or number of the series that is meant.
     Raises `ImageError`: No CT, several to choose from, slices that do not make a volume.
     """
+    chosen, findings = _meant(folder, series)
+    slices = [s for header in chosen.headers for s in slices_of(header)]
+    return volume_of(folder.name, slices, chosen.modality, findings)
+
+
+def study_date(path: Path, series: str | None) -> str:
+    """The date of the study of a DICOM folder or file, YYYYMMDD; empty where none is stated.
+
+    Raises `ImageError`: As `read_dicom_folder`.
+    """
+    header = _meant(path, series)[0].first if path.is_dir() else dicom_header(path)
+    return "" if header is None else header.text("study_date")
+
+
+def _meant(folder: Path, series: str | None) -> tuple[Series, list[Finding]]:
+    """The series of a folder that is meant, and findings on the others."""
     headers, findings = _headers(folder, series)
     groups: dict[tuple[str, str], list[DicomHeader]] = {}
     stated = {uid: modality for uid, modality in map(_key, headers) if modality}
@@ -95,9 +111,7 @@ def read_dicom_folder(
         groups.setdefault((uid, modality or stated.get(uid, "")), []).append(header)
     there = [Series(uid, tuple(group)) for (uid, _), group in sorted(groups.items())]
     chosen, more = _chosen(folder, there, series)
-    findings += more
-    slices = [s for header in chosen.headers for s in slices_of(header)]
-    return volume_of(folder.name, slices, chosen.modality, findings)
+    return chosen, [*findings, *more]
 
 
 def read_dicom_file(path: Path) -> tuple[ImageData, str, tuple[Finding, ...]]:

@@ -1,6 +1,7 @@
 """Post-operative data, registered to the frame of the pre-operative data."""
 
 import logging
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 from cmfsim._core import rigid_fit
 from cmfsim.errors import CaseInputError, RegistrationError
 from cmfsim.io import Case, read_landmark_file, read_surface
+from cmfsim.io.images.dicom_series import study_date
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.pipeline.building.inputs import read_case_landmarks, refuse_errors, segment_options
 from cmfsim.surfaces.levels import surface_of_level
@@ -140,6 +142,7 @@ def _trimmed_fit(moving: Floats, fixed: Floats) -> Floats:
 
 def _scanned(case: Case, given: CasePostoperative) -> Postoperative:
     """Skin and bone from a CT after the operation."""
+    _check_dates(case, given)
     read = read_image_file(Path(str(given.image)), series=given.series)
     skull = read_case_landmarks(case)[0].get("skull", {})
     matrix = np.eye(4) if given.aligned else _registered(case, read.image, skull)
@@ -159,6 +162,20 @@ def _scanned(case: Case, given: CasePostoperative) -> Postoperative:
         matrix,
         (*read.findings, *head.findings),
     )
+
+
+def _check_dates(case: Case, given: CasePostoperative) -> None:
+    """Refuses scans whose dates are exchanged, unless the user states that they are right."""
+    if case.image is None or given.image is None or given.verified:
+        return
+    before = study_date(case.image.file, case.image.series)
+    after = study_date(given.image, given.series)
+    if after < before and all(re.fullmatch(r"\d{8}", date) for date in (before, after)):
+        raise CaseInputError(
+            f"{case.where('postoperative.image')}: the scan after the operation is of {after} "
+            f"(YYYYMMDD), the one before it, [image], of {before}: exchange them, or write "
+            "verified = true here if the dates are wrong"
+        )
 
 
 def _registered(case: Case, after: ImageData, skull: Mapping[str, Floats]) -> Floats:
