@@ -160,6 +160,17 @@ class Region:
 
 
 @dataclass(frozen=True)
+class CaseBite:
+    """Intraoral scans of the teeth: those of the CT, or in the bite that a plan is meant to give.
+
+    upper, lower: In occlusion, in one frame: any; mm.
+    """
+
+    upper: Path = field(metadata=PLAIN)
+    lower: Path = field(metadata=PLAIN)
+
+
+@dataclass(frozen=True)
 class CaseImage:
     """A CT and how to read tissue from it; None stands for the default of the imaging stage.
 
@@ -170,6 +181,7 @@ class CaseImage:
     rescale: Slope and intercept from the image's values to HU, where they are not HU.
     bones: Closed surfaces of the bones in mm, instead of those that the image shows, such as those
         of a label image; the skin is the image's.
+    teeth: Intraoral scans whose crowns replace those of the image, which metal may have streaked.
     """
 
     file: Path = field(metadata=PLAIN)
@@ -180,6 +192,7 @@ class CaseImage:
     series: str | None = None
     rescale: tuple[float, float] | None = None
     bones: Mapping[str, Path] = field(default_factory=dict)
+    teeth: CaseBite | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
@@ -431,17 +444,6 @@ class CasePhoto:
 
     def __post_init__(self) -> None:
         checks.check_one_of("units", self.units, tuple(UNITS))
-
-
-@dataclass(frozen=True)
-class CaseBite:
-    """Intraoral scans of the teeth in the bite that a plan is meant to give.
-
-    upper, lower: In occlusion, in one frame: any; mm.
-    """
-
-    upper: Path = field(metadata=PLAIN)
-    lower: Path = field(metadata=PLAIN)
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,10 @@ def image_of(table: Table, folder: Path) -> case_parts.CaseImage:
     """The image of [image], with how its values become HU."""
     series, rescale = _dicom_series(table), _rescale(table)
     bones = _bones(table, folder)
-    image = table.part(case_parts.CaseImage, folder, series=series, rescale=rescale, bones=bones)
+    scans = table.table("teeth").part(case_parts.CaseBite, folder) if "teeth" in table else None
+    image = table.part(
+        case_parts.CaseImage, folder, series=series, rescale=rescale, bones=bones, teeth=scans
+    )
     for low, high in (("skin", "bone"), ("bone", "metal")):
         small, large = (getattr(image, f"{name}_threshold") for name in (low, high))
         if small is not None and large is not None and small >= large:

@@ -279,7 +279,17 @@ def planned_head(
 
 
 def _head(case: Case, stages: Stages, options: BuildOptions) -> Head:
-    """What was read of a case, with the landmarks that were found."""
+    """What was read of a case, with the landmarks that were found and the teeth of its scans."""
+    head = _read_head(case, stages, options)
+    if case.image is not None and case.image.teeth is not None:
+        # A case without scans loads nothing of tooth rows.
+        from cmfsim.pipeline.building.teeth import with_scanned_teeth  # noqa: PLC0415
+
+        return with_scanned_teeth(head, case.image.teeth, stages)
+    return head
+
+
+def _read_head(case: Case, stages: Stages, options: BuildOptions) -> Head:
     if options.check:
         stages.begin("checking the case")
         stages.add(_checked(case))

@@ -327,6 +327,9 @@ def _files(case: Case) -> Iterator[Path]:
     if case.image is not None:
         yield case.image.file
         yield from case.image.bones.values()
+    for scans in (case.bite, case.image and case.image.teeth):
+        if scans is not None:
+            yield from (scans.upper, scans.lower)
     if case.surfaces is not None:
         yield case.surfaces.skin
         yield from case.surfaces.bones.values()
@@ -341,8 +344,6 @@ def _files(case: Case) -> Iterator[Path]:
         optional += [after.skin, after.image, after.landmarks, *after.bones.values()]
     if case.photo is not None:
         optional += [*photo_files(case.photo.file), case.photo.landmarks]
-    if case.bite is not None:
-        optional += [case.bite.upper, case.bite.lower]
     for motion in case.plan.values():
         optional += [motion.transform, motion.surface, motion.moved_surface]
     yield from (path for path in optional if path is not None)

@@ -112,8 +112,8 @@ def final_bite(
     >>> plan["mandible_body"] = bite.following(plan["maxilla"])  # doctest: +SKIP
     """
     towards = upper_scan.vertices.mean(axis=0) - lower_scan.vertices.mean(axis=0)
-    upper_fit, upper_mirrored = _fitted(upper, upper_scan, towards)
-    lower_fit, lower_mirrored = _fitted(lower, lower_scan, -towards)
+    upper_fit, upper_mirrored = fitted_scan(upper, upper_scan, towards)
+    lower_fit, lower_mirrored = fitted_scan(lower, lower_scan, -towards)
     if upper.segment == lower.segment:
         raise CaseInputError(
             f"both rows are on {upper.segment} (bite-one-segment): separate the jaws"
@@ -132,7 +132,7 @@ def final_bite(
     return FinalBite(motion, upper_fit.rms, lower_fit.rms, overlap, gap, jaws)
 
 
-def _fitted(row: ToothRow, scan: SurfaceData, out: Floats) -> tuple[IcpFit, bool]:
+def fitted_scan(row: ToothRow, scan: SurfaceData, out: Floats) -> tuple[IcpFit, bool]:
     """The motion of a row onto its scan, and whether the row's mirror image fits it as well.
 
     out: Roughly from the bite to the roots of the scan.

@@ -20,19 +20,6 @@ pytest.importorskip("skimage")
 # The lower jaw goes forwards and turns; the scans are in a frame of their own.
 BITE = cmfsim.rigid_motion((1.0, -2.5, 1.0), 3.0, (0.2, 1.0, 0.3), centre=(0.0, -60.0, -45.0))
 FRAME = cmfsim.rigid_motion((120.0, 40.0, -33.0), 140.0, (1.0, 2.0, -0.5))
-# Height of a scan from its cusps, mm: with gum.
-HEIGHT = 9.0
-
-
-def scan_of(row, motion):
-    """An open surface of the teeth of a row, moved."""
-    vertices, triangles = row.surface.vertices, row.surface.triangles
-    across, ahead, out = ((vertices - row.arch.middle) @ row.arch.axes().T).T
-    near = (np.abs(across) < row.arch.half_width + 9) & (ahead > -8)
-    near &= -out > (-out)[[*row.cusps.values()]].mean() - HEIGHT
-    kept = triangles[near[triangles].all(axis=1)]
-    used, numbers = np.unique(kept, return_inverse=True)
-    return cmfsim.SurfaceData(carried(motion, vertices[used]), numbers.reshape(-1, 3))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +28,7 @@ def scans():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(heads, "SPACING", 0.6)
         upper, lower = heads.rows_of(cmfsim.make_head())
-    return scan_of(upper, FRAME), scan_of(lower, FRAME @ BITE)
+    return heads.scan_of(upper, FRAME), heads.scan_of(lower, FRAME @ BITE)
 
 
 def moved(surface, motion):
@@ -85,7 +72,7 @@ def test_a_mirrored_scan_is_refused_or_noticed_where_the_arch_is_symmetric(scans
     shift = 0.3 * np.sin(0.3 * surface.vertices[:, [0]]) * [0.0, 1.0, 0.0]
     bent = cmfsim.SurfaceData(surface.vertices + shift, surface.triangles)
     lean = cmfsim.ToothRow(rows[0].segment, bent, rows[0].arch)
-    own = scan_of(lean, FRAME)
+    own = heads.scan_of(lean, FRAME)
     assert cmfsim.final_bite(lean, rows[1], own, lower).mirrored == ("lower",)
     with pytest.raises(cmfsim.CaseError, match=r"bite-scan-mirrored.*mirror image fits better"):
         cmfsim.final_bite(lean, rows[1], mirrored(own), mirrored(lower))
