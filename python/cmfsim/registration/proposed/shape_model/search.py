@@ -85,7 +85,12 @@ class Start:
         return State(self.linear, self.offset, np.zeros(N_JAW), np.zeros(model.n_modes))
 
 
-def found_poses(model: HeadModel, samples: HeadSamples, turn: Floats | None = None) -> list[Start]:
+def found_poses(
+    model: HeadModel,
+    samples: HeadSamples,
+    turn: Floats | None = None,
+    stages: Sequence[tuple[int, int, int]] = STAGES,
+) -> list[Start]:
     """The best similarities, best first.
 
     Parameters
@@ -94,9 +99,11 @@ def found_poses(model: HeadModel, samples: HeadSamples, turn: Floats | None = No
     samples : HeadSamples
     turn : (3, 3) float64, optional
         What comes first: how an image lies whose axes are wrong.
+    stages : sequence of (int, int, int)
+        Points, rounds and starts that are kept.
     """
     starts = list(_starts(model, samples, np.eye(3) if turn is None else turn))
-    for count, rounds, kept in STAGES:
+    for count, rounds, kept in stages:
         starts = _descended(model, samples.fewer(count), starts, rounds)[:kept]
     return starts
 
