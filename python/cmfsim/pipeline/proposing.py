@@ -42,6 +42,8 @@ from cmfsim.values.surface_data import SurfaceData
 SURFACES_AT_ONCE = 2
 # The finding of a segmentation that separated the jaws without landmarks.
 BY_SHAPE = "jaws-parted-by-shape"
+# What voxels add to the expected error of a site, as a share of their longest edge.
+VOXEL_ERROR = 0.5
 # A site that moves by more when the jaws are separated again is doubtful, mm.
 MOVED = 3.5
 # What a template head keeps its surfaces in.
@@ -221,7 +223,16 @@ def unproposed_head(anatomy: Anatomy, why: str) -> ProposedHead:
 
 def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:
     bones, skin = head_surfaces(anatomy)
-    return ProposedHead(anatomy, bones, skin, propose_landmarks(bones, skin, templates=heads))
+    found = propose_landmarks(bones, skin, templates=heads)
+    if not anatomy.surfaces:
+        # The voxels of an image blur what the definitions read.
+        blur = VOXEL_ERROR * float(anatomy.skin.spacing.max())
+        found = replace(found, skull=_blurred(found.skull, blur), skin=_blurred(found.skin, blur))
+    return ProposedHead(anatomy, bones, skin, found)
+
+
+def _blurred(sites: Mapping[str, ProposedSite], blur: float) -> dict[str, ProposedSite]:
+    return {n: replace(s, error=float(np.hypot(s.error, blur))) for n, s in sites.items()}
 
 
 def _is_worse(second: ProposedLandmarks, first: ProposedLandmarks) -> bool:

@@ -7,7 +7,7 @@ import pytest
 
 import cmfsim
 import real_heads
-from cmfsim.pipeline.proposing import read_template_head
+from cmfsim.pipeline.proposing import _blurred, read_template_head
 from cmfsim.registration.proposed import measured_biases
 from cmfsim.registration.proposed.judgement import missing_sites
 from cmfsim.registration.proposed.pose import Pose, refined_pose
@@ -16,6 +16,7 @@ from cmfsim.registration.proposed.shape_model.samples import samples_of
 from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.landmark_sites import JAW_SITES
 from cmfsim.values.motion import rigid_motion
+from cmfsim.values.proposed_landmarks import ProposedSite
 
 pytest.importorskip("scipy")
 
@@ -225,3 +226,8 @@ def test_a_real_head_has_its_landmarks_within_2_5_mm():
     assert len(errors) == 46
     assert errors.mean() < 2.5
     assert np.quantile(errors, 0.9) < 4.3
+
+
+def test_coarse_voxels_raise_every_expected_error():
+    site = ProposedSite(np.zeros(3), 1.5)
+    assert _blurred({"nasion": site}, 1.5)["nasion"].error == pytest.approx(1.5 * np.sqrt(2.0))

@@ -54,6 +54,9 @@ KNOWN, FARTHEST = 2.5, 8.0
 LIKENESS = 0.8
 # Share by which a pair moves towards its mirror image.
 MIRRORED = 0.3
+# Share that the model's place has in sites that lie where its surface is smooth: less than what
+# either of two real heads in six shapes suggests.
+MODEL_SHARES = {"supra_m2": 0.35, "infradentale": 0.2}
 # Rounds of finding sites and levelling the head by them, and how many of the last ones the sites
 # are the mean of: definitions jump where two places are nearly as good, as a pose turns by 0.2°.
 LEVEL_ROUNDS, LAST_ROUNDS = 6, 5
@@ -90,6 +93,10 @@ def with_model(
     missing = dict(found.missing)
     for name, site in found.sites.items():
         model, error = head.sites[kind, name], head.errors[kind, name]
+        share = MODEL_SHARES.get(name.removesuffix("_L").removesuffix("_R"))
+        if share is not None:
+            place = _surface_place(found, name, site.point + share * (model - site.point), size)
+            site = site if place is None else replace(site, point=place)  # noqa: PLW2901
         gap = float(np.linalg.norm(site.point - model))
         deviations = gap / float(np.hypot(error, site.error))
         if deviations < DOUBTFUL:

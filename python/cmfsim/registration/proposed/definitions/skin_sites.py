@@ -16,8 +16,8 @@ WING_BEHIND = 21.5
 INNER_CORNER, OUTER_CORNER = 0.54, 1.46
 # The slit of the eye lies so far below the middle of the orbit, mm.
 EYE_BELOW = 2.5
-# The corners of the mouth lie so far from its middle, mm.
-MOUTH_CORNER = 25.3
+# The corners of the mouth lie so far from its middle, mm, in a face of average breadth.
+MOUTH_CORNER = 26.6
 # A lip stands out from the dent beside it by this, mm.
 LEAST_LIP = 0.15
 
