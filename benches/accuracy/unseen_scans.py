@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 import cmfsim
 from benches.scenes.marked import publish
-from benches.scenes.unseen_scans import Scanned, made, unseen
+from benches.scenes.unseen_scans import TILTS, Scanned, made, unseen
 from benches.scenes.warped_heads import KnownHead
 from cmfsim.io.landmarks import write_landmarks
 
@@ -39,12 +39,19 @@ SECONDS = 3600
 QUIET = {"landmarks-proposed", "jaws-parted-by-shape", "jaws-separated-again"}
 
 
-def written(folder: Path, head: Scanned | KnownHead, *, with_sites: bool) -> None:
-    """The scan of a head in a folder, with the landmarks that a perfect person places."""
+def written(
+    folder: Path, head: Scanned | KnownHead, *, with_sites: bool, tilt: float = 0.0
+) -> None:
+    """The scan of a head in a folder, with the landmarks that a perfect person places.
+
+    tilt: Of the slices, degrees; they are then written as DICOM.
+    """
     folder.mkdir(parents=True)
     if isinstance(head, KnownHead):
         for name, surface in {**head.bones, "skin": head.skin}.items():
             cmfsim.write_surface(folder / f"{name}.stl", surface)
+    elif tilt:
+        _tilted(folder / "dicom", head.image, np.radians(tilt))
     else:
         import SimpleITK  # noqa: PLC0415
 
@@ -55,6 +62,39 @@ def written(folder: Path, head: Scanned | KnownHead, *, with_sites: bool) -> Non
     for kind, points in zip(("skull", "skin"), head.truth, strict=True):
         if with_sites:
             write_landmarks(folder / f"{kind}_landmarks.mrk.json", points)
+
+
+def _tilted(folder: Path, image: cmfsim.ImageData, tilt: float) -> None:
+    """Slices that a tilted gantry takes, 1.5 mm apart along the couch, as DICOM files."""
+    import SimpleITK  # noqa: PLC0415
+    from scipy import ndimage  # noqa: PLC0415
+
+    folder.mkdir()
+    step, low = np.asarray(image.spacing), np.asarray(image.lowest)
+    size = step * (np.array(image.values.shape) - 1)
+    x, v = np.arange(0.0, size[0], 1.0), np.arange(0.0, size[1] / np.cos(tilt), 1.0)
+    along = np.array([0.0, np.cos(tilt), np.sin(tilt)])
+    writer = SimpleITK.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for k, height in enumerate(np.arange(-size[1] * np.tan(tilt), size[2], 1.5)):
+        first = np.array([0.0, 0.0, height])
+        places = first + x[None, :, None] * [1.0, 0.0, 0.0] + v[:, None, None] * along
+        values = ndimage.map_coordinates(
+            np.asarray(image.values, np.float32), np.moveaxis(places / step, -1, 0), order=1,
+            cval=-1000.0,
+        )  # fmt: skip
+        one = SimpleITK.GetImageFromArray(np.round(values).astype(np.int16))
+        tags = {
+            "0008|0060": "CT", "0020|000d": "1.2.826.0.1.1", "0020|000e": "1.2.826.0.1.2",
+            "0020|0013": str(k), "0008|0018": f"1.2.826.0.1.3.{k}", "0018|0050": "1.5",
+            "0020|0032": "\\".join(f"{c:.6f}" for c in low + first),
+            "0020|0037": "\\".join(f"{c:.8f}" for c in (1.0, 0.0, 0.0, *along)),
+            "0018|1120": f"{np.degrees(tilt):.3f}",
+        }  # fmt: skip
+        for tag, value in tags.items():
+            one.SetMetaData(tag, value)
+        writer.SetFileName(str(folder / f"{k:04d}.dcm"))
+        writer.Execute(one)
 
 
 def command(folder: Path, *words: str) -> tuple[int, str, float]:
@@ -202,7 +242,7 @@ def main() -> None:
         folder = options.work / f"{kind.split(',')[0].replace(' ', '_')}_{seed}"
         if not (folder / "clean").is_dir():
             clean, scan = made(data, kind, head, seed)
-            written(folder / "scan", scan, with_sites=False)
+            written(folder / "scan", scan, with_sites=False, tilt=TILTS.get(kind, 0.0))
             written(folder / "clean", clean, with_sites=True)
         kept = folder / "row.json"
         is_kept = options.kept and kept.is_file()

@@ -113,12 +113,18 @@ def _opened(head: Scanned, degrees: float) -> Scanned:
 
     def lower(points: Points, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         by = variants.opening(skull, degrees)
+        moved = {n: by.turn @ (p - by.joint) + by.joint for n, p in points.items()}
+        # As the image: what comes to lie behind the joints moves less.
         return {
-            n: by.turn @ (p - by.joint) + by.joint if n.startswith(names) else p
+            n: p + by.front(moved[n])[0] * (moved[n] - p) if n.startswith(names) else p
             for n, p in points.items()
         }
 
     skin = {n: variants.opened(p[None], skull, degrees)[0] for n, p in head.truth[1].items()}
+    # Its corners are half-way between the lips, wherever the closed mouth had them.
+    for name in ("cheilion_L", "cheilion_R"):
+        below = lower(head.truth[1], (name,))[name]
+        skin[name] = 0.5 * (head.truth[1][name] + below)
     return Scanned(image, (lower(skull, JAW_SITES), skin))
 
 
@@ -204,12 +210,112 @@ def cadaver(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
     return anatomy, anatomy.changed(_rounded(anatomy.image, values))
 
 
+def _filled(head: Scanned, inside: np.ndarray, hu: float) -> Scanned:
+    """Something of a density where there is air outside the head, and in it where it is denser."""
+    values = np.asarray(head.image.values)
+    return head.changed(head.image.with_values(np.where(inside & (values < hu), hu, values)
+                                               .astype(np.int16)))  # fmt: skip
+
+
+def arms_beside(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
+    """Both forearms beside the head, against its sides: tissue, and two bones in each."""
+    x, y, z = head.image.axes()
+    skull = head.truth[0]
+    found = head
+    for letter, side in (("L", 1.0), ("R", -1.0)):
+        joint = skull[f"supraglenoid_{letter}"]
+        a, b = joint[0] + side * 50.0, joint[1] + 30.0 + 5.0 * seed
+        arm = np.hypot(x - a, y - b) < 32.0 + 0.0 * z
+        found = _filled(found, arm, TISSUE)
+        for at in (-12.0, 12.0):
+            found = _filled(found, np.hypot(x - a, y - b - at) < 6.0 + 0.0 * z, BONE)
+    return head, found
+
+
+def half_head(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
+    """The left half, with 2 cm and more of the right one."""
+    middle = float(head.truth[0]["nasion"][0])
+    return head, head.changed(variants.one_side(head.image, middle, 15.0 + 5.0 * seed))
+
+
+def teeth_in_contact(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
+    """The lower teeth pressed onto the upper ones, and fillings across both rows."""
+    low = _low(head.truth[0])
+    anatomy = head.moved(lambda p: p + low(p) * [0.0, 0.0, 1.5 + 0.5 * seed])
+    pieces = effects.fillings(anatomy.image, _crowns(anatomy.truth[0], 4), 5.0)
+    return anatomy, anatomy.changed(effects.with_metal_scanned(anatomy.image, [pieces], seed=seed))
+
+
+def hearing_aid(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
+    """Plastic and a battery of steel behind and in one ear."""
+    joint = head.truth[0]["supraglenoid_R"]
+    x, y, z = (a - b for a, b in zip(head.image.axes(), joint, strict=True))
+    _, j, k = _index(head, joint + [0.0, 14.0, 0.0])
+    skin = np.flatnonzero(head.image.values[:, j, k] > -300)
+    out = float(head.image.axes()[0].ravel()[skin[0]] - joint[0])
+    case = (np.abs(x - out) < 5.0) & (np.abs(y - 18.0) < 5.0) & (np.abs(z - 2.0) < 14.0)
+    shown = _filled(head, case, 150.0)
+    place = tuple(float(v) for v in joint + [out, 18.0, -6.0])
+    piece = effects.Pieces("steel", effects.fillings(head.image, [place], 3.0).filled)
+    return head, shown.changed(effects.with_metal_scanned(shown.image, [piece], seed=seed))
+
+
+def _index(head: Scanned, place: np.ndarray) -> tuple[int, ...]:
+    step, low = np.asarray(head.image.spacing), np.asarray(head.image.lowest)
+    return tuple(int(i) for i in np.round((place - low) / step))
+
+
+def tubes(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
+    """A tube from the floor of the nose out of a nostril, and past the corner of the mouth."""
+    nose, lip = head.truth[1]["subnasale"], head.truth[1]["cheilion_L"]
+    x, y, z = head.image.axes()
+    away = np.full(head.image.values.shape, np.inf)
+    inner = nose + [6.0, 60.0, 4.0]
+    for a, b in ((inner, nose + [6.0, 4.0, 0.0]), (nose + [6.0, -4.0, -3.0], lip + [6.0, -5, -8.0]),
+                 (lip + [6.0, -5.0, -8.0], lip + [40.0, 10.0, -25.0])):  # fmt: skip
+        for share in np.linspace(0.0, 1.0, 40):
+            p = a + share * (b - a)
+            away = np.minimum(away, np.sqrt((x - p[0]) ** 2 + (y - p[1]) ** 2 + (z - p[2]) ** 2))
+    values = np.where(away < 4.5, np.maximum(head.image.values, 200.0), head.image.values)
+    values = np.where(away < 2.5 + 0.25 * seed, -1000.0, values)
+    return head, head.changed(_rounded(head.image, values))
+
+
+def neck_collar(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
+    """A rigid collar: foam round the neck up to the chin and the angles of the jaw, and a shell."""
+    skull = head.truth[0]
+    body = ndimage.binary_fill_holes(head.image.values > -300)
+    away = ndimage.distance_transform_edt(~body, sampling=np.asarray(head.image.spacing))
+    y, z = head.image.axes()[1:]
+    top = float(skull["menton"][2]) + 4.0 + (y - skull["menton"][1]) * 0.35
+    below = z < np.minimum(top, float(skull["gonion_L"][2]) + 8.0 * seed)
+    foam = _filled(head, below & (away > 0.0) & (away < 9.0), -850.0)
+    return head, _filled(foam, below & (away >= 9.0) & (away < 12.0), 60.0)
+
+
+def turned_and_tilted(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
+    """The head turned by 20° about the vertical; the slices are tilted when it is written."""
+    image, motion = variants.turned(head.image, (0.0, 0.0, 20.0 if seed % 2 else -20.0))
+    turned = Scanned(image, _moved(head.truth, lambda p: p @ motion[:3, :3].T + motion[:3, 3]))
+    return turned, turned
+
+
 SCANS: Mapping[str, Callable[[Scanned, int], tuple[Scanned, Scanned]]] = {
     "chin cut off, metal": chin_cut_and_metal,
     "child, mouth open, voxels of 3 mm": child,
     "orthodontic cone beam": orthodontic_cone_beam,
     "cadaver, mouth open, no upper teeth": cadaver,
+    "forearms beside the head": arms_beside,
+    "half a head and 2 cm": half_head,
+    "teeth in contact, metal across both rows": teeth_in_contact,
+    "hearing aid": hearing_aid,
+    "tubes in the nose": tubes,
+    "neck collar": neck_collar,
+    "head turned by 20°, tilted gantry": turned_and_tilted,
 }
+RARE = [*SCANS][4:]
+# Slices of these are written as DICOM, tilted by so many degrees.
+TILTS = {"head turned by 20°, tilted gantry": 18.0}
 
 
 def as_surfaces(head: KnownHead) -> KnownHead:
@@ -244,10 +350,10 @@ def _stepped(head: KnownHead) -> dict[str, SurfaceData]:
 
 
 def unseen(data: Path, seeds: tuple[int, ...] = (1, 2)) -> Iterator[tuple[str, str, int]]:
-    """The kinds of scan, with the head and seed of each."""
+    """The kinds of scan, with the head and seed of each; of the rarer ones the first seed alone."""
     heads = ("ct_phantom", "atlas_head")
     for kind in (*SCANS, "surfaces of a skull with skin"):
-        for seed in seeds:
+        for seed in seeds[:1] if kind in RARE else seeds:
             if (data / heads[(seed + 1) % 2]).is_dir():
                 yield kind, heads[(seed + 1) % 2], seed
 
