@@ -255,8 +255,8 @@ def hearing_aid(head: Scanned, seed: int) -> tuple[Scanned, Scanned]:
     out = float(head.image.axes()[0].ravel()[skin[0]] - joint[0])
     case = (np.abs(x - out) < 5.0) & (np.abs(y - 18.0) < 5.0) & (np.abs(z - 2.0) < 14.0)
     shown = _filled(head, case, 150.0)
-    place = tuple(float(v) for v in joint + [out, 18.0, -6.0])
-    piece = effects.Pieces("steel", effects.fillings(head.image, [place], 3.0).filled)
+    a, b, c = (float(v) for v in joint + [out, 18.0, -6.0])
+    piece = effects.Pieces("steel", effects.fillings(head.image, [(a, b, c)], 3.0).filled)
     return head, shown.changed(effects.with_metal_scanned(shown.image, [piece], seed=seed))
 
 

@@ -47,7 +47,8 @@ def with_scanned_teeth(head: Head, scans: CaseBite, stages: Stages) -> Head:
         for row, scan, out in zip(rows, given, (up, -up), strict=True):
             fit, as_well = fitted_scan(row, scan, out)
             stages.add(_noticed(row.arch.jaw, fit.rms, as_well=as_well))
-            placed = SurfaceData(carried(np.linalg.inv(fit.matrix), scan.vertices), scan.triangles)
+            back = np.asarray(np.linalg.inv(fit.matrix), dtype=np.float64)
+            placed = SurfaceData(carried(back, scan.vertices), scan.triangles)
             own = ToothRow(row.segment, placed, row.arch)
             levels[row.segment] = _with_crowns(levels[row.segment], own, anatomy.skin)
     except CaseInputError as error:
