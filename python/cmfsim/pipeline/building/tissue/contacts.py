@@ -200,7 +200,20 @@ def cleft_tets(
     radius = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
     reach = width + float(radius.max())
     surfaces = [s.surface.searched for s in segments]
-    about = [_least_at_corners(nodes, tets, surface, reach) - radius for surface in surfaces]
+    is_moved = np.array([segment.name in moved for segment in segments])
+    about = np.full((len(surfaces), len(tets)), np.inf)
+    boxes = [_in_box(nodes, surface, reach) for surface in surfaces]
+    # All corners of a tet between two segments are within reach of both.
+    close = np.zeros(len(nodes), dtype=bool)
+    for number in np.argsort(~is_moved, kind="stable").tolist():
+        others = [box for other, box in enumerate(boxes) if other != number]
+        wanted = np.logical_or.reduce(others) if is_moved[number] and others else close
+        near = np.flatnonzero(boxes[number] & wanted)
+        away = np.full(len(nodes), np.inf)
+        away[near] = distances(nodes[near], surfaces[number])
+        about[number] = away[tets].min(axis=1) - radius
+        if is_moved[number]:
+            close |= away < reach
     names = [segment.name for segment in segments]
     for one in (i for i, name in enumerate(names) if name in moved):
         for other in range(len(surfaces)):
@@ -214,22 +227,12 @@ def cleft_tets(
     return inside
 
 
-def _least_at_corners(
-    nodes: Floats, tets: NDArray[np.uint32], surface: Surface, reach: float
-) -> Floats:
-    """The distance of each tet's nearest corner from a surface; infinity beyond its box."""
-    near = _in_box(nodes, surface, reach)
-    distance = np.full(len(nodes), np.inf)
-    distance[near] = distances(nodes[near], surface)
-    nearest: Floats = distance[tets].min(axis=1)
-    return nearest
-
-
-def _in_box(nodes: Floats, surface: Surface, reach: float) -> NDArray[np.int64]:
-    """The nodes within a surface's box, enlarged by `reach`."""
+def _in_box(nodes: Floats, surface: Surface, reach: float) -> NDArray[np.bool_]:
+    """Which nodes are within a surface's box, enlarged by `reach`."""
     vertices = surface.vertices
     low, high = vertices.min(axis=0) - reach, vertices.max(axis=0) + reach
-    return np.flatnonzero(((nodes >= low) & (nodes <= high)).all(axis=1))
+    inside: NDArray[np.bool_] = ((nodes >= low) & (nodes <= high)).all(axis=1)
+    return inside
 
 
 @dataclass(frozen=True, eq=False)
