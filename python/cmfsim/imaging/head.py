@@ -15,7 +15,7 @@ from cmfsim.imaging.bones.metal import find_metal, metal_within
 from cmfsim.imaging.intensities.cupping import without_cupping, without_noise
 from cmfsim.imaging.intensities.intensity import weak_bone
 from cmfsim.imaging.intensities.levels import level_of
-from cmfsim.imaging.morphology import Mask, Volume, depth, label
+from cmfsim.imaging.morphology import Mask, Volume, depth, label, load
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skins.attached import attached_findings
 from cmfsim.imaging.skins.skin import SKIN_SCALE, Skin, find_skin
@@ -117,6 +117,8 @@ def segmented(
 
     points = None if landmarks is None else _checked(landmarks)
     with ThreadPoolExecutor(THREADS) as beside:
+        # Libraries, while the image is resampled.
+        beside.submit(load)
         # What separates the jaws of a head without landmarks depends on nothing of the image.
         is_guessed = points is None and options.part_jaws
         modelled = beside.submit(head_model) if is_guessed else None

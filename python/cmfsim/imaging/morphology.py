@@ -28,6 +28,13 @@ def ndimage() -> Any:
     return _package("scipy.ndimage")
 
 
+def load() -> None:
+    """Loads what segmentation needs last, which takes half a second."""
+    ndimage()
+    _package("scipy.optimize")
+    _package("skimage.segmentation").watershed  # noqa: B018 (loaded when it is first asked for)
+
+
 def sparse() -> Any:
     """The package scipy.sparse."""
     return _package("scipy.sparse")

@@ -53,13 +53,11 @@ class CuttingPlane:
         offset = as_rows("points", points, 3) - self.point
         return offset @ self.normal
 
-    def distance_on(self, image: ImageData) -> Floats:
-        """The signed distance at every voxel of an image's grid, (nx, ny, nz) mm."""
-        along_x, along_y, along_z = self.distance_along(image)
-        return along_x + along_y + along_z
-
     def distance_along(self, image: ImageData) -> tuple[Floats, Floats, Floats]:
-        """The parts of `distance_on` that vary along x, y and z, shaped to broadcast."""
+        """The signed distance at the voxels of an image's grid, mm: the sum of what is returned.
+
+        Its parts that vary along x, y and z, shaped to broadcast.
+        """
         x, y, z = (
             n * (line - p) for line, p, n in zip(image.axes(), self.point, self.normal, strict=True)
         )

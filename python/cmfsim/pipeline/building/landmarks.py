@@ -19,6 +19,7 @@ from cmfsim.io import Case
 from cmfsim.pipeline.building.case_checks import Head
 from cmfsim.pipeline.building.inputs import read_placed_sites
 from cmfsim.pipeline.building.stages import Stages
+from cmfsim.surfaces.levels import block_of
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.case_parts import FEW_SITES
 from cmfsim.values.checks import Floats
@@ -137,7 +138,11 @@ def _check_no_lower_jaw(
     case: Case, body: BoneSegment, bite: CuttingPlane, *, by_hand: bool
 ) -> None:
     level = body.level
-    below = (level.values > 0.0) & (bite.distance_on(level) < -BELOW_BITE)
+    inside = level.values > 0.0
+    box = tuple(slice(a, b) for a, b in zip(*block_of(inside), strict=True))
+    x, y, z = bite.distance_along(level)
+    above = x[box[0]] + y[:, box[1]] + z[:, :, box[2]]
+    below = inside[box] & (above < -BELOW_BITE)
     volume = np.count_nonzero(below) * float(np.prod(level.spacing))
     if volume > LOWER_JAW:
         raise LandmarkInputError(

@@ -304,6 +304,10 @@ def _fill_model(
     fresh: Path, prediction: Prediction, clock: _Clock, *, drawing: _Drawing, slicer: bool
 ) -> WrittenPrediction:
     """The files of one prediction in its folder, with the pictures that are wanted."""
+    place = drawing.place(prediction.model)
+    (fresh / place).mkdir(exist_ok=True)
+    # They take longest.
+    begun = drawing.begin(prediction)
     summary = prediction.summary
     skin = {**summary["skin"], **face_motion(prediction)}
     clinical, contacts = clinical_figures(prediction), drawing.contacts(prediction.patient)
@@ -313,9 +317,6 @@ def _fill_model(
     now = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z")
     figures = {"skin": skin, "clinical": clinical, "findings": findings, "written_at": now}
     prediction = replace(prediction, summary={**summary, **figures})
-    place = drawing.place(prediction.model)
-    (fresh / place).mkdir(exist_ok=True)
-    begun = drawing.begin(prediction)
     more = partial(_more_files, prediction, begun, clock, slicer=slicer)
     clock.begin(place, prediction.summary["timings"])
     with clock.timed("writing the files"):

@@ -201,27 +201,22 @@ def cleft_tets(
     reach = width + float(radius.max())
     surfaces = [s.surface.searched for s in segments]
     is_moved = np.array([segment.name in moved for segment in segments])
-    about = np.full((len(surfaces), len(tets)), np.inf)
-    boxes = [_in_box(nodes, surface, reach) for surface in surfaces]
-    # All corners of a tet between two segments are within reach of both.
+    away = np.full((len(surfaces), len(nodes)), np.inf)
+    boxes = np.array([_in_box(nodes, surface, reach) for surface in surfaces])
+    # All corners of a tet between two segments are within reach of both, of which one moves.
     close = np.zeros(len(nodes), dtype=bool)
-    for number in np.argsort(~is_moved, kind="stable").tolist():
-        others = [box for other, box in enumerate(boxes) if other != number]
-        wanted = np.logical_or.reduce(others) if is_moved[number] and others else close
-        near = np.flatnonzero(boxes[number] & wanted)
-        away = np.full(len(nodes), np.inf)
-        away[near] = distances(nodes[near], surfaces[number])
-        about[number] = away[tets].min(axis=1) - radius
-        if is_moved[number]:
-            close |= away < reach
-    names = [segment.name for segment in segments]
-    for one in (i for i, name in enumerate(names) if name in moved):
+    for one in np.argsort(~is_moved, kind="stable").tolist():
+        near = boxes[one] & (np.delete(boxes, one, axis=0).any(axis=0) if is_moved[one] else close)
+        away[one, near] = distances(nodes[near], surfaces[one])
+        if is_moved[one]:
+            close |= away[one] < reach
+    some = np.flatnonzero(close[tets].all(axis=1))
+    about = np.maximum(away[:, tets[some]].min(axis=2) - radius[some], 0.0)
+    for one in np.flatnonzero(is_moved).tolist():
         for other in range(len(surfaces)):
-            if other == one or (other < one and names[other] in moved):
+            if other == one or (other < one and is_moved[other]):
                 continue
-            ids = np.flatnonzero(
-                np.maximum(about[one], 0.0) + np.maximum(about[other], 0.0) < width
-            )
+            ids = some[about[one] + about[other] < width]
             both = [distances(centroids[ids], surfaces[each]) for each in (one, other)]
             inside[ids[both[0] + both[1] < width]] = True
     return inside
