@@ -50,9 +50,7 @@ def skull_views(cranium: Floats, mandible: Floats) -> SkullViews:
 
     def sides(points: Floats) -> tuple[DepthMap, DepthMap]:
         left = depth_map(points[points[:, 0] > 0.0], (1, 2, 0), -1.0, SIDE_REACH)
-        right = depth_map(
-            points[points[:, 0] < 0.0] * [-1.0, 1.0, 1.0], (1, 2, 0), -1.0, SIDE_REACH
-        )
+        right = depth_map(points[points[:, 0] < 0.0], (1, 2, 0), 1.0, SIDE_REACH)
         return left, right
 
     return SkullViews(
