@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
-from cmfsim.imaging.field_of_view import RoundField, round_field
 from cmfsim.imaging.intensities.intensity import (
     AIR,
     Calibration,
@@ -16,7 +15,17 @@ from cmfsim.imaging.intensities.intensity import (
     check_is_ct,
     saturation_of,
 )
-from cmfsim.imaging.morphology import Block, Mask, Volume, binned, label, opened, resampled_to
+from cmfsim.imaging.morphology import (
+    Block,
+    Mask,
+    RoundField,
+    Volume,
+    binned,
+    label,
+    opened,
+    resampled_to,
+    round_field,
+)
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData

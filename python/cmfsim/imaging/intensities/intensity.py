@@ -8,8 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
-from cmfsim.imaging.field_of_view import round_field
-from cmfsim.imaging.morphology import Mask, Volume, closed, depth, filled, largest, opened
+from cmfsim.imaging.morphology import (
+    Mask,
+    Volume,
+    closed,
+    depth,
+    filled,
+    largest,
+    opened,
+    round_field,
+)
 from cmfsim.values.finding import Finding
 
 # Bone is brighter than this above soft tissue, HU.

@@ -327,7 +327,7 @@ def _files(case: Case) -> Iterator[Path]:
     if case.image is not None:
         yield case.image.file
         yield from case.image.bones.values()
-    for scans in (case.bite, case.image and case.image.teeth):
+    for scans in (case.bite, case.image.teeth if case.image is not None else None):
         if scans is not None:
             yield from (scans.upper, scans.lower)
     if case.surfaces is not None:

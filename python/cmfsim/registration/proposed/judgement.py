@@ -7,8 +7,8 @@ from types import MappingProxyType
 import numpy as np
 
 from cmfsim.registration.proposed.definitions.groups import misfits
-from cmfsim.registration.proposed.limits import CutPlane
 from cmfsim.registration.proposed.pose import Pose
+from cmfsim.registration.proposed.shape_model.samples import CutPlane
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedSite

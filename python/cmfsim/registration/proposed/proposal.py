@@ -24,7 +24,6 @@ from cmfsim.registration.proposed.jaw_evidence import (
     weakened,
 )
 from cmfsim.registration.proposed.judgement import IMAGE_ENDS, IMPOSSIBLE, judged, missing_sites
-from cmfsim.registration.proposed.limits import cut_planes
 from cmfsim.registration.proposed.pose import (
     Pose,
     distance_from,
@@ -33,7 +32,7 @@ from cmfsim.registration.proposed.pose import (
     surface_samples,
 )
 from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead, fit_head
-from cmfsim.registration.proposed.shape_model.samples import samples_of
+from cmfsim.registration.proposed.shape_model.samples import cut_planes, samples_of
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES, SKIN_LANDMARKS, SKULL_LANDMARKS
