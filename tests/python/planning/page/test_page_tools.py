@@ -102,7 +102,8 @@ def test_a_photo_of_either_profile_lies_under_the_lines_of_the_plan(opened, tmp_
     path = tmp_path / "photo.jpg"
     pixels = drawn_photo(opened, path, side)
     opened.locator("#photo-file").set_input_files(path)
-    until(opened, "!cmfsimPage.photo.canvas.hidden")
+    # The photo of the other side may still be there.
+    until(opened, "!cmfsimPage.photo.canvas.hidden && cmfsimPage.photo.points.length === 0")
     canvas = opened.locator("canvas.photo")
     box = canvas.bounding_box()
     scale = box["width"] / PHOTO["width"]
