@@ -87,10 +87,8 @@ def poor_bite(rows: Iterable[Mapping[str, Any]]) -> list[Finding]:
         if out > EDGE_ERROR and out > out_before + WORSE:
             limits = f"{low:g} or more" if np.isinf(high) else f"{low:g} to {high:g}"
             unit = measure.unit if measure.unit == "°" else f" {measure.unit}"
-            texts.append(
-                f"{measure.label.lower()} is {now:.1f}{unit}, {was:.1f} before (limits: "
-                f"{limits}, {source})"
-            )
+            numbers = f"{now:.1f}{unit}, {was:.1f} before (limits: {limits}".replace("-", "−")
+            texts.append(f"{measure.label.lower()} is {numbers}, {source})")
     return [Finding("plan-bite-poor", f"as planned, {'; '.join(texts)}")] if texts else []
 
 

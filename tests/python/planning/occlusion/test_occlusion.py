@@ -130,9 +130,9 @@ def bite_rows(**values):
 def test_a_plan_that_leaves_a_bad_bite_is_stated_with_values_limits_and_source():
     (found,) = poor_bite(bite_rows(overjet=(6.2, 13.3), overbite=(1.0, -6.0), cant=(0.0, -6.5)))
     assert (found.code, found.severity) == ("plan-bite-poor", "warning")
-    assert "overjet is 13.3 mm, 6.2 before (limits: -3.5 to 9, Brook and Shaw 1989)" in found.what
-    assert "overbite is -6.0 mm, 1.0 before (limits: -4 or more" in found.what
-    assert "cant of the upper molars is -6.5°" in found.what
+    assert "overjet is 13.3 mm, 6.2 before (limits: −3.5 to 9, Brook and Shaw 1989)" in found.what
+    assert "overbite is −6.0 mm, 1.0 before (limits: −4 or more" in found.what
+    assert "cant of the upper molars is −6.5°" in found.what
     assert "midline" not in found.what
     assert "cmfsim bite" in found.fix
 
