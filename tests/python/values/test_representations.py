@@ -36,6 +36,18 @@ def test_a_scene_shows_how_far_each_segment_moves(patient):
     assert "mandible_body stays" in plan
 
 
+def test_a_planning_model_shows_what_may_move_and_whether_its_product_is_exact(patient):
+    title, *rows = lines_of(cmfsim.planning_model(patient, "M"))
+    assert title == f"PlanningModel {patient.name!r}"
+    text = "\n".join(rows)
+    assert ", ".join(patient.scene.segments) in text
+    assert ("linearised contact" in text) == (
+        patient.lifted is not None and len(patient.lifted.nodes) > 0
+    )
+    sliding = "\n".join(lines_of(cmfsim.planning_model(patient, "M+S")))
+    assert "linearised contact" in sliding
+
+
 def test_a_prediction_shows_its_skin_and_its_solution(patient):
     prediction = cmfsim.predict_patient(patient, "H")
     title, *rows = lines_of(prediction)

@@ -13,7 +13,7 @@ from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.planning.replanning.correction import PlanCorrection
 from cmfsim.solving.models import model_scene, predict_patient
 from cmfsim.solving.simulation import scene_plan, scene_tensors, solver_of
-from cmfsim.values.checks import Floats, frozen
+from cmfsim.values.checks import Floats, frozen, listing
 from cmfsim.values.motion import rigid_matrix, rigid_motion
 from cmfsim.values.patient_model import LiftedTissue, PatientModel
 from cmfsim.values.prediction import Prediction
@@ -126,6 +126,19 @@ class PlanningModel:
     columns: PlanColumns
     reference: Mapping[str, Floats]
     correction: PlanCorrection | None = None
+
+    def __repr__(self) -> str:
+        """The patient, the model, what may move, the reference plan and whether it is exact."""
+        scene = self.patient.scene
+        how = "corrected by exact solutions" if self.correction else "linearised contact"
+        rows = {
+            "model": self.model,
+            "mesh": f"{scene.n_nodes} nodes, {scene.n_tets} tets",
+            "segments": ", ".join(self.segments),
+            "reference": scene.plan_text(),
+            "product": "exact for rigid plans" if self.is_exact else how,
+        }
+        return listing(f"PlanningModel {self.patient.name!r}", rows)
 
     @property
     def segments(self) -> tuple[str, ...]:
