@@ -33,7 +33,7 @@ FOOT = HEIGHT - MARGIN - (INPUT_LINES + 2) * LEADING * FINE
 INK, PALE, RULE, ALARM = "#1d2530", "#5d6875", "#d5dbe2", "#c2410c"
 # Shares of the columns in the width of a table of measures.
 SHARES: Mapping[str, tuple[float, ...]] = {
-    "cephalometry": (0.3, 0.11, 0.11, 0.11, 0.37),
+    "cephalometry": (0.29, 0.11, 0.125, 0.115, 0.36),
     "face": (0.37, 0.15, 0.17, 0.15, 0.16),
 }
 # Landmarks at teeth, chin and lips.
@@ -138,7 +138,7 @@ def draw_chart_page(
     """Draws the page of one plan onto an empty figure of matplotlib, of the size `A4`.
 
     The prediction is what `prediction.json` holds; pictures are PNG files, "prediction",
-    "lateral" and "plan", which stands below the others if there is no band; findings are those of
+    "lateral" and "plan", which stands below the others; findings are those of
     all stages.
     """
     page, y = _Page(figure), MARGIN
@@ -172,17 +172,19 @@ def draw_chart_page(
         texts = [f"Not available: {absent}"] if absent else []
         ends.append(page.paragraph((x, end), texts, FINE, ABSENT_LINES, room))
     y = max(ends) + APART
-    band, plan = prediction.get("band"), pictures.get("plan")
-    ends = [_sites(page, y, found), _band(page, y, band)]
-    if band is None and plan is not None and "lateral" in pictures:
-        # The bones from the front as well, where the band would stand.
-        most = (RIGHT, (BAND_ROWS - 1) * ROW)
-        ends.append(page.picture(COLUMN, ends[1] + 2.0, plan, most))
-    y = max(ends) + APART
-    y = page.heading(MARGIN, y, "Warnings")
+    ends = [_sites(page, y, found), _band(page, y, prediction.get("band"))]
+    if "plan" in pictures and "lateral" in pictures:
+        # The bones from the front as well, in what is left below the band.
+        top = page.heading(COLUMN, ends[1] + APART, "Bones as planned", RIGHT)
+        page.picture(COLUMN, top, pictures["plan"], (RIGHT, FOOT - top))
+        room = LEFT
+    else:
+        ends, room = [max(ends)], WHOLE
+    y = page.heading(MARGIN, ends[0] + APART, "Warnings", room)
     groups = [group for group in grouped(findings) if group.severity != "note"]
     lines = [f"{group.severity}: {group.line}" for group in groups] or ["None."]
-    page.paragraph((MARGIN, y), lines, SMALL, WARNING_LINES)
+    most = int((FOOT - y) / (LEADING * SMALL))
+    page.paragraph((MARGIN, y), lines, SMALL, most, room)
     _origin(page, prediction)
 
 
