@@ -17,7 +17,15 @@ import numpy as np
 
 from cmfsim._core import TetMesh
 from cmfsim.cli import BAD_INPUT, DONE
-from cmfsim.cli.terminal import FindingsError, Notices, StageProgress, columns, escaped, in_colour
+from cmfsim.cli.terminal import (
+    FindingsError,
+    Notices,
+    StageProgress,
+    argument,
+    columns,
+    escaped,
+    in_colour,
+)
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.drafting import CASE_FILE, init_case, read_moves
 from cmfsim.errors import CaseInputError
@@ -106,7 +114,7 @@ def init(options: argparse.Namespace) -> int:
     print(f"case  {escaped(str(case))}")
     for question in draft.questions:
         print(f"decide  {escaped(question)}")
-    print(f"next  cmfsim doctor {escaped(str(case))}")
+    print(f"next  cmfsim doctor {argument(case)}")
     return DONE
 
 

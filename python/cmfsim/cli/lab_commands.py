@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cmfsim.cli import DONE
-from cmfsim.cli.terminal import StageProgress, escaped
+from cmfsim.cli.terminal import StageProgress, argument, escaped
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.io.results.populations import FAILED, MADE, PARTS, PENDING
@@ -153,7 +153,7 @@ def virtual_patients(options: argparse.Namespace) -> int:
     else:
         for case in cases:
             print(f"wrote {case} (in silico); the truth is in {case.parent / 'truth'}")
-        print(f"next: cmfsim study {options.folder / 'cohort.toml'}")
+        print(f"next: cmfsim study {argument(options.folder / 'cohort.toml')}")
     return DONE
 
 
@@ -188,7 +188,7 @@ def _population(options: argparse.Namespace) -> int:
     for state in (FAILED, PENDING):
         if found.named(state):
             print(f"{state}: {', '.join(found.named(state))} (population.json)")
-    print(f"next: cmfsim benchmark {options.folder}")
+    print(f"next: cmfsim benchmark {argument(options.folder)}")
     return DONE
 
 

@@ -3,6 +3,7 @@
 import codecs
 import logging
 import os
+import shlex
 import shutil
 import sys
 import threading
@@ -153,6 +154,11 @@ def print_error(error: BaseException) -> None:
 def escaped(text: str) -> str:
     """A text without terminal control characters, since names in files are untrusted."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def argument(path: Path) -> str:
+    """A path as it is typed after a command: in quotes where it has spaces."""
+    return shlex.quote(escaped(str(path)))
 
 
 def in_colour(stream: TextIO) -> bool:

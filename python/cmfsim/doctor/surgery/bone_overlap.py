@@ -219,8 +219,8 @@ def _check_bite(parts: Sequence[BonePart], landmarks: Mapping[str, Floats]) -> I
     was = "in front of" if before < 0.0 else "behind"
     yield Finding(
         "bite-odd",
-        f"the plan takes the lower front teeth from {abs(before):.0f} mm {was} the upper ones to "
-        f"{abs(after):.0f} mm {words} them",
+        f"the plan takes the bone at the lower front teeth from {abs(before):.0f} mm {was} that at "
+        f"the upper ones to {abs(after):.0f} mm {words} it (infradentale, supradentale)",
         where=moving.where,
         facts={"better": ", or ".join(better)},
     )
