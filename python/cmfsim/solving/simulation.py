@@ -20,6 +20,7 @@ from cmfsim._core import (
     Tissue,
     __version__,
 )
+from cmfsim.errors import BoundaryInputError
 from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
 from cmfsim.values.scene import Scene, SceneResult
@@ -141,7 +142,7 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
     ----------
     scene : Scene
     solver : StaticSolver, optional
-        Of this scene, with any plan, if `scene_solver` has already made one.
+        Of this scene, with any plan and loads, if `scene_solver` has already made one.
 
     Returns
     -------
@@ -154,7 +155,7 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
     ------
     MeshError, MaterialError, BoundaryError, ContactError, SolverError
         (the input errors also `ValueError`) The scene is invalid, or the solution did not converge;
-        the error states the figures reached.
+        the error states the figures reached. `BoundaryError`: the solver is of another scene.
 
     Examples
     --------
@@ -171,7 +172,34 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
     >>> float(round(result.forces[3, 2], 9))  # V E g² u = 1/6 · 1 · 1 · 0.1
     0.016666667
     """
-    return solved_scene(scene, solver or scene_solver(scene))[0]
+    if solver is None:
+        solver = scene_solver(scene)
+    else:
+        _check_solver(solver, scene)
+    return solved_scene(scene, solver)[0]
+
+
+def _check_solver(solver: StaticSolver, scene: Scene) -> None:
+    """Refuses the solver of another scene: its solution would be taken for that of this one."""
+    mesh, tissue, given = solver.tensors.mesh, solver.tensors.tissue, solver.boundary
+    needed, options = _boundary(scene, None), scene.options
+    parts: dict[str, list[tuple[Any, Any]]] = {
+        "nodes": [(mesh.nodes, scene.nodes)],
+        "tets": [(mesh.tets, scene.tets)],
+        "segments": [(given.segments, needed.segments)],
+        "fixed nodes": [(given.fixed, needed.fixed)],
+        "joined nodes": [(given.joined.get(name), j) for name, j in needed.joined.items()],
+        "sliding nodes": [(given.sliding.get(name), s) for name, s in needed.sliding.items()],
+        "element": [(solver.tensors.element, options.element)],
+        "kinematics": [(solver.kinematics, options.kinematics)],
+        "tissue": [(tissue.stiffness(), _tissue(scene.tissue).stiffness())],
+    }
+    for part, pairs in parts.items():
+        if not all(np.array_equal(one, other) for one, other in pairs):
+            raise BoundaryInputError(
+                f"the solver is of another scene, with other {part}: make one of this scene "
+                "(scene_solver)"
+            )
 
 
 def solved_scene(scene: Scene, solver: StaticSolver) -> tuple[SceneResult, Solution]:

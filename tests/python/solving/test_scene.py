@@ -59,6 +59,25 @@ def test_solving_a_scene_is_solving_by_hand(kind):
     assert result.summary["scene_sha256"] == s.sha256()
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"nodes": 2.0 * NODES}, "nodes"),
+        ({"options": cmfsim.SolverOptions(kinematics="corotational")}, "kinematics"),
+        ({"fixed": []}, "fixed nodes"),
+        ({"tissue": cmfsim.TissueData("isotropic", young=7.0, poisson=0.3)}, "tissue"),
+    ],
+)
+def test_a_solver_of_another_scene_is_refused(change, said):
+    """Its solution would be that of the other scene, with the name of this one."""
+    one = scene()
+    solver = cmfsim.scene_solver(one)
+    same = cmfsim.solve_scene(dataclasses.replace(one, loads=None), solver=solver)
+    assert same.summary["residual"] >= 0.0
+    with pytest.raises(cmfsim.BoundaryError, match=f"other {said}"):
+        cmfsim.solve_scene(dataclasses.replace(one, **change), solver=solver)
+
+
 def test_a_result_survives_its_file(tmp_path):
     """Npz keeps every array and the summary."""
     result = cmfsim.solve_scene(scene())
