@@ -5,8 +5,8 @@ import re
 import unicodedata
 from dataclasses import dataclass
 
-# Words that programs and people use, without accents: English, then German, French, Spanish and
-# Italian. "schaedel" and "schadel" are the two ways to write an umlaut without it.
+# Words that programs and people use, without accents: English, then German, French, Spanish,
+# Italian and Dutch. "schaedel" and "schadel" are the two ways to write an umlaut without it.
 # Parts that are no bone of a case.
 NO_BONE = frozenset(
     ("canal", "airway", "sinus", "tongue", "muscle", "muscles", "plate", "plates", "pulp")
@@ -18,16 +18,18 @@ NO_BONE = frozenset(
 TEETH = frozenset(
     ("teeth", "tooth", "incisor", "canine", "premolar", "molar", "dentition")
     + ("zahn", "zahne", "zaehne", "zahnreihe", "dent", "dents", "diente", "dientes", "dente")
-    + ("denti",)
+    + ("denti", "tand", "tanden", "gebit")
 )
-JOINING = frozenset(["with", "and", "including", "incl", "mit", "und", "avec", "et", "con"])
+JOINING = frozenset(["with", "and", "including", "incl", "mit", "und", "avec", "et", "con", "met"])
 UPPER = frozenset(
     ("upper", "maxillary", "maxilla", "oben", "obere", "oberer", "oberkiefer")
-    + ("superieure", "superieures", "sup", "superior", "superiores", "superiori")
+    + ("superieur", "superieure", "superieures", "sup", "superior", "superiores", "superiore")
+    + ("superiori", "boven", "bovenste", "bovenkaak")
 )
 LOWER = frozenset(
     ("lower", "mandibular", "mandible", "unten", "untere", "unterer", "unterkiefer")
-    + ("inferieure", "inferieures", "inf", "inferior", "inferiores", "inferiori")
+    + ("inferieur", "inferieure", "inferieures", "inf", "inferior", "inferiores", "inferiore")
+    + ("inferiori", "onder", "onderste", "onderkaak")
 )
 # The first of these that a head has holds the row of teeth.
 JAWS_OF_TEETH = {
@@ -37,36 +39,44 @@ JAWS_OF_TEETH = {
 AFTER = frozenset(
     ("post", "postop", "postoperative", "after", "achieved", "postsurgery", "postsurgical")
     + ("postoperativ", "nachher", "nach", "apres", "postoperatoire", "despues", "dopo")
+    + ("postoperatief",)
 )
 SKIN = frozenset(
     ("skin", "face", "softtissue", "softtissues", "epidermis", "soft", "haut", "gesicht")
     + ("gesichtshaut", "weichteil", "weichteile", "weichgewebe", "peau", "visage", "piel", "cara")
-    + ("pelle", "viso")
+    + ("pelle", "cute", "viso", "huid", "gezicht")
 )
 CRANIUM = frozenset(
     ("cranium", "cranial", "skull", "neurocranium", "schadel", "schaedel", "hirnschadel")
-    + ("hirnschaedel", "crane", "craneo", "cranio")
+    + ("hirnschaedel", "crane", "craneo", "cranio", "teschio", "schedel")
 )
 MANDIBLE = frozenset(
     ("mandible", "mandibula", "mandibular", "jaw", "unterkiefer", "unterkieferknochen")
-    + ("mandibule", "mandibola")
+    + ("mandibule", "mandibulaire", "mandibola", "mandibolare", "onderkaak")
 )
 MAXILLA = frozenset(
     ("maxilla", "maxillary", "lefort", "lefort1", "lf1", "upperjaw", "upperjawbone")
-    + ("oberkiefer", "oberkieferknochen", "maxillaire", "maxilar", "mascella")
+    + ("oberkiefer", "oberkieferknochen", "maxillaire", "maxilar", "mascella", "bovenkaak")
 )
 MIDFACE = frozenset(["midface", "lefort3", "lf3", "mittelgesicht"])
-CHIN = frozenset(["chin", "genio", "genioplasty", "kinn", "kinnplastik", "menton", "mento"])
+CHIN = frozenset(["chin", "genio", "genioplasty", "kinn", "kinnplastik", "menton", "mento", "kin"])
 RAMUS = frozenset(
     ("ramus", "proximal", "condyle", "condylar", "proximales", "kieferast", "unterkieferast")
-    + ("gelenkfortsatz", "kondylus")
+    + ("gelenkfortsatz", "kondylus", "branche", "rama", "ramo", "condilo")
 )
-JAW = frozenset(["jaw", "jawbone", "kiefer", "machoire", "mascellare"])
+JAW = frozenset(["jaw", "jawbone", "kiefer", "machoire", "mascellare", "kaak"])
 DISTAL = frozenset(["distal", "distales"])
-BONE = frozenset(["bone", "bones", "skeleton", "knochen", "skelett"])
-LEFT = frozenset(("left", "l", "lt", "links", "linke", "linker", "linkes", "gauche", "izquierda"))
+BODY = frozenset(["body", "corpus", "korper", "koerper", "corps", "cuerpo", "corpo", "lichaam"])
+# Of the lower jaw, where "inferior" stands with them.
+EITHER_JAW = frozenset(["maxillaire", "maxilar"])
+BONE = frozenset(["bone", "bones", "skeleton", "knochen", "skelett", "hueso", "osso"])
+LEFT = frozenset(
+    ("left", "l", "lt", "links", "linke", "linker", "linkes", "gauche", "izquierda")
+    + ("izquierdo", "sinistra", "sinistro")
+)
 RIGHT = frozenset(
     ("right", "r", "rt", "rechts", "rechte", "rechter", "rechtes", "droit", "droite", "derecha")
+    + ("derecho", "destra", "destro")
 )
 # Words of a transform that brings data together, and moves no bone.
 REGISTERS = frozenset(
@@ -132,12 +142,14 @@ def _part(words: set[str]) -> tuple[str, str]:
         if left != right:
             return ("ramus_left" if left else "ramus_right"), word
         return "", word
-    if words & MANDIBLE and (word := said(DISTAL | {"body"})):
+    if words & MANDIBLE and (word := said(DISTAL | BODY)):
         return "mandible_body", word
     if word := said(CRANIUM):
         return "cranium", word
     if word := said(MIDFACE):
         return "midface", word
+    if words & LOWER and (word := said(EITHER_JAW)):
+        return "mandible", word
     for part, known, side in (("maxilla", MAXILLA, UPPER), ("mandible", MANDIBLE, LOWER)):
         if word := said(known - {"jaw"}):
             return part, word

@@ -43,7 +43,7 @@ GAP_LIMIT = 2.0
 # Of the bone about the crowns that is shown, mm.
 ROW_AROUND = 5.0
 # Room beside the rows, mm.
-ROW_BESIDE = 8.0
+ROW_BESIDE = 14.0
 ROWS_SIZE = (1500, 800)
 ROW_VIEWS = (
     View("below", "upper teeth from below, the patient's left on the right"),

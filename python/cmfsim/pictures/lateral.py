@@ -31,8 +31,9 @@ BEFORE, PLANNED, PALE = "#1f4e8c", "#c2261c", "#4a5663"
 # The sites that are named, those of bone behind them, where no skin is.
 BONE_SITES = ("S", "N", "Po", "Or", "A", "B", "Pog", "Gn", "Me", "Go", "U1", "L1")
 SHOWN = (*BONE_SITES, "Prn", "Sn", "Ls", "Li", "Pog'")
-# How far above the site a name stands, points: edges of incisors lie close to each other.
-RAISED = {"U1": 4.0, "L1": -4.0}
+# How far above the site a name stands, points: the edge of a lower incisor lies behind and above
+# that of the upper one.
+RAISED = {"U1": 9.0, "L1": -4.0}
 PLANES: Mapping[str, tuple[str, str]] = {
     "SN": ("S", "N"),
     "FH": ("Po", "Or"),
@@ -73,7 +74,7 @@ def picture_lateral(
 
     def paint(figure: Any) -> None:
         panels = figure.subplots(1, 2, subplot_kw={"xlim": window[0], "ylim": window[1]})
-        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.0)
+        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.04, wspace=0.0)
         _panel(panels[0], before, BEFORE, window)
         _panel(panels[1], planned, PLANNED, window)
         _trace(panels[1], before, BEFORE, 0.6)
@@ -105,7 +106,9 @@ def _panel(panel: Any, view: LateralView, colour: str, window: Floats) -> None:
             side = -3.0 if name in BONE_SITES else 3.0
             _write(panel, view.sites[name], name, colour, (side, RAISED.get(name, 0.0)))
     x, y = window[0][0] + 4.0, window[1][0] + 5.0
-    panel.plot([x, x + SCALE], [y, y], color="black", linewidth=1.5, solid_capstyle="butt")
+    ends = [x, x + SCALE], [y, y]
+    panel.plot(*ends, color="white", linewidth=4.5)
+    panel.plot(*ends, color="black", linewidth=1.5, solid_capstyle="butt")
     words = f"{SCALE:g} mm, not enlarged"
     _write(panel, np.array([x + SCALE, y]), words, "black", (3.0, 0.0))
     panel.set_axis_off()

@@ -114,9 +114,10 @@ MOST_TRIANGLES = 1_000_000
 
 MARK = "# cmfsim demo: written by this command, and overwritten by it."
 NOTE = (
-    "Not a patient, but a synthetic head (long mandible, strong chin) and an operation of ordinary "
-    "size. Skin, bones and airway are computed from the formulas that define the head, so nothing "
-    "was scanned or segmented (cmfsim phantom writes a head with its CT). Landmarks are found "
+    "Not a patient, but a synthetic head (long mandible, strong chin). The plan shows how lips and "
+    "chin follow the jaws; it is not one to operate by: the overjet grows from 2 to 10 mm. "
+    "Skin, bones and airway are computed from the formulas that define the head, so nothing was "
+    "scanned or segmented (cmfsim phantom writes a head with its CT). Landmarks are found "
     "automatically, more accurately than on real heads. The tets are coarse, for speed."
 )
 IN_SILICO = (
