@@ -196,7 +196,9 @@ def test_a_piece_beyond_the_mesh_that_nobody_named_is_a_warning(cut):
 def test_a_build_compares_landmarks_with_the_bones_that_it_made(head, truth, cut):
     """Correct ones give no word; all 5 mm up are found on bones and skin, and end no build."""
     case = types.SimpleNamespace(where=lambda key: key)
-    marks = {"skull": head.skull_landmarks, "skin": head.skin_landmarks}
+    # Sella lies in no surface: measures alone use it.
+    skull = {**head.skull_landmarks, "S": np.array([0.0, -20.0, 25.0])}
+    marks = {"skull": skull, "skin": head.skin_landmarks}
     assert case_checks.misplaced(case, marks, truth, cut) == []
     for shift, words in ((5.0, "5.0 mm too high"), (12.0, "12.0 mm too high")):
         moved = {

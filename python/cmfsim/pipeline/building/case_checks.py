@@ -22,6 +22,7 @@ from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.landmark_sites import is_for_measures
 from cmfsim.values.mesh_report import MeshReport
 from cmfsim.values.motion import carried
 from cmfsim.values.node_kinds import NodeKinds
@@ -118,7 +119,8 @@ def misplaced(
     """Findings about landmarks that do not lie on the bones and the skin that were segmented."""
     surfaces = [s.surface.searched for s in segments]
     findings: list[Finding] = []
-    for key, places in landmarks.items():
+    for key, given in landmarks.items():
+        places = {name: place for name, place in given.items() if not is_for_measures(name)}
         where = case.where(f"landmarks.{key}")
         on_bone = key == "skull"
         nearest = (
