@@ -28,9 +28,10 @@ BONE, SKIN = 0.1, 0.05
 FRONT, BELOW, ABOVE, ASPECT = 22.0, 20.0, 22.0, 1.08
 SCALE = 20.0
 BEFORE, PLANNED, PALE = "#1f4e8c", "#c2261c", "#4a5663"
-# The sites that are named, those of bone behind them, where no skin is.
-BONE_SITES = ("S", "N", "Po", "Or", "A", "B", "Pog", "Gn", "Me", "Go", "U1", "L1")
-SHOWN = (*BONE_SITES, "Prn", "Sn", "Ls", "Li", "Pog'")
+# The sites that are named, those of bone behind them, where no skin is, but for Gn, which lies
+# between Pog and Me.
+BONE_SITES = ("S", "N", "Po", "Or", "A", "B", "Pog", "Me", "Go", "U1", "L1")
+SHOWN = (*BONE_SITES, "Gn", "Prn", "Sn", "Ls", "Li", "Pog'")
 # How far above the site a name stands, points: the edge of a lower incisor lies behind and above
 # that of the upper one.
 RAISED = {"U1": 9.0, "L1": -4.0}

@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from cmfsim._core import KINEMATICS
 from cmfsim.errors import CaseInputError
 from cmfsim.io import replacing_files, write_metrics
 from cmfsim.lab.frontier.choice import Choice
@@ -23,7 +24,7 @@ TITLES = (
 DASH = "–"
 # Told apart in grey too, and by those who see no red or green.
 ELEMENT_COLOURS = {"p1": "#8a5a2b", "anp": "#e0a53f", "p2": "#3f7fb5"}
-KINEMATICS_MARKS = {"linear": "o", "corotational": "s", "hyperelastic": "^"}
+KINEMATICS_MARKS = dict(zip(KINEMATICS, "os^Dv<>P", strict=False))
 SIZE = (10.0, 5.2)
 SUMMARY, TABLE, PAGE, PICTURE = "frontier.json", "frontier.csv", "frontier.md", "frontier.png"
 
