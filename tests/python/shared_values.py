@@ -6,12 +6,16 @@ every run creates for itself: no value outlives the code that made it.
 
 import contextlib
 import hashlib
+import json
+import logging
 import os
 import pickle
-from collections.abc import Callable, Iterator
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 
@@ -22,6 +26,7 @@ from cmfsim.pipeline import proposing
 from cmfsim.pipeline.building import inputs
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
+from cmfsim.processes.worker import Answer, WorkerFailedError
 
 try:
     import fcntl
@@ -128,3 +133,61 @@ def without_pictures(patch: pytest.MonkeyPatch, folder: Path) -> None:
         import_module("pyvista")
     patch.syspath_prepend(folder)
     patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+
+
+def without_processes(patch: pytest.MonkeyPatch) -> None:
+    """Has jobs of studies and populations be worked on in this process, which shares values.
+
+    A process for each patient imports everything and reads every surface again: half of its time.
+    For tests of what is written; cli/test_crash_safety.py and processes/ test the processes.
+    """
+    patch.setattr("cmfsim.processes.parallel.Worker", _Here)
+
+
+class _Here:
+    """Answers as a `Worker` does, and writes what the package logs where a worker would."""
+
+    turn = threading.Lock()
+
+    def __init__(self, *, threads: int | None = None, log: IO[bytes] | None = None) -> None:
+        del threads
+        self.log = _LogTo(log)
+
+    def __enter__(self) -> "_Here":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def ask(self, function: str, arguments: Mapping[str, Any]) -> Answer:
+        """The answer of a function of the package to plain values."""
+        module, name = function.split(":")
+        package = logging.getLogger("cmfsim")
+        with self.turn:
+            package.addHandler(self.log)
+            try:
+                found = getattr(import_module(module), name)(**json.loads(json.dumps(arguments)))
+            except cmfsim.CmfsimError:
+                raise
+            except Exception as error:
+                kinds = [kind.__name__ for kind in type(error).__mro__]
+                raise WorkerFailedError(kinds, str(error), traceback.format_exc()) from error
+            finally:
+                package.removeHandler(self.log)
+        return found if isinstance(found, Answer) else Answer(json.loads(json.dumps(found)))
+
+    def end(self) -> None:
+        """Nothing: there is no process."""
+
+
+class _LogTo(logging.Handler):
+    """Writes as processes of the package do, if there is a file."""
+
+    def __init__(self, log: IO[bytes] | None) -> None:
+        super().__init__(logging.WARNING)
+        self.file = log
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self.file is not None:
+            self.file.write(f"cmfsim: {record.getMessage()}\n".encode())
+            self.file.flush()

@@ -14,7 +14,7 @@ import phantom_case
 from cmfsim.cli import main
 from cmfsim.report import render_page, study_document
 from cmfsim.report.study import table3_text
-from shared_values import drawn_levels, without_pictures
+from shared_values import drawn_levels, without_drawings, without_processes
 
 pytest.importorskip("skimage")
 pytest.importorskip("jinja2")
@@ -58,7 +58,7 @@ def _patient(folder, head, anatomy, share):
 def folder(tmp_path_factory):
     """Two patients in a folder, and a cohort file that names a third who is not there.
 
-    The processes that work on a case draw nothing; the figures of the study are drawn by this one.
+    Work on a case draws nothing; the figures of the study are drawn.
     """
     folder = tmp_path_factory.mktemp("cohort")
     head = cmfsim.make_head()
@@ -72,7 +72,8 @@ def folder(tmp_path_factory):
         encoding="utf-8",
     )
     with pytest.MonkeyPatch.context() as patch:
-        without_pictures(patch, tmp_path_factory.mktemp("absent"))
+        without_processes(patch)
+        without_drawings(patch)
         assert main(["study", str(folder), "-q", "--workers", "1"]) == 1
     return folder
 
@@ -229,7 +230,8 @@ def test_figures_show_every_patient_and_model(folder):
 
 def test_a_study_is_drawn_from_what_it_left_and_nothing_else(folder, tmp_path, monkeypatch):
     """Errors that were changed after the study are refused; a run again works on that case."""
-    without_pictures(monkeypatch, tmp_path / "absent")
+    without_processes(monkeypatch)
+    without_drawings(monkeypatch)
     copied = tmp_path / "copy"
     shutil.copytree(folder, copied)
     cohort = replace(cmfsim.Cohort.load(copied), cases={"P1": copied / "P1" / "case.toml"})

@@ -13,7 +13,7 @@ import phantom_case
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError
 from cmfsim.report.variants import variants_text
-from shared_values import drawn_levels, without_pictures
+from shared_values import drawn_levels, without_drawings, without_processes
 
 pytest.importorskip("skimage")
 pytest.importorskip("jinja2")
@@ -67,11 +67,12 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def study(folder, tmp_path_factory):
+def study(folder):
     """The values of the study, its exit code being 1 for cases that failed."""
     words = ["study", str(folder), "--variants", str(folder / "variants.toml"), "-q"]
     with pytest.MonkeyPatch.context() as patch:
-        without_pictures(patch, tmp_path_factory.mktemp("absent"))
+        without_processes(patch)
+        without_drawings(patch)
         assert main([*words, "--workers", "1"]) == 1
     text = (folder / "study-variants" / "variants.json").read_text(encoding="utf-8")
     return json.loads(text)
@@ -161,7 +162,8 @@ def test_tables_name_patients_variants_and_regions(folder, study):
 
 def test_what_is_finished_is_kept_until_its_variant_changes(folder, study, monkeypatch, tmp_path):
     del study
-    without_pictures(monkeypatch, tmp_path)
+    without_processes(monkeypatch)
+    without_drawings(monkeypatch)
     text = (folder / "variants.toml").read_text(encoding="utf-8")
     other = tmp_path / "variants.toml"
     other.write_text(text.partition("[variants.named")[0].replace("0.1", "0.2"), encoding="utf-8")
