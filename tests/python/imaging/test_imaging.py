@@ -1,19 +1,13 @@
-"""The segmentation of heads: a made one with known truth, and variants of a real CT."""
-
-import json
-import os
-from pathlib import Path
+"""The segmentation of a made head with known truth."""
 
 import numpy as np
 import pytest
 
-import cmfsim
 from benches.scenes import ct_variants as variants
 from cmfsim import ImageData, ImageError, SegmentOptions, segment_head
 from cmfsim.imaging.intensities import intensity
 from cmfsim.registration.proposed.shape_model import fitted_head
-from phantom_reference import check_face, dice, distances, face, parted_as, surface_points
-from phantom_reference import reference as reference_surfaces
+from phantom_reference import dice, surface_points
 from synthetic_head import made_head
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
@@ -22,8 +16,6 @@ measure = pytest.importorskip("skimage.measure", reason="needs scikit-image")
 
 # For what does not depend on where the jaws part.
 WHOLE = SegmentOptions(part_jaws=False)
-DATA = Path(os.environ.get("CMFSIM_DATA", Path(__file__).parents[4] / "shared/data"))
-PHANTOM = DATA / "ct_phantom"
 
 
 def on_truth(level, head, mask):
@@ -45,6 +37,17 @@ def head():
 @pytest.fixture(scope="session")
 def anatomy(head):
     return segment_head(head.image, landmarks=head.landmarks)
+
+
+@pytest.fixture(scope="session")
+def coarse():
+    """The head in voxels of 4 mm, for what does not depend on their size."""
+    return made_head(4.0)
+
+
+@pytest.fixture(scope="session")
+def coarse_anatomy(coarse):
+    return segment_head(coarse.image, landmarks=coarse.landmarks)
 
 
 def test_the_made_head_is_found_within_its_voxels(head, anatomy):
@@ -110,16 +113,16 @@ def test_the_jaws_are_parted_without_landmarks_and_it_is_said(head, monkeypatch)
     assert dice(found, truth) > 0.85
 
 
-def test_the_same_image_gives_the_same_bits(head, anatomy):
-    again = segment_head(head.image, landmarks=head.landmarks)
-    assert again.skin.values.tobytes() == anatomy.skin.values.tobytes()
-    for name, level in anatomy.bones.items():
+def test_the_same_image_gives_the_same_bits(coarse, coarse_anatomy):
+    again = segment_head(coarse.image, landmarks=coarse.landmarks)
+    assert again.skin.values.tobytes() == coarse_anatomy.skin.values.tobytes()
+    for name, level in coarse_anatomy.bones.items():
         assert again.bones[name].values.tobytes() == level.values.tobytes()
 
 
-def test_one_bone_is_left_where_jaws_are_not_to_be_parted_and_stages_are_named_in_order(head):
+def test_one_bone_is_left_where_jaws_are_not_to_be_parted_and_stages_are_named_in_order(coarse):
     stages = []
-    whole = segment_head(head.image, WHOLE, progress=stages.append)
+    whole = segment_head(coarse.image, WHOLE, progress=stages.append)
     assert set(whole.bones) == {"skull"}
     assert stages == ["grid", "metal", "skin", "bone", "air"]
 
@@ -128,19 +131,21 @@ def test_one_bone_is_left_where_jaws_are_not_to_be_parted_and_stages_are_named_i
     ("slope", "offset", "dtype"),
     [(1.0, 1024.0, np.uint16), (1.0, 32768.0, np.uint16), (9.7, 9950.0, np.uint16)],
 )
-def test_other_scales_than_hu_are_recognised_and_said(head, anatomy, slope, offset, dtype):
-    raw = np.clip(np.round(head.image.values * slope + offset), 0, 65535).astype(dtype)
-    found = segment_head(head.image.with_values(raw), landmarks=head.landmarks)
+def test_other_scales_than_hu_are_recognised_and_said(coarse, coarse_anatomy, slope, offset, dtype):
+    raw = np.clip(np.round(coarse.image.values * slope + offset), 0, 65535).astype(dtype)
+    found = segment_head(coarse.image.with_values(raw), landmarks=coarse.landmarks)
     assert "ct-not-hu" in codes(found)
-    assert dice(found.skin.values > 0, anatomy.skin.values > 0) > 0.99
-    assert dice(found.bones["mandible"].values > 0, anatomy.bones["mandible"].values > 0) > 0.95
+    assert dice(found.skin.values > 0, coarse_anatomy.skin.values > 0) > 0.99
+    assert (
+        dice(found.bones["mandible"].values > 0, coarse_anatomy.bones["mandible"].values > 0) > 0.95
+    )
 
 
-def test_values_from_nought_to_one_are_recognised(head, anatomy):
-    scaled = ((head.image.values + 1024.0) / 4000.0).astype(np.float32)
-    found = segment_head(head.image.with_values(scaled), WHOLE)
+def test_values_from_nought_to_one_are_recognised(coarse, coarse_anatomy):
+    scaled = ((coarse.image.values + 1024.0) / 4000.0).astype(np.float32)
+    found = segment_head(coarse.image.with_values(scaled), WHOLE)
     assert "ct-not-hu" in codes(found)
-    assert dice(found.skin.values > 0, anatomy.skin.values > 0) > 0.99
+    assert dice(found.skin.values > 0, coarse_anatomy.skin.values > 0) > 0.99
 
 
 def test_a_head_of_plastic_is_no_mr_image(head):
@@ -176,6 +181,11 @@ def test_an_image_without_bright_bone_is_no_ct(head):
 
 def test_a_ct_in_hu_is_left_alone(anatomy):
     assert "ct-not-hu" not in codes(anatomy)
+
+
+def test_coarse_voxels_are_reported(anatomy, coarse_anatomy):
+    assert "ct-spacing-coarse" not in codes(anatomy)
+    assert "ct-spacing-coarse" in codes(coarse_anatomy)
 
 
 def test_an_mr_image_is_refused(head):
@@ -225,10 +235,10 @@ def test_thresholds_must_ascend():
         SegmentOptions(closing=0.0)
 
 
-def test_a_flipped_head_is_an_error_finding(head):
-    back = segment_head(head.image.with_values(head.image.values[:, ::-1].copy()), WHOLE)
+def test_a_flipped_head_is_an_error_finding(coarse):
+    back = segment_head(coarse.image.with_values(coarse.image.values[:, ::-1].copy()), WHOLE)
     assert any(f.code == "ct-flipped" and f.severity == "error" for f in back.findings)
-    turned = segment_head(head.image.with_values(head.image.values[:, :, ::-1].copy()), WHOLE)
+    turned = segment_head(coarse.image.with_values(coarse.image.values[:, :, ::-1].copy()), WHOLE)
     assert any(f.code == "ct-flipped" and f.severity == "error" for f in turned.findings)
 
 
@@ -262,33 +272,33 @@ def with_fillings(head, hu):
     return head.image.with_values(values.astype(np.int16))
 
 
-def test_metal_is_found_where_the_image_is_cut_off_below_the_usual_threshold(head):
-    found = segment_head(with_fillings(head, 2000.0), WHOLE)
+def test_metal_is_found_where_the_image_is_cut_off_below_the_usual_threshold(coarse):
+    found = segment_head(with_fillings(coarse, 2000.0), WHOLE)
     assert {"metal", "ct-saturated"} <= codes(found)
     (metal,) = [f for f in found.findings if f.code == "metal"]
     assert "2 pieces" in metal.what
     assert "above 1940 HU" in metal.what
     # What the case sets counts.
     options = SegmentOptions(metal_threshold=2400.0, part_jaws=False)
-    set_higher = segment_head(with_fillings(head, 2000.0), options)
+    set_higher = segment_head(with_fillings(coarse, 2000.0), options)
     assert not {"metal", "ct-saturated"} & codes(set_higher)
 
 
-def test_an_image_cut_off_too_low_to_tell_metal_is_reported(head):
-    found = segment_head(with_fillings(head, 1500.0), WHOLE)
+def test_an_image_cut_off_too_low_to_tell_metal_is_reported(coarse):
+    found = segment_head(with_fillings(coarse, 1500.0), WHOLE)
     assert "metal" not in codes(found)
     (finding,) = [f for f in found.findings if f.code == "ct-saturated"]
     assert finding.severity == "warning"
     assert "metal_threshold" in finding.fix
     options = SegmentOptions(metal_threshold=1400.0, part_jaws=False)
-    lower = segment_head(with_fillings(head, 1500.0), options)
+    lower = segment_head(with_fillings(coarse, 1500.0), options)
     assert "metal" in codes(lower)
 
 
-def test_one_bright_voxel_is_no_saturation(head):
-    values = head.image.values.copy()
+def test_one_bright_voxel_is_no_saturation(coarse):
+    values = coarse.image.values.copy()
     values[40, 20, 20] = 2000
-    found = segment_head(head.image.with_values(values), WHOLE).findings
+    found = segment_head(coarse.image.with_values(values), WHOLE).findings
     assert "ct-saturated" not in {f.code for f in found if f.severity == "warning"}
 
 
@@ -321,180 +331,12 @@ def test_a_part_that_is_too_small_for_a_head_is_refused():
         segment_head(ImageData(values, (2.0, 2.0, 2.0)))
 
 
-def test_a_stated_scale_is_used_and_checked(head, anatomy):
-    stored = head.image.with_values(head.image.values + np.int16(1024))
-    found = segment_head(stored, SegmentOptions(rescale=(1.0, -1024.0)), landmarks=head.landmarks)
+def test_a_stated_scale_is_used_and_checked(coarse, coarse_anatomy):
+    stored = coarse.image.with_values(coarse.image.values + np.int16(1024))
+    found = segment_head(stored, SegmentOptions(rescale=(1.0, -1024.0)), landmarks=coarse.landmarks)
     assert "ct-not-hu" not in codes(found)
-    np.testing.assert_array_equal(found.skin.values, anatomy.skin.values)
+    np.testing.assert_array_equal(found.skin.values, coarse_anatomy.skin.values)
     with pytest.raises(ImageError, match="correct rescale"):
         segment_head(stored, SegmentOptions(rescale=(1.0, 0.0)))
     with pytest.raises(ValueError, match="slope"):
         SegmentOptions(rescale=(0.0, 0.0))
-
-
-# The real CT -----------------------------------------------------------------------------------
-
-needs_phantom = pytest.mark.skipif(
-    not (PHANTOM / "ct.nii.gz").is_file(), reason=f"needs the head phantom's CT in {PHANTOM}"
-)
-
-
-@pytest.fixture(scope="session")
-def phantom():
-    return cmfsim.read_image(PHANTOM / "ct.nii.gz")
-
-
-@pytest.fixture(scope="session")
-def phantom_landmarks():
-    document = json.loads((PHANTOM / "skull_landmarks.mrk.json").read_text())
-    points = document["markups"][0]["controlPoints"]
-    return {p["label"]: np.array(p["position"]) for p in points}
-
-
-@pytest.fixture(scope="session")
-def phantom_anatomy(phantom, phantom_landmarks):
-    """Segmented as the reference was: bone's surface lies at 250 HU."""
-    options = SegmentOptions(bone_threshold=250.0)
-    return segment_head(phantom, options, landmarks=phantom_landmarks)
-
-
-@pytest.fixture(scope="session")
-def coarse_phantom(phantom):
-    return variants.coarser(phantom, (2, 2, 1))
-
-
-@pytest.fixture(scope="session")
-def reference():
-    return reference_surfaces()
-
-
-@needs_phantom
-def test_the_real_skin_is_that_of_the_reference(phantom_anatomy, reference):
-    distance = distances(face(surface_points(phantom_anatomy.skin)), reference["skin"])
-    assert np.median(distance) < 0.1
-    assert np.percentile(distance, 95.0) < 0.5
-    volume = np.count_nonzero(phantom_anatomy.skin.values > 0) * np.prod(
-        phantom_anatomy.skin.spacing
-    )
-    assert volume == pytest.approx(4.197e6, rel=0.01)
-
-
-@needs_phantom
-def test_the_real_bone_is_that_of_the_reference(phantom_anatomy, reference):
-    both = np.maximum(*(level.values for level in phantom_anatomy.bones.values()))
-    level = phantom_anatomy.skin.with_values(both)
-    distance = distances(face(surface_points(level)), reference["bone"])
-    assert np.median(distance) < 0.15
-    assert np.percentile(distance, 95.0) < 1.0
-
-
-@needs_phantom
-def test_the_real_jaws_are_parted(phantom_anatomy, reference):
-    assert parted_as(phantom_anatomy, reference) > 0.98
-    volume = np.count_nonzero(phantom_anatomy.bones["mandible"].values > 0) * np.prod(
-        phantom_anatomy.skin.spacing
-    )
-    assert volume == pytest.approx(79.9e3, rel=0.05)
-
-
-def _skin_of(image, landmarks, options=None):
-    anatomy = segment_head(image, options, landmarks=landmarks)
-    return anatomy, face(surface_points(anatomy.skin))
-
-
-# Others are built from in pipeline/test_hard_heads.py, which looks at their faces as well.
-VARIANTS = {
-    "pillow": (
-        lambda i: variants.with_pillow(variants.without_couch(i, -107.0)),
-        {"rest-removed"},
-        0.3,
-        1.0,
-        0.9,
-    ),
-    "holder": (
-        lambda i: variants.with_holder(variants.without_couch(i, -107.0)),
-        {"rest-removed"},
-        0.3,
-        1.0,
-        0.9,
-    ),
-    "scaled": (
-        lambda i: i.with_values(((i.values.astype(np.float64) + 1024) * 9.7 + 321).astype("u2")),
-        {"ct-not-hu"},
-        0.3,
-        1.0,
-        0.85,
-    ),
-    "slices of 4 mm": (
-        lambda i: variants.coarser(i, (1, 1, 2)),
-        {"ct-spacing-coarse"},
-        0.3,
-        2.0,
-        0.85,
-    ),
-}
-
-
-@needs_phantom
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if name in {"pillow", "slices of 4 mm"} else pytest.param(name, marks=pytest.mark.slow)
-        for name in VARIANTS
-    ],
-)
-def test_a_hard_variant_of_the_real_ct_keeps_its_face(
-    name, coarse_phantom, phantom_landmarks, reference
-):
-    make, expected, median, p95, parted = VARIANTS[name]
-    anatomy = segment_head(make(coarse_phantom), landmarks=phantom_landmarks)
-    assert expected <= codes(anatomy)
-    assert not [f for f in anatomy.findings if f.severity == "error"]
-    check_face(anatomy, reference, median, p95, parted)
-
-
-@needs_phantom
-def test_the_real_face_has_nothing_attached(phantom_anatomy):
-    assert not {"skin-attachment", "ct-saturated", "metal"} & codes(phantom_anatomy)
-
-
-@needs_phantom
-def test_the_real_jaws_are_parted_without_landmarks(coarse_phantom, reference):
-    anatomy = segment_head(coarse_phantom)
-    assert "jaws-parted-by-shape" in codes(anatomy)
-    assert parted_as(anatomy, reference) > 0.85
-
-
-@needs_phantom
-@pytest.mark.parametrize(
-    ("axis", "code"), [pytest.param(1, "ct-flipped", marks=pytest.mark.slow), (2, "ct-flipped")]
-)
-def test_a_flipped_real_ct_is_found(coarse_phantom, axis, code):
-    flipped = coarse_phantom.with_values(np.flip(coarse_phantom.values, axis))
-    anatomy = segment_head(flipped, WHOLE)
-    assert code in {f.code for f in anatomy.findings if f.severity == "error"}
-
-
-@needs_phantom
-def test_a_turned_header_gives_the_same_face(
-    tmp_path, coarse_phantom, phantom_landmarks, reference
-):
-    sitk = pytest.importorskip("SimpleITK")
-
-    image = sitk.GetImageFromArray(np.ascontiguousarray(coarse_phantom.values.T))
-    image.SetSpacing(coarse_phantom.spacing.tolist())
-    image.SetOrigin(coarse_phantom.origin.tolist())
-    # Voxels resampled on a tilted grid, as a gantry or another orientation gives them.
-    c, s = np.cos(np.radians(10.0)), np.sin(np.radians(10.0))
-    grid = sitk.Image(image.GetSize(), image.GetPixelID())
-    grid.SetSpacing(image.GetSpacing())
-    grid.SetDirection([1, 0, 0, 0, c, -s, 0, s, c])
-    middle = np.array(coarse_phantom.lowest + coarse_phantom.highest) / 2.0
-    half = np.array(image.GetSize()) * np.array(image.GetSpacing()) / 2.0
-    grid.SetOrigin((middle - np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ half).tolist())
-    sitk.WriteImage(sitk.Resample(image, grid, defaultPixelValue=-1024), str(tmp_path / "t.nrrd"))
-    _, points = _skin_of(cmfsim.read_image(tmp_path / "t.nrrd"), phantom_landmarks)
-    distance = distances(points[points[:, 2] > 340.0], reference["skin"])
-    # Voxels of 2 mm, interpolated twice.
-    assert np.median(distance) < 0.6
-    assert np.percentile(distance, 95.0) < 1.5
