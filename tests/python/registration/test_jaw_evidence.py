@@ -97,20 +97,23 @@ def test_a_jaw_that_cannot_be_one_is_named_so(change, why):
     assert [f.severity for f in found.findings if f.code == "jaw-doubtful"] == ["warning"]
 
 
-@pytest.fixture
-def child(tmp_path):
+@pytest.fixture(scope="module")
+def child(tmp_path_factory):
     """A child with an open mouth in coarse voxels: its maxilla is taken for the mandible."""
     pytest.importorskip("SimpleITK")
     pytest.importorskip("skimage")
+    folder = tmp_path_factory.mktemp("child")
     head = cmfsim.make_head(cmfsim.HeadParameters(scale=0.85, lip_gap=8.0, bite_gap=6.0))
-    cmfsim.write_image(head.ct(3.0), tmp_path / "ct.nrrd")
-    (tmp_path / "case.toml").write_text(CASE, encoding="utf-8")
-    return head, cmfsim.Case.load(tmp_path)
+    cmfsim.write_image(head.ct(3.0), folder / "ct.nrrd")
+    (folder / "case.toml").write_text(CASE, encoding="utf-8")
+    case = cmfsim.Case.load(folder)
+    return head, case, read_anatomy(case, {}, lambda _: None)
 
 
 def test_a_build_stops_where_the_maxilla_is_taken_for_the_mandible(child, monkeypatch):
     """Where the second separation does not help either: here by a volume that no jaw has."""
     monkeypatch.setattr("cmfsim.pipeline.proposing._separated_by", lambda *_: None)
+    monkeypatch.setattr("cmfsim.pipeline.building.case_model.read_anatomy", lambda *_: child[2])
     limits = "cmfsim.registration.proposed.jaw_evidence.POSSIBLE_VOLUMES"
     monkeypatch.setattr(limits, (500.0, 600.0))
     with pytest.raises(cmfsim.LandmarkError, match=r"mandible is not one.*by hand"):
@@ -118,8 +121,7 @@ def test_a_build_stops_where_the_maxilla_is_taken_for_the_mandible(child, monkey
 
 
 def test_the_jaws_of_an_open_mouth_are_separated_at_once(child):
-    head, case = child
-    anatomy, _ = read_anatomy(case, {}, lambda _: None)
+    head, case, (anatomy, _) = child
     found = proposed_head(case, anatomy, lambda _: None)
     assert found.findings == ()
     errors = {
@@ -135,7 +137,7 @@ def test_doubtful_jaws_are_separated_again_by_the_landmarks_found(tmp_path, monk
     pytest.importorskip("SimpleITK")
     pytest.importorskip("skimage")
     head = cmfsim.make_head()
-    cmfsim.write_image(head.ct(2.5), tmp_path / "ct.nrrd")
+    cmfsim.write_image(head.ct(3.0), tmp_path / "ct.nrrd")
     (tmp_path / "case.toml").write_text(CASE, encoding="utf-8")
     case = cmfsim.Case.load(tmp_path)
     anatomy, _ = read_anatomy(case, {}, lambda _: None)
