@@ -81,7 +81,7 @@ def test_a_piece_that_is_there_is_not_cut_again(head):
 
 def test_a_ct_without_landmarks_turns_about_the_teeth_that_are_found_in_it(tmp_path):
     head = cmfsim.make_head()
-    cmfsim.write_image(head.ct(3.0), tmp_path / "ct.nrrd")
+    cmfsim.write_image(head.ct(4.0), tmp_path / "ct.nrrd")
     draft = init_case(tmp_path, moves={"maxilla": {"forwards": 4.0, "pitch": 5.0}})
     teeth = head.skull_landmarks["supradentale"]
     motion = cmfsim.Case.load(tmp_path).plan["maxilla"].matrix

@@ -29,7 +29,7 @@ translation = [0, -4, 0]
     ids=["backwards", "upside down"],
 )
 def test_a_turned_image_ends_the_run(tmp_path, axis, said, capsys):
-    image = cmfsim.make_head().ct(2.5)
+    image = cmfsim.make_head().ct(4.0)
     turned = image.with_values(np.flip(image.values, axis).copy())
     cmfsim.write_image(turned, tmp_path / "ct.nrrd")
     path = write_case(tmp_path, HEAD + IMAGE + PLAN)
