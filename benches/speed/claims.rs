@@ -1,6 +1,6 @@
 //! The timing claims, as a markdown table on stdout: arrays to displacements, next plans, memory.
 //!
-//! `MTM_BENCH_SIZES=20000,80000,300000 cargo bench -p mtm-core --features metis --bench claims`
+//! `MTM_BENCH_SIZES=20000,80000,300000 cargo bench -p mtm-benches --bench claims`
 //!
 //! Each line of the table runs in a process of its own, so that its peak memory is its own.
 //! `MTM_BENCH_REPEATS` (3) is how often whole runs repeat. Times are the median, with the smallest and
@@ -293,10 +293,9 @@ fn circumstances() -> String {
     let commit = git(&["rev-parse", "--short", "HEAD"]).unwrap_or_else(|| "unknown".into());
     let changed = git(&["status", "--porcelain", "--untracked-files=no"]);
     let dirty = if changed.is_none_or(|s| s.is_empty()) { "" } else { " with changes" };
-    let ordering = if cfg!(feature = "metis") { "METIS" } else { "minimum degree" };
     let load = read("/proc/loadavg");
     format!(
-        "{processor}, {} processors, {} threads; commit {commit}{dirty}; ordering by {ordering}; load \
+        "{processor}, {} processors, {} threads; commit {commit}{dirty}; ordering by METIS; load \
          {} before the run; whole runs {} times, median (smallest–largest).",
         std::thread::available_parallelism().map_or(0, usize::from),
         rayon::current_num_threads(),

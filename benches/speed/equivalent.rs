@@ -1,6 +1,6 @@
 //! Time from muscles' surfaces to fractions and fibres of tets: sampling alone, and a whole head.
 //!
-//! `cargo bench -p mtm-core --features metis --bench equivalent`
+//! `cargo bench -p mtm-benches --bench equivalent`
 
 #![allow(missing_docs)] // criterion's macros make public items without any
 

@@ -1,6 +1,6 @@
 //! Each kernel beside the time that its bytes alone would take, as a markdown table on stdout.
 //!
-//! `MTM_BENCH_SIZES=80000,300000 cargo bench -p mtm-core --features metis --bench kernels`
+//! `MTM_BENCH_SIZES=80000,300000 cargo bench -p mtm-benches --bench kernels`
 //!
 //! Bytes are counted from the data structures: each array once for every pass over it, as if nothing
 //! stayed in cache between passes and nothing was fetched twice within one. The bandwidth is measured in

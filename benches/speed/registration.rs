@@ -1,6 +1,6 @@
 //! Points per second through a thin-plate spline of 32 landmarks, and of closest-point iterations.
 //!
-//! `cargo bench -p mtm-core --bench registration`
+//! `cargo bench -p mtm-benches --bench registration`
 
 #![allow(missing_docs)] // criterion's macros make public items without any
 

@@ -1,6 +1,6 @@
 //! Time of each stage by itself, at the sizes of `MTM_BENCH_SIZES` (tets, comma-separated).
 //!
-//! `MTM_BENCH_SIZES=20000,80000,300000 cargo bench -p mtm-core --features metis --bench stages`
+//! `MTM_BENCH_SIZES=20000,80000,300000 cargo bench -p mtm-benches --bench stages`
 
 #![allow(missing_docs)] // criterion's macros make public items without any
 

@@ -1,6 +1,6 @@
 //! Time from labels, levels and surfaces to tets: the stages of meshing one by one.
 //!
-//! `cargo bench -p mtm-core --features metis --bench stuffing`
+//! `cargo bench -p mtm-benches --bench stuffing`
 
 #![allow(missing_docs)] // criterion's macros make public items without any
 

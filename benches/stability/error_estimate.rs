@@ -1,7 +1,7 @@
 //! How often the reported error of a solve is less than its true error, over random scenes whose moduli
 //! differ up to 1e10 times, as a markdown table on stdout.
 //!
-//! `cargo bench -p mtm-core --features metis --bench error_estimate -- --scenes 20000 --seed 1`
+//! `cargo bench -p mtm-benches --bench error_estimate -- --scenes 20000 --seed 1`
 //!
 //! `--nodes N` (3000) is the size of the largest scene; `--only I` solves one scene and prints it. The exit
 //! status is 1 if any estimate failed.
