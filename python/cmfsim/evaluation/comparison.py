@@ -339,7 +339,8 @@ def _check_matched(matches: Matches, n_chosen: int) -> None:
         raise RegistrationInputError(
             f"none of {n_chosen} vertices has a partner: {matches.n_border} are matched to the "
             f"border of the post-operative skin and {matches.n_far} are further away than the "
-            "limit; check that both are in one frame, and that the mask is on the scanned face"
+            "limit; check that both are in one frame and unit (in a case: frame, units, aligned in "
+            "[postoperative]; aligned = false registers them), and the mask is on the scanned face"
         )
 
 
