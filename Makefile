@@ -14,6 +14,8 @@ PY := $(BIN)/python
 # One interpreter for every build of the binding, whatever shims the PATH holds.
 export PYO3_PYTHON := $(PY)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Python compiles the few modules that it loads; pip would compile 8,400. It reads this as --no-compile = off.
+export PIP_NO_COMPILE := 0
 
 ENV_STAMP := $(VENV)/.cmfsim-env
 BUILD_STAMP := $(VENV)/.cmfsim-build
