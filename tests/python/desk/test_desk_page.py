@@ -17,6 +17,7 @@ from cmfsim.desk.server import desk_server
 from cmfsim.desk.session import Session
 from cmfsim.io.results.predictions import read_prediction
 from cmfsim.values.motion import plan_digits
+from shared_values import without_pictures
 
 pytest.importorskip("skimage")
 pytest.importorskip("starlette")
@@ -198,7 +199,11 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_ct_becomes_a_saved_plan_and_a_printed_page_by_clicks(browser, folder):
+def test_a_ct_becomes_a_saved_plan_and_a_printed_page_by_clicks(
+    browser, folder, tmp_path_factory, monkeypatch
+):
+    """Its report is without pictures; test_demo.py counts those of a report."""
+    without_pictures(monkeypatch, tmp_path_factory.mktemp("absent"))
     for person in serve(folder, browser):
         digits = plan_by_clicks(person, 240)
         page = person.page

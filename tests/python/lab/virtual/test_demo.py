@@ -92,7 +92,7 @@ def test_landmarks_after_without_any_before_are_not_used_and_that_is_stated(tmp_
 
 def test_the_face_is_as_good_as_with_the_exact_landmarks(tmp_path):
     """Both predictions against the truth, by the paper's distance through exact landmarks."""
-    made = write_demo_case(tmp_path / "new", edge_length=10.0)
+    made = write_demo_case(tmp_path / "new", edge_length=14.0)
     head, file = make_head(DEMO_PARAMETERS), made.case.file
     cmfsim.write_landmarks(file.parent / "skull.mrk.json", head.skull_landmarks)
     cmfsim.write_landmarks(file.parent / "skin.mrk.json", head.skin_landmarks)
