@@ -91,11 +91,11 @@ def real_head(data: Path, name: str) -> Head:
     return Head(name, bones, at)
 
 
-def synthetic_head(seed: int) -> Head:
-    """A head by formulas, drawn at random."""
+def synthetic_head(seed: int, spacing: float = 2.0) -> Head:
+    """A head by formulas, drawn at random; its triangles are as wide as the spacing, mm."""
     head = cmfsim.make_head(cmfsim.HeadParameters() if seed == 0 else drawn(seed))
     bones = {
-        bone: head.surface(part, spacing=2.0)
+        bone: head.surface(part, spacing=spacing)
         for bone, part in {"skull": "cranium", "mandible": "mandible"}.items()
     }
     return Head(f"synthetic {seed}", bones, dict(head.skull_landmarks))

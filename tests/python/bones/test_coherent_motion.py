@@ -24,7 +24,7 @@ from cmfsim.bones.pairs.paired_surfaces import AlongSurface
 @pytest.fixture(scope="module")
 def head():
     pytest.importorskip("skimage")
-    return synthetic_head(0)
+    return synthetic_head(0, spacing=3.0)
 
 
 def teeth(head, pair, label="supradentale"):
