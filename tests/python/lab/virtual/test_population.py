@@ -32,7 +32,7 @@ from cmfsim.values.calibration import PLAN
 
 SIZE = 400
 # What a test can afford: coarse tets, and a CT that no prediction will read.
-COARSE = {"edge_length": 9.0, "spacing": 8.0}
+COARSE = {"edge_length": 12.0, "spacing": 8.0}
 
 
 @pytest.fixture(scope="module")
