@@ -89,6 +89,13 @@ pub(crate) struct Round {
     pub links: Vec<Link>,
 }
 
+impl Round {
+    /// The force on candidate `i` at displacements `rows` of the unknown nodes, N; zero if nothing pushes it.
+    pub fn force(&self, i: usize, rows: &[[f64; 3]]) -> f64 {
+        self.number[i].map_or(0.0, |k| self.links[k as usize].pull(rows).max(0.0))
+    }
+}
+
 /// Residuals of a round.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Left {
@@ -101,11 +108,6 @@ pub(crate) struct Left {
 }
 
 impl Left {
-    /// The larger of penetration and gap, mm.
-    pub fn distance(&self) -> f64 {
-        self.penetration.max(self.gap)
-    }
-
     /// The larger of penetration of bone and gap, mm: where tissue meets tissue, the closest point of a node
     /// that has slid past the border of the other part may lie on its far side, and only deformed tets show
     /// whether it is inside.
@@ -305,7 +307,8 @@ impl Pairs {
         Some(Meeting { gap: distance - c.allowed, point: closest.point, normal, facing })
     }
 
-    /// The planes at displacements `u` of all nodes.
+    /// The planes at displacements `u` of all nodes under motions `from`, moved with the bones to motions `to`:
+    /// closest points are meaningless where a bone has moved into the tissue that follows it.
     ///
     /// # Errors
     /// A triangle of the tissue that has collapsed.
@@ -313,41 +316,19 @@ impl Pairs {
         &self,
         mesh: &TetMesh,
         u: &[[f64; 3]],
-        motions: &[&Motion],
-        touching: &Touching,
-    ) -> Result<Planes> {
-        let meetings = self.meetings(mesh, u, motions, &touching.gaps)?;
-        Ok(self.linearised(&meetings, u))
-    }
-
-    /// The planes at displacements `u` under motions `from`, moved with the bones to motions `to`: closest
-    /// points are meaningless where a bone has moved into the tissue that follows it.
-    ///
-    /// # Errors
-    /// A triangle of the tissue that has collapsed.
-    pub fn planes_ahead(
-        &self,
-        mesh: &TetMesh,
-        u: &[[f64; 3]],
         (from, to): (&[&Motion], &[&Motion]),
         touching: &Touching,
     ) -> Result<Planes> {
-        let mut meetings = self.meetings(mesh, u, from, &touching.gaps)?;
-        for (c, meeting) in self.candidates.iter().zip(&mut meetings) {
-            let Wall::Bone { segment: Some(s), .. } = &self.walls[c.wall] else { continue };
-            if let Some(meeting) = meeting {
+        let meetings = self.meetings(mesh, u, from, &touching.gaps)?;
+        let plane = |(c, meeting): (&Candidate, Option<Meeting>)| {
+            let mut meeting = meeting?;
+            if let Wall::Bone { segment: Some(s), .. } = &self.walls[c.wall] {
                 let place = add(self.positions[c.node as usize], u[c.node as usize]);
                 meeting.carry(from[*s], to[*s], place);
             }
-        }
-        Ok(self.linearised(&meetings, u))
-    }
-
-    fn linearised(&self, meetings: &[Option<Meeting>], u: &[[f64; 3]]) -> Planes {
-        let plane = |(c, meeting): (&Candidate, &Option<Meeting>)| {
-            meeting.as_ref().map(|m| Plane::new(c.node, m, u))
+            Some(Plane::new(c.node, &meeting, u))
         };
-        Planes { at: self.candidates.iter().zip(meetings).map(plane).collect() }
+        Ok(Planes { at: self.candidates.iter().zip(meetings).map(plane).collect() })
     }
 
     /// The round at displacements `u` of all nodes, prescribed ones at their target, with the forces of
@@ -386,14 +367,14 @@ impl Pairs {
         gap: impl Fn(&Plane) -> f64,
     ) -> Left {
         let mut left = Left { penetration: 0.0, in_bone: 0.0, gap: 0.0 };
-        for ((c, plane), number) in self.candidates.iter().zip(&planes.at).zip(&round.number) {
+        for (i, (c, plane)) in self.candidates.iter().zip(&planes.at).enumerate() {
             let Some(plane) = plane else { continue };
             let gap = gap(plane);
             left.penetration = left.penetration.max(-gap);
             if matches!(self.walls[c.wall], Wall::Bone { .. }) {
                 left.in_bone = left.in_bone.max(-gap);
             }
-            if number.is_some_and(|k| round.links[k as usize].pull(rows) > 0.0) {
+            if round.force(i, rows) > 0.0 {
                 left.gap = left.gap.max(gap);
             }
         }
@@ -411,14 +392,12 @@ impl Pairs {
     /// The nodes that touch at the end of `round`, at displacements `rows` of the unknown nodes about which
     /// `planes` are linearised.
     pub fn met(&self, planes: &Planes, round: &Round, rows: &[[f64; 3]]) -> Vec<Met> {
-        let force = |number: Option<u32>| {
-            number.map_or(0.0, |k| round.links[k as usize].pull(rows).max(0.0))
-        };
-        let each = self.candidates.iter().zip(&planes.at).zip(&round.number);
-        each.filter_map(|((c, plane), number)| {
+        let each = self.candidates.iter().zip(&planes.at).enumerate();
+        each.filter_map(|(i, (c, plane))| {
             let Plane { gap, normal, .. } = plane.as_ref()?;
             let is_bone = matches!(self.walls[c.wall], Wall::Bone { .. });
-            Some(Met { node: c.node, gap: *gap, normal: *normal, force: force(*number), is_bone })
+            let force = round.force(i, rows);
+            Some(Met { node: c.node, gap: *gap, normal: *normal, force, is_bone })
         })
         .collect()
     }
@@ -428,8 +407,8 @@ impl Touching {
     /// Updates the multipliers after `round` to the forces of its links at displacements `rows` of the unknown
     /// nodes.
     pub fn follow(&mut self, round: &Round, rows: &[[f64; 3]]) {
-        for (force, number) in self.multipliers.iter_mut().zip(&round.number) {
-            *force = number.map_or(0.0, |k| round.links[k as usize].pull(rows).max(0.0));
+        for (i, force) in self.multipliers.iter_mut().enumerate() {
+            *force = round.force(i, rows);
         }
     }
 }

@@ -23,7 +23,7 @@ pub(crate) struct Meeting {
 }
 
 /// The gap of a candidate about some state: g(u) = offset + Σ cⱼ·uⱼ.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct Plane {
     /// Gap at the state of linearisation, mm.
     pub gap: f64,
@@ -37,6 +37,8 @@ pub(crate) struct Plane {
     turn: f64,
     /// By how much the normal and the gap, mm, of the surface last differed from those of the plane.
     swing: ([f64; 3], f64),
+    /// Whether the candidate was beyond the border in a late round before.
+    came_back: bool,
 }
 
 impl Plane {
@@ -48,7 +50,7 @@ impl Plane {
             ends.extend((0..3).map(|k| (nodes[k], scaled(normal, -weights[k]))));
         }
         let here: f64 = ends.iter().map(|(j, c)| dot(*c, u[*j as usize])).sum();
-        Self { gap, normal, offset: gap - here, ends, turn: 1.0, swing: ([0.0; 3], 0.0) }
+        Self { gap, normal, offset: gap - here, ends, turn: 1.0, ..Self::default() }
     }
 
     /// Rotates the plane to another normal about the node positions under displacements `u`, with another gap
@@ -95,10 +97,23 @@ impl Planes {
     /// Damps planes that oscillate: if a surface lies alternately on either side of what the planes `before`
     /// predicted, the planes follow it by a smaller share. [`Plane::gap`] remains the gap that was found.
     ///
-    /// `u`: displacements of all nodes.
-    pub fn steady(&mut self, before: &Self, u: &[[f64; 3]]) {
-        for (now, before) in self.at.iter_mut().zip(&before.at) {
-            let (Some(now), Some(before)) = (now, before) else { continue };
+    /// A candidate that came back to its surface, and that its plane pushes beyond the border again, keeps that
+    /// plane for as long as it pushes: it would come back for ever. Losing a plane that does not push changes
+    /// nothing.
+    ///
+    /// `u`: displacements of all nodes. `pushes`: whether the plane of a candidate does.
+    pub fn steady(&mut self, before: &Self, u: &[[f64; 3]], pushes: impl Fn(usize) -> bool) {
+        for (i, (now, before)) in self.at.iter_mut().zip(&before.at).enumerate() {
+            let Some(before) = before else {
+                now.iter_mut().for_each(|now| now.came_back = true);
+                continue;
+            };
+            let Some(now) = now else {
+                let stays = before.came_back && pushes(i);
+                *now = stays.then(|| Plane { gap: before.at(u), ..before.clone() });
+                continue;
+            };
+            now.came_back = before.came_back;
             let foreseen = before.at(u);
             now.swing = (sub(now.normal, before.normal), now.gap - foreseen);
             let (turned, jumped) = before.swing;

@@ -207,15 +207,17 @@ impl TouchingPlan<'_> {
         let prescribed = self.body.prescribed(&motions)?;
         let b = self.forces(&prescribed, to);
         let goal = StepTarget { motions: &motions, prescribed: &prescribed, b: &b };
-        let ahead =
-            self.pairs.planes_ahead(self.mesh(), &pose.u, (&before, &motions), &pose.touching)?;
+        let planes = |pose: &PartialState, from: &[&Motion]| {
+            self.pairs.planes(self.mesh(), &pose.u, (from, &motions), &pose.touching)
+        };
+        let ahead = planes(pose, &before)?;
         let contact = self.carried(pose, &before, &motions);
         // Displacements are nearly proportional to the plan.
         let more = if from > 0.0 { to / from } else { 1.0 };
         let mut pose = pose.clone();
         pose.rows.iter_mut().for_each(|v| *v = scaled(*v, more));
         let (pose, rounds) = self.go_ahead(pose, &ahead, contact, &goal, solve)?;
-        let planes = self.pairs.planes(self.mesh(), &pose.u, &motions, &pose.touching)?;
+        let planes = planes(&pose, &motions)?;
         if planes.deepest() > DEEP_EDGES * self.pairs.mean_edge() {
             return Ok(None);
         }
@@ -273,13 +275,14 @@ impl TouchingPlan<'_> {
             let next = self.moved(&pose, rows, contact, goal);
             let change = largest_change(&pose.u, &next.u);
             pose = next;
-            let mut met = self.pairs.planes(self.mesh(), &pose.u, goal.motions, &pose.touching)?;
+            let motions = (goal.motions, goal.motions);
+            let mut met = self.pairs.planes(self.mesh(), &pose.u, motions, &pose.touching)?;
             if count > SHARP_ROUNDS {
-                met.steady(&planes, &pose.u);
+                met.steady(&planes, &pose.u, |i| round.force(i, &pose.rows) > 0.0);
             }
             let left = self.left(&met, &round, &pose);
             pose.touching.follow(&round, &pose.rows);
-            let near = left.distance() <= close && change <= STILL * close;
+            let near = left.penetration.max(left.gap) <= close && change <= STILL * close;
             let converged = near && !rough;
             let over = converged || count >= most || (near && !is_last);
             if over {
