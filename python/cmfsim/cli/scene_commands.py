@@ -6,7 +6,6 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,11 @@ from cmfsim.cli.terminal import Notices, StageProgress, escaped, open_page
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
 from cmfsim.lab.virtual.demo import DemoCase, write_demo_case
-from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import evaluate
 from cmfsim.pipeline.outputs.results import REPORT_STAGE, WrittenResults, write_results
-from cmfsim.pipeline.predicting import predict_models, prepare
+from cmfsim.pipeline.predicting import prepare
 from cmfsim.solving.simulation import solve_scene
 from cmfsim.values.finding import Finding
-from cmfsim.values.prediction import Prediction
 from cmfsim.values.progress import expected_stages
 from cmfsim.values.scene import Scene
 
@@ -142,7 +139,7 @@ def demo(options: argparse.Namespace) -> int:
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         progress.stage("making a head")
         made = write_demo_case(options.folder, edge_length=options.edge_length)
-        prepare(made.case, report=True, evaluation=made.truth is not None)
+        prepare(made.case, report=True, evaluation=True)
         written = _work(made, models, progress, notices)
     notices.found(written.findings)
     name = written.report
@@ -168,26 +165,21 @@ def demo(options: argparse.Namespace) -> int:
 def _work(
     made: DemoCase, models: tuple[str, ...], progress: StageProgress, notices: Notices
 ) -> WrittenResults:
-    """Predicts by each model, compares where the truth is known, and writes everything."""
-    case, found = made.case, None
-    predictions: Iterable[Prediction]
-    asked: BuildKeywords = {
-        "progress": progress.stage,
-        "check": False,
-        "anatomy": made.anatomy,
-        "on_findings": notices.found,
-    }
-    if made.truth is None:
-        predictions = predict_models(case, models, **asked)
-    else:
-        found = evaluate(case, models, **asked)
-        predictions = found.predictions
+    """Predicts by each model, compares with the truth, and writes everything."""
+    found = evaluate(
+        made.case,
+        models,
+        progress=progress.stage,
+        check=False,
+        anatomy=made.anatomy,
+        on_findings=notices.found,
+    )
     return write_results(
-        case.output,
-        predictions,
+        made.case.output,
+        found.predictions,
         models,
         stage=progress.stage,
-        evaluation=None if found is None else lambda: found,
+        evaluation=lambda: found,
         # The report shows the pictures of the last model alone.
         pictures=lambda model: model == models[-1],
     )

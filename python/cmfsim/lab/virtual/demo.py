@@ -6,11 +6,9 @@ mm; and `parameters`, a JSON text whose `head` names the `HeadParameters` that t
 `scripts/make_demo_truth.py` computes it, in silico.
 """
 
-import json
 import os
-import zipfile
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from cmfsim.lab.virtual.population import PATIENTS
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy
-from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
+from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.surface_data import SurfaceData
 
 CASE_TEXT = """\
@@ -95,7 +93,6 @@ def write_phantom_case(
 
 
 TRUTH_FILE = "demo_truth.npz"
-MEMBERS = ("vertices", "triangles", "landmark_names", "landmarks", "parameters")
 
 # A mandible that is long and a chin that is strong next to the average synthetic head (3 and 2 mm).
 DEMO_PATIENT = PATIENTS[1]
@@ -118,16 +115,14 @@ NOTE = (
     "chin follow the jaws; it is not one to operate by: the overjet grows from 2 to 10 mm. "
     "Skin, bones and airway are computed from the formulas that define the head, so nothing was "
     "scanned or segmented (cmfsim phantom writes a head with its CT). Landmarks are found "
-    "automatically, more accurately than on real heads. The tets are coarse, for speed."
-)
-IN_SILICO = (
-    " The post-operative face is computed as well, by other equations on a finer mesh with "
+    "automatically, more accurately than on real heads. The tets are coarse, for speed. "
+    "The post-operative face is computed as well, by other equations on a finer mesh with "
     "other muscles (in silico). Errors show how the models differ from it, not how accurate they "
     "are on patients."
 )
 CASE = """\
 {mark}
-# Change the plan, then run: cmfsim {command} case.toml
+# Change the plan, then run: cmfsim evaluate case.toml
 format = "cmfsim-case"
 version = 1
 name = "demo"
@@ -166,13 +161,11 @@ upper = {upper}
 [mesh]
 edge_length = {edge_length}
 
-{after}[output]
-folder = "out"
-"""
-AFTER = """\
 [postoperative]
 skin = "after.ply"
 
+[output]
+folder = "out"
 """
 
 
@@ -187,76 +180,32 @@ class DemoTruth:
     landmarks: Mapping[str, Floats]
 
 
-def read_demo_truth(head: Mapping[str, float], path: Path | None = None) -> DemoTruth | None:
-    """The face after the operation; None where the package holds none.
-
-    head: Parameters of the head that it must belong to.
-    path: Another archive than the package's own.
-    Raises `FileNotFoundError`: There is no file at `path`.
-    Raises `CaseError`: Not such an archive, or of another head.
-    """
-    if path is None:
-        own = files("cmfsim.lab.virtual").joinpath(TRUTH_FILE)
-        if not own.is_file():
-            return None
-        path = Path(str(own))
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            members = {name: archive[name] for name in MEMBERS if name in archive.files}
-    except (zipfile.BadZipFile, ValueError, EOFError) as error:
-        raise CaseInputError(f"{path}: is not an archive of arrays ({error})") from error
-    missing = [name for name in MEMBERS if name not in members]
-    if missing:
-        raise CaseInputError(f"{path}: lacks {', '.join(missing)}")
-    _check_head(path, str(members["parameters"]), head)
-    vertices = as_rows(f"{path.name}: vertices", members["vertices"], 3)
-    triangles = as_index_rows(
-        f"{path.name}: triangles", members["triangles"], 3, len(vertices), "vertices"
-    )
-    places = as_rows(f"{path.name}: landmarks", members["landmarks"], 3)
-    names = [str(name) for name in members["landmark_names"]]
-    if len(names) != len(places):
-        raise CaseInputError(f"{path}: has {len(places)} landmarks, but {len(names)} names")
-    return DemoTruth(SurfaceData(vertices, triangles), dict(zip(names, places, strict=True)))
-
-
-def _check_head(path: Path, text: str, head: Mapping[str, float]) -> None:
-    """Refuses the face of another person."""
-    try:
-        given = json.loads(text)["head"]
-        same = {name: float(value) for name, value in given.items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise CaseInputError(f"{path}: parameters do not describe a head ({error})") from error
-    for name, value in head.items():
-        if same.get(name) != float(value):
-            raise CaseInputError(
-                f"{path}: is the face of another head: {name} is {same.get(name)}, not {value:g}; "
-                "create it again (scripts/make_demo_truth.py)"
-            )
+def read_demo_truth() -> DemoTruth:
+    """The face after the operation, of the head of `DEMO_PARAMETERS`."""
+    with (
+        files("cmfsim.lab.virtual").joinpath(TRUTH_FILE).open("rb") as file,
+        np.load(file, allow_pickle=False) as archive,
+    ):
+        skin = SurfaceData(archive["vertices"], archive["triangles"])
+        names = (str(name) for name in archive["landmark_names"])
+        return DemoTruth(skin, dict(zip(names, archive["landmarks"], strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
 class DemoCase:
-    """The embedded case on disk, with the anatomy that its surfaces were made from.
-
-    truth: None where the package holds no face after the operation.
-    """
+    """The embedded case on disk, with the anatomy that its surfaces were made from."""
 
     case: Case
     anatomy: Anatomy
-    truth: DemoTruth | None
+    truth: DemoTruth
 
 
-def write_demo_case(
-    folder: str | os.PathLike[str], *, edge_length: float = 6.0, truth: Path | None = None
-) -> DemoCase:
+def write_demo_case(folder: str | os.PathLike[str], *, edge_length: float = 6.0) -> DemoCase:
     """The embedded case, written as `case.toml` with surfaces, and without any landmark.
 
     folder: Made if it is not there; empty, or an earlier demo's.
     edge_length: mm, of the tets.
-    truth: An archive with the face after the operation, instead of the package's own.
-    Raises `CaseError`: A folder with other files in it; an archive of another head; scikit-image is
-        missing.
+    Raises `CaseError`: A folder with other files in it; scikit-image is missing.
     Raises `OSError`: The folder cannot be made or written to.
 
     Examples
@@ -268,18 +217,17 @@ def write_demo_case(
     edge_length = as_positive("edge length", edge_length)
     folder = Path(folder)
     _check_folder(folder)
-    after = read_demo_truth(asdict(DEMO_PARAMETERS), truth)
+    after = read_demo_truth()
     head = make_head(DEMO_PARAMETERS)
     anatomy = head.anatomy(float(np.clip(edge_length / VOXELS_PER_EDGE, *VOXEL_BOUNDS)))
     folder.mkdir(parents=True, exist_ok=True)
     # First, so that a run that stops here leaves a folder that the next one knows.
     with replacing(folder / "case.toml") as file:
-        file.write(_case_text(head, edge_length, after).encode())
+        file.write(_case_text(head, edge_length).encode())
     options = SurfaceOptions(max_triangles=MOST_TRIANGLES, smoothing=0)
     for name, level in {"skin": anatomy.skin, **anatomy.bones}.items():
         write_surface(folder / f"{name}.ply", surface_of_level(name, level, options))
-    if after is not None:
-        write_surface(folder / "after.ply", after.skin)
+    write_surface(folder / "after.ply", after.skin)
     return DemoCase(Case.load(folder / "case.toml"), anatomy, after)
 
 
@@ -296,17 +244,15 @@ def _check_folder(folder: Path) -> None:
         )
 
 
-def _case_text(head: PhantomHead, edge_length: float, after: DemoTruth | None) -> str:
+def _case_text(head: PhantomHead, edge_length: float) -> str:
     centre = [round(float(x), 3) for x in head.skull_landmarks[MAXILLA.centre]]
     return CASE.format(
         mark=MARK,
-        command="predict" if after is None else "evaluate",
-        note=NOTE if after is None else NOTE + IN_SILICO,
+        note=NOTE,
         maxilla=list(MAXILLA.translation),
         turn=MAXILLA.angle,
         centre=centre,
         mandible=list(MANDIBLE.translation),
         upper=TISSUE_TOP,
         edge_length=edge_length,
-        after="" if after is None else AFTER,
     )
