@@ -1,19 +1,18 @@
-"""A coarse synthetic head with sliding tissue, built for planning: some ten seconds."""
+"""A coarse synthetic head with sliding tissue, for planning."""
 
 from pathlib import Path
 
+import pytest
+
 import cmfsim
 from cmfsim.lab.virtual.demo import write_demo_case
-from cmfsim.pipeline.building.stages import BuildOptions
-from cmfsim.pipeline.predicting import build_patient
-
-EDGE = 14.0
+from shared_values import COARSE_EDGE, coarse_demo_patient
 
 
-def planning_patient(folder: Path) -> cmfsim.PatientModel:
-    """The patient of the embedded case on a coarse mesh, without muscles."""
-    made = write_demo_case(folder, edge_length=EDGE)
-    return build_patient(made.case, ("H+S",), BuildOptions(anatomy=made.anatomy, check=False))
+def planning_patient(folder: Path, temporary: pytest.TempPathFactory) -> cmfsim.PatientModel:
+    """The patient of the embedded case on a coarse mesh, whose files are written into a folder."""
+    write_demo_case(folder, edge_length=COARSE_EDGE)
+    return coarse_demo_patient(temporary)
 
 
 def other_plan(planning, size=1.0):

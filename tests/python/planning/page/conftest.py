@@ -15,8 +15,8 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def bare(folder):
-    return cmfsim.planning_model(planning_patient(folder / "case"), "H+S")
+def bare(folder, tmp_path_factory):
+    return cmfsim.planning_model(planning_patient(folder / "case", tmp_path_factory), "H+S")
 
 
 @pytest.fixture(scope="session")
