@@ -2,7 +2,6 @@
 
 import importlib
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,6 +28,15 @@ def scans():
         patch.setattr(heads, "SPACING", 0.6)
         upper, lower = heads.rows_of(cmfsim.make_head())
     return heads.scan_of(upper, FRAME), heads.scan_of(lower, FRAME @ BITE)
+
+
+def coarse_case(folder, temporary):
+    """The path of a case of the head; its voxels and tets are coarse, its surfaces are not."""
+    levels = shared_values.drawn_levels(temporary, 2.0)
+    path = phantom_case.surface_case(folder, cmfsim.make_head(), levels)
+    text = path.read_text(encoding="utf-8").replace("edge_length = 7.0", "edge_length = 14.0")
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
 def moved(surface, motion):
@@ -103,8 +111,7 @@ def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
         return kept[0]
 
     monkeypatch.setattr("cmfsim.pipeline.planning.planned_head", head_of)
-    levels = shared_values.drawn_levels(tmp_path_factory, 2.0)
-    case = phantom_case.surface_case(tmp_path, cmfsim.make_head(), levels)
+    case = coarse_case(tmp_path, tmp_path_factory)
     words = ["bite", str(case), "--json", "-q", "--no-doctor"]
     for jaw, scan in zip(("upper", "lower"), scans, strict=True):
         cmfsim.write_surface(tmp_path / f"{jaw}_scan.stl", scan)
@@ -132,8 +139,7 @@ def test_the_command_writes_a_plan_in_which_the_lower_jaw_follows(
 def test_a_case_states_how_far_its_plan_is_from_the_bite_of_its_scans(
     scans, tmp_path, tmp_path_factory, capsys
 ):
-    levels = shared_values.drawn_levels(tmp_path_factory, 2.0)
-    case = phantom_case.surface_case(tmp_path, cmfsim.make_head(), levels)
+    case = coarse_case(tmp_path, tmp_path_factory)
     text = case.read_text(encoding="utf-8")
     for jaw, scan in zip(("upper", "lower"), scans, strict=True):
         cmfsim.write_surface(tmp_path / f"{jaw}_scan.stl", scan)
@@ -146,7 +152,6 @@ def test_a_case_states_how_far_its_plan_is_from_the_bite_of_its_scans(
     assert main(words) == 0
     file = json.loads(capsys.readouterr().out)["file"]
     given = cmfsim.Case.load(case)
-    given = replace(given, mesh=replace(given.mesh, edge_length=14.0))
     first = cmfsim.predict(given, model="H", check=False)
     target = first.patient.summary["target_bite"]
     places = np.array(target["places"])
