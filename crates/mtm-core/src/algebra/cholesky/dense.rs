@@ -5,7 +5,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::lifting::{Liftable, Lifted, LowRank};
-use super::symmetric::{DenseSymmetric, Rough};
+use super::symmetric::{DenseSymmetric, Number, Rough};
 use crate::algebra::simd::{Kernel, widest};
 use crate::error::{MtmError, Result};
 
@@ -102,9 +102,14 @@ impl TailFlexibility {
         Ok(vectors(&lifted.pushes((sliding.as_flattened(), own.as_flattened()), flat)?))
     }
 
-    /// What lifted nodes add to the flexibility between `directions`: node and unit vector each.
-    pub fn more_along(&self, directions: &[(usize, [f64; 3])]) -> Option<LowRank> {
-        self.lifted.as_ref().map(|lifted| lifted.more.along(directions))
+    /// What lifted nodes add to the flexibility between `directions`, node and unit vector each, in numbers that
+    /// `narrow` makes.
+    pub fn more_along<T: Number>(
+        &self,
+        directions: &[(usize, [f64; 3])],
+        narrow: impl Fn(f64) -> T,
+    ) -> Option<LowRank<T>> {
+        self.lifted.as_ref().map(|lifted| lifted.more.along(directions, narrow))
     }
 
     /// The displacements `moved` with what lifted nodes add under `forces`.
@@ -156,7 +161,7 @@ impl TailFlexibility {
         softness: &[f64],
     ) -> DenseSymmetric {
         let directions: Vec<_> = nodes.iter().copied().zip(normals.iter().copied()).collect();
-        let more = self.more_along(&directions).map(|more| more.product());
+        let more = self.more_along(&directions, |v| v).map(|more| more.product());
         DenseSymmetric::from_columns(nodes.len(), |c, column| {
             let (j, n_j) = (nodes[c], normals[c]);
             // S⁻¹ n_j for node j and those after it. The columns begin on the diagonal, and the part of the

@@ -12,9 +12,11 @@ use std::sync::Arc;
 
 use faer::linalg::matmul::matmul;
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
-use faer::{Accum, Mat, MatMut, MatRef, Par};
+use faer::{Accum, Mat, MatMut, MatRef};
 
-use super::symmetric::{DenseFactor, DenseSymmetric, add_scaled, dot};
+use super::symmetric::{
+    COLUMNS_AT_ONCE as AT_ONCE, DenseFactor, DenseSymmetric, DotsAndAdd, Number, add_scaled, dot,
+};
 use super::workspace::parallelism;
 
 /// X and H of all rows that may be held.
@@ -82,22 +84,19 @@ impl Lifted {
             }
         });
         let factor = matrix.factor().map_err(|at| free[at] / 3)?;
-        let (rank, count) = (free.len(), all.width);
-        let mut columns: Vec<f64> = (0..all.width)
-            .flat_map(|s| free.iter().map(move |&l| (l, s)))
-            .map(|(l, s)| all.row(l)[s])
-            .collect();
-        if !columns.is_empty() {
-            let rows = MatMut::from_column_major_slice_mut(&mut columns, rank, all.width);
-            solve_lower_triangular_in_place(factor.lower(), rows, parallelism(all.width));
+        let mut rows: Vec<f64> = free.iter().flat_map(|&l| all.row(l)).copied().collect();
+        if !rows.is_empty() {
+            let v = MatMut::from_row_major_slice_mut(&mut rows, free.len(), all.width);
+            solve_lower_triangular_in_place(factor.lower(), v, parallelism(all.width));
         }
-        Ok(Self { all, free, held, factor, more: LowRank { rank, count, columns } })
+        let more = LowRank::new(all.width, rows);
+        Ok(Self { all, free, held, factor, more })
     }
 
     /// Bytes held.
     pub fn bytes(&self) -> usize {
         let Liftable { carried, stiffness, .. } = &*self.all;
-        8 * (self.more.columns.len() + carried.len() + stiffness.len()) + self.factor.bytes()
+        8 * (self.more.rows.len() + carried.len() + stiffness.len()) + self.factor.bytes()
     }
 
     /// Forces on S and L that bring the body from a state in which all of L is free, with displacements `sliding`
@@ -132,47 +131,64 @@ impl Lifted {
     }
 }
 
-/// Vᵀ V, for the columns of V one after the other.
-pub struct LowRank {
-    rank: usize,
+/// Vᵀ V, for V row by row: a product reads each row once.
+pub struct LowRank<T = f64> {
     /// Number of columns.
     count: usize,
-    columns: Vec<f64>,
+    /// Filled up with zeros to whole blocks of rows.
+    rows: Vec<T>,
 }
 
-impl LowRank {
-    fn column(&self, c: usize) -> &[f64] {
-        &self.columns[c * self.rank..(c + 1) * self.rank]
-    }
-
-    fn matrix(&self) -> MatRef<'_, f64> {
-        MatRef::from_column_major_slice(&self.columns, self.rank, self.count)
+impl<T: Number> LowRank<T> {
+    fn new(count: usize, mut rows: Vec<T>) -> Self {
+        rows.resize(rows.len().next_multiple_of((count * AT_ONCE).max(1)), T::default());
+        Self { count, rows }
     }
 
     /// y ← y + Vᵀ V x.
-    pub fn add_product(&self, x: &[f64], y: &mut [f64]) {
-        let (x, rows) = (MatRef::from_column_major_slice(x, x.len(), 1), y.len());
-        let y = MatMut::from_column_major_slice_mut(y, rows, 1);
-        let mut sum = Mat::zeros(self.rank, 1);
-        matmul(sum.as_mut(), Accum::Replace, self.matrix(), x, 1.0, Par::Seq);
-        matmul(y, Accum::Add, self.matrix().transpose(), sum.as_ref(), 1.0, Par::Seq);
-    }
-
-    /// The same between directions: a node of S and a unit vector each.
-    pub fn along(&self, directions: &[(usize, [f64; 3])]) -> Self {
-        let mut columns = Vec::with_capacity(self.rank * directions.len());
-        for &(node, [x, y, z]) in directions {
-            let [a, b, c] = [0, 1, 2].map(|axis| self.column(3 * node + axis));
-            columns.extend((0..self.rank).map(|r| x * a[r] + y * b[r] + z * c[r]));
+    pub fn add_product(&self, x: &[T], y: &mut [T]) {
+        for rows in self.rows.chunks_exact((self.count * AT_ONCE).max(1)) {
+            let a = std::array::from_fn(|k| &rows[k * self.count..(k + 1) * self.count]);
+            let none = [T::default(); AT_ONCE];
+            let weights = T::dots_and_add(DotsAndAdd { a, x, weights: none, y: &mut *y });
+            T::dots_and_add(DotsAndAdd { a, x, weights, y: &mut *y });
         }
-        Self { rank: self.rank, count: directions.len(), columns }
+    }
+}
+
+impl LowRank<f32> {
+    /// y ← y + Vᵀ V x to six or seven digits.
+    pub fn add_roughly(&self, x: &[f64], y: &mut [f64]) {
+        let largest = x.iter().fold(f64::MIN_POSITIVE, |m, v| m.max(v.abs()));
+        let x: Vec<f32> = x.iter().map(|v| (v / largest) as f32).collect();
+        let mut more = vec![0.0; y.len()];
+        self.add_product(&x, &mut more);
+        y.iter_mut().zip(more).for_each(|(y, v)| *y += f64::from(v) * largest);
+    }
+}
+
+impl LowRank {
+    /// The same between directions, a node of S and a unit vector each, in numbers that `narrow` makes.
+    pub fn along<T: Number>(
+        &self,
+        directions: &[(usize, [f64; 3])],
+        narrow: impl Fn(f64) -> T,
+    ) -> LowRank<T> {
+        let mut rows = Vec::with_capacity(self.rows.len() / self.count.max(1) * directions.len());
+        for row in self.rows.chunks_exact(self.count.max(1)) {
+            rows.extend(
+                directions.iter().map(|&(node, way)| narrow(dot(&row[3 * node..][..3], &way))),
+            );
+        }
+        LowRank::new(directions.len(), rows)
     }
 
     /// Vᵀ V itself.
     pub fn product(&self) -> Mat<f64> {
-        let v = self.matrix();
-        let mut out = Mat::zeros(v.ncols(), v.ncols());
-        matmul(out.as_mut(), Accum::Replace, v.transpose(), v, 1.0, parallelism(v.ncols()));
+        let rank = self.rows.len() / self.count.max(1);
+        let v = MatRef::from_row_major_slice(&self.rows, rank, self.count);
+        let mut out = Mat::zeros(self.count, self.count);
+        matmul(out.as_mut(), Accum::Replace, v.transpose(), v, 1.0, parallelism(self.count));
         out
     }
 }

@@ -21,7 +21,7 @@ const PARTS: usize = 16;
 pub const ROWS_TO_SHARE: usize = 512;
 /// Columns that a product processes at once: one by one, it would spend more time on its vectors than on the
 /// matrix.
-const COLUMNS_AT_ONCE: usize = 4;
+pub(super) const COLUMNS_AT_ONCE: usize = 4;
 /// Independent sums in a scalar product: the width of two vector registers.
 const SUMS: usize = 8;
 
@@ -347,10 +347,10 @@ pub(super) fn add_scaled(a: &[f64], weight: f64, y: &mut [f64]) {
 /// Adds Σ `weights` · `a` to `y` and returns each aᵀx, in one pass over all: x and y are read once for all
 /// four.
 pub struct DotsAndAdd<'a, T> {
-    a: [&'a [T]; COLUMNS_AT_ONCE],
-    x: &'a [T],
-    weights: [T; COLUMNS_AT_ONCE],
-    y: &'a mut [T],
+    pub(super) a: [&'a [T]; COLUMNS_AT_ONCE],
+    pub(super) x: &'a [T],
+    pub(super) weights: [T; COLUMNS_AT_ONCE],
+    pub(super) y: &'a mut [T],
 }
 
 impl<T: Number> DotsAndAdd<'_, T> {

@@ -12,7 +12,7 @@ pub(super) struct Along {
     /// With the directions in the order of their nodes.
     matrix: Rough,
     /// What lifted nodes add to it.
-    more: Option<LowRank>,
+    more: Option<LowRank<f32>>,
     /// The direction at each of its rows.
     order: Vec<usize>,
 }
@@ -31,7 +31,7 @@ impl Along {
         let sorted: Vec<(usize, [f64; 3])> = order.iter().map(|&i| directions[i]).collect();
         let soft = |i: usize| rows.softness.get(i).copied().unwrap_or(0.0);
         let softness: Vec<f64> = order.iter().map(|&i| soft(i)).collect();
-        let more = tail.more_along(&sorted);
+        let more = tail.more_along(&sorted, |v| v as f32);
         Self { matrix: tail.rough_flexibility(&sorted, &softness, memory), more, order }
     }
 
@@ -41,7 +41,7 @@ impl Along {
             self.order.iter().map(|&i| forces.get(i).copied().unwrap_or(0.0)).collect();
         let mut moved = self.matrix.multiply(&sorted);
         if let Some(more) = &self.more {
-            more.add_product(&sorted, &mut moved);
+            more.add_roughly(&sorted, &mut moved);
         }
         let mut out = vec![0.0; moved.len()];
         for (&i, v) in self.order.iter().zip(moved) {
