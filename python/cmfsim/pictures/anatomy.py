@@ -16,7 +16,7 @@ from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import AnyPath, Floats, as_index_rows, as_rows
 from cmfsim.values.musculature import MuscleSurface, Musculature
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, joined_surface
 from cmfsim.values.touching import LipRegion
 
 SKIN_COLOUR = "#e3b7a0"
@@ -252,9 +252,8 @@ def picture_muscles(
     def paint(plotter: Any, _: View) -> None:
         if skull is not None:
             shown.add(plotter, "skull", partial(add_bones, plotter, skull))
-        for muscle, drawn in zip(musculature, lines, strict=True):
-            make = partial(add_muscle, plotter, muscle, colours[without_side(muscle.name)])
-            shown.add(plotter, f"muscle {muscle.name}", make)
+        shown.add(plotter, "muscles", partial(_add_muscles, plotter, musculature, colours))
+        for drawn in lines:
             if drawn is not None:
                 strokes, edges, colour = drawn
                 plotter.add_lines(strokes, color=LINE_COLOUR, width=2)
@@ -273,10 +272,18 @@ def add_bones(plotter: Any, skull: SurfaceData) -> Any:
     return plotter.add_mesh(shape, color=BONE_COLOUR, smooth_shading=True)
 
 
-def add_muscle(plotter: Any, muscle: MuscleSurface, colour: str) -> Any:
-    """The actor of a muscle, added in a colour to a view."""
-    shape = polydata(muscle.surface.vertices, muscle.surface.triangles)
-    return plotter.add_mesh(shape, color=colour, smooth_shading=True, ambient=0.15)
+def _add_muscles(plotter: Any, muscles: Musculature, colours: Mapping[str, str]) -> Any:
+    """The actor of all muscles, added to a view: one surface with the colour of each."""
+    joined = joined_surface([muscle.surface for muscle in muscles])
+    shape = polydata(joined.vertices, joined.triangles)
+    own = [_rgb(colours[without_side(muscle.name)]) for muscle in muscles]
+    counts = [len(muscle.surface.vertices) for muscle in muscles]
+    shape.point_data["colour"] = np.repeat(np.array(own, dtype=np.uint8), counts, axis=0)
+    return plotter.add_mesh(shape, scalars="colour", rgb=True, smooth_shading=True, ambient=0.15)
+
+
+def _rgb(colour: str) -> list[int]:
+    return [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
 
 
 def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:

@@ -76,8 +76,9 @@ def picture_lateral(
     def paint(figure: Any) -> None:
         panels = figure.subplots(1, 2, subplot_kw={"xlim": window[0], "ylim": window[1]})
         figure.get_layout_engine().set(w_pad=0.02, h_pad=0.04, wspace=0.0)
-        _panel(panels[0], before, BEFORE, window)
-        _panel(panels[1], planned, PLANNED, window)
+        shells: dict[bytes, Floats] = {}
+        _panel(panels[0], before, BEFORE, window, shells)
+        _panel(panels[1], planned, PLANNED, window, shells)
         _trace(panels[1], before, BEFORE, 0.6)
         panels[0].set_title("before", size=LETTERS + 1.0, color=BEFORE)
         panels[1].set_title("planned, over before", size=LETTERS + 1.0, color=PLANNED)
@@ -85,10 +86,19 @@ def picture_lateral(
     write_figure(Path(path), PANELS, paint, dpi=DPI)
 
 
-def _panel(panel: Any, view: LateralView, colour: str, window: Floats) -> None:
-    """Draws one head with its tracing, sites and planes."""
-    depth = SKIN * _shells([view.skin], view.axes, window)
-    depth = depth + BONE * _shells([*view.bones.values()], view.axes, window)
+def _panel(
+    panel: Any, view: LateralView, colour: str, window: Floats, shells: dict[bytes, Floats]
+) -> None:
+    """Draws one head with its tracing, sites and planes.
+
+    shells: By their vertices: most bone is the same in both panels.
+    """
+    depth = 0.0
+    for surface in (view.skin, *view.bones.values()):
+        place = surface.vertices.tobytes()
+        if place not in shells:
+            shells[place] = _shells(surface, view.axes, window)
+        depth = depth + (SKIN if surface is view.skin else BONE) * shells[place]
     extent = [*window[0], *window[1]]
     panel.imshow(
         np.exp(-depth), cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent,
@@ -160,27 +170,26 @@ def _section(surface: SurfaceData, axes: Floats, middle: float) -> Floats:
     return cut
 
 
-def _shells(surfaces: list[SurfaceData], axes: Floats, window: Floats) -> Floats:
-    """The area of surfaces in front of each pixel, in areas of a pixel, from below upwards."""
+def _shells(surface: SurfaceData, axes: Floats, window: Floats) -> Floats:
+    """The area of a surface in front of each pixel, in areas of a pixel, from below upwards."""
     across, high = (int(size) for size in np.ceil(np.ptp(window, axis=1) / PIXEL))
     total = np.zeros(high * across)
-    for surface in surfaces:
-        corners = surface.vertices[surface.triangles]
-        edges = corners[:, 1:] - corners[:, :1]
-        areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-        flat = (corners @ axes[:2].T - window[:, 0]) / PIXEL
-        longest = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2).max(axis=1)
-        # Each triangle as points closer to each other than pixels are, with their share of it.
-        parts = np.ceil(2.0 * longest).astype(int).clip(1)
-        for count in np.unique(parts).tolist():
-            own = parts == count
-            shares = _lattice(count)
-            points = (shares @ flat[own].transpose(1, 0, 2).reshape(3, -1)).reshape(-1, 2)
-            weights = np.tile(areas[own] / len(shares), len(shares))
-            column, row = np.floor(points).astype(np.int64).T
-            inside = (column >= 0) & (column < across) & (row >= 0) & (row < high)
-            places = (row * across + column)[inside]
-            total += np.bincount(places, weights[inside], minlength=len(total))
+    corners = surface.vertices[surface.triangles]
+    edges = corners[:, 1:] - corners[:, :1]
+    areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    flat = (corners @ axes[:2].T - window[:, 0]) / PIXEL
+    longest = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2).max(axis=1)
+    # Each triangle as points closer to each other than pixels are, with their share of it.
+    parts = np.ceil(2.0 * longest).astype(int).clip(1)
+    for count in np.unique(parts).tolist():
+        own = parts == count
+        shares = _lattice(count)
+        points = (shares @ flat[own].transpose(1, 0, 2).reshape(3, -1)).reshape(-1, 2)
+        weights = np.tile(areas[own] / len(shares), len(shares))
+        column, row = np.floor(points).astype(np.int64).T
+        inside = (column >= 0) & (column < across) & (row >= 0) & (row < high)
+        places = (row * across + column)[inside]
+        total += np.bincount(places, weights[inside], minlength=len(total))
     return total.reshape(high, across) / PIXEL**2
 
 

@@ -29,7 +29,7 @@ def ball(radius, centre=(0.0, 0.0, 0.0)):
 
 def test_a_shell_absorbs_by_its_area_in_front_of_each_pixel():
     # A sphere of radius r has 2 r / sqrt(r² - d²) of its area in front of a place at distance d.
-    found = _shells([ball(30.0)], AXES, np.array([[-36.0, 36.0], [-36.0, 36.0]]))
+    found = _shells(ball(30.0), AXES, np.array([[-36.0, 36.0], [-36.0, 36.0]]))
     # Nothing is lost: the area of the sphere.
     assert found.sum() * PIXEL**2 == pytest.approx(4.0 * np.pi * 30.0**2, rel=3e-3)
     # Single pixels hold a whole number of points: means of five by five of them.
