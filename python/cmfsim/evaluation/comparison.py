@@ -13,7 +13,15 @@ from cmfsim.errors import CaseInputError, LandmarkError, LandmarkInputError, Reg
 from cmfsim.evaluation.regions import Matches, Skin, match_skins, skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
-from cmfsim.values.checks import Floats, as_indices, as_positive, as_rows, check_one_of, frozen
+from cmfsim.values.checks import (
+    Floats,
+    as_indices,
+    as_positive,
+    as_rows,
+    brief,
+    check_one_of,
+    frozen,
+)
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
@@ -92,6 +100,8 @@ class SkinComparison:
     back_border: int
     back_far: int
     findings: tuple[Finding, ...]
+
+    __repr__ = brief
 
     @property
     def mean(self) -> float:

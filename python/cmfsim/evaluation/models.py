@@ -22,7 +22,7 @@ from cmfsim.evaluation.statistics import (
     wilcoxon_test,
 )
 from cmfsim.surfaces.depth import moved_outward
-from cmfsim.values.checks import Floats, as_rows, as_text, check_one_of, frozen
+from cmfsim.values.checks import Floats, as_rows, as_text, brief, check_one_of, frozen
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 
@@ -94,6 +94,8 @@ class ModelComparison:
     statistics: Mapping[str, DistanceStatistics]
     regions: Mapping[str, Mapping[str, DistanceStatistics]]
     improvements: Mapping[str, Mapping[str, Improvement]]
+
+    __repr__ = brief
 
     @property
     def models(self) -> tuple[str, ...]:

@@ -117,8 +117,8 @@ def _panel(
             side = -3.0 if name in BONE_SITES else 3.0
             _write(panel, view.sites[name], name, colour, (side, RAISED.get(name, 0.0)))
     x, y = window[0][0] + 4.0, window[1][0] + 5.0
-    for colour, width in (("white", 4.5), ("black", 1.5)):
-        panel.plot([x, x + SCALE], [y, y], color=colour, linewidth=width, solid_capstyle="butt")
+    for ink, width in (("white", 4.5), ("black", 1.5)):
+        panel.plot([x, x + SCALE], [y, y], color=ink, linewidth=width, solid_capstyle="butt")
     words = f"{SCALE:g} mm, not enlarged"
     _write(panel, np.array([x + SCALE, y]), words, "black", (3.0, 0.0))
     panel.set_axis_off()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.crossings import crossing_pairs
 from cmfsim.surfaces.topology import Edges, component_labels, edges_of, orientation_flips
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, brief
 from cmfsim.values.surface_data import SurfaceData
 
 # Largest coordinate for which areas and volumes stay finite, mm.
@@ -105,6 +105,8 @@ class SurfaceReport:
     components: tuple[Component, ...]
     crossings: NDArray[np.int64] | None = None
     crossing_points: Floats | None = None
+
+    __repr__ = brief
 
     @property
     def is_closed(self) -> bool:

@@ -17,6 +17,7 @@ from cmfsim.values.checks import (
     as_number,
     as_point,
     as_text,
+    brief,
     check_instance,
     check_one_of,
     keep,
@@ -53,6 +54,8 @@ class Anatomy(Frozen):
     teeth: ImageData | None = None
     findings: tuple[Finding, ...] = ()
     surfaces: Mapping[str, SurfaceData] = field(default_factory=dict)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         check_instance("skin", self.skin, ImageData)

@@ -9,6 +9,7 @@ import copyreg
 import difflib
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from types import MappingProxyType
 from typing import Any, cast
 
@@ -20,6 +21,8 @@ from cmfsim.errors import CaseInputError
 AnyPath = str | os.PathLike[str]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.uint32]
+# Most numbers of an array, and letters of a line, that a representation shows.
+FEW, LINE = 9, 120
 
 
 class Frozen:
@@ -43,6 +46,23 @@ def listing(title: str, rows: Mapping[str, str]) -> str:
     shown = {name: text for name, text in rows.items() if text}
     width = max((len(name) for name in shown), default=0)
     return "\n".join([title, *(f"  {name:<{width}}  {text}" for name, text in shown.items())])
+
+
+def brief(value: Any) -> str:
+    """The representation of a value of many numbers: its fields, arrays by their shapes."""
+    shown = {f.name: _brief(getattr(value, f.name)) for f in fields(value)}
+    return listing(type(value).__name__, shown)
+
+
+def _brief(entry: Any) -> str:
+    if isinstance(entry, np.ndarray) and entry.size > FEW:
+        return f"{entry.shape} {entry.dtype}"
+    if isinstance(entry, Mapping):
+        return ", ".join(map(str, entry))
+    text = repr(entry).split("\n")[0]
+    if isinstance(entry, tuple) and len(text) > LINE:
+        return f"{len(entry)} of {type(entry[0]).__name__}"
+    return text if len(text) <= LINE else f"{text[:LINE]}…"
 
 
 def frozen_mapping(items: Mapping[Any, Any]) -> Mapping[Any, Any]:

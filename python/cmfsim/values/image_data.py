@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, Frozen, as_point, as_rows, as_unmasked, keep
+from cmfsim.values.checks import Floats, Frozen, as_point, as_rows, as_unmasked, brief, keep
 
 # Points that are looked up at a time.
 AT_A_TIME = 8192
@@ -43,6 +43,8 @@ class ImageData(Frozen):
     values: NDArray[Any]
     spacing: Floats
     origin: Floats
+
+    __repr__ = brief
 
     def __init__(
         self, values: NDArray[Any], spacing: ArrayLike, origin: ArrayLike = (0.0, 0.0, 0.0)

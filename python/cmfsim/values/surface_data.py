@@ -10,7 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, Frozen, Indices, as_index_rows, as_number, as_rows, keep
+from cmfsim.values.checks import (
+    Floats,
+    Frozen,
+    Indices,
+    as_index_rows,
+    as_number,
+    as_rows,
+    brief,
+    keep,
+)
 
 
 def used_nodes(cells: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -49,6 +58,8 @@ class SurfaceData(Frozen):
     vertices: Floats
     triangles: Indices
     crease_angle: float
+
+    __repr__ = brief
 
     def __init__(
         self, vertices: ArrayLike, triangles: ArrayLike, crease_angle: float = 60.0

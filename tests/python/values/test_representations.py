@@ -66,3 +66,13 @@ def test_a_case_shows_its_file_inputs_and_plan(tmp_path, tmp_path_factory):
     assert str(path) in text
     assert "skin" in text
     assert all(name in text for name in case.plan)
+
+
+def test_surfaces_images_and_comparisons_show_the_shapes_of_their_arrays(tmp_path_factory):
+    levels = drawn_levels(tmp_path_factory, 6.0)
+    anatomy = cmfsim.Anatomy(skin=levels.skin, bones=levels.bones)
+    assert "cranium, mandible" in "\n".join(lines_of(anatomy))
+    assert f"{anatomy.skin.values.shape} float32" in repr(anatomy.skin)
+    head = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]] * 5, [[0, 1, 2]])
+    assert "vertices      (15, 3) float64" in lines_of(head)[1]
+    assert max(map(len, repr(cmfsim.check_surface(head)).splitlines())) < 250
