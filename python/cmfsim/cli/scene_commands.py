@@ -107,20 +107,12 @@ def info(options: argparse.Namespace) -> int:
         }  # fmt: skip
         print(json.dumps(answer, allow_nan=False))
         return DONE
-    print(f"mesh      {scene.n_nodes} nodes, {scene.n_tets} tets")
+    print("\n".join(map(escaped, repr(scene).split("\n"))))
     if len(nodes):
         low, high = nodes.min(axis=0), nodes.max(axis=0)
         extent = " × ".join(f"{length:.1f}" for length in high - low)
-        print(f"extent    {extent} mm")
-    print(f"tissue    {', '.join(scene.header()['tissue'].values())}")
-    print(f"fixed     {np.size(scene.fixed)} nodes")
-    for name, segment in scene.segments.items():
-        print(
-            f"segment   {escaped(name)}: {np.size(segment.joined)} joined, "
-            f"{np.size(segment.sliding)} sliding"
-        )
-    print(f"solver    {scene.options.method}, {scene.options.contact} contact")
-    print(f"sha256    {scene.sha256()}")
+        print(f"  extent    {extent} mm")
+    print(f"  sha256    {scene.sha256()}")
     return DONE
 
 

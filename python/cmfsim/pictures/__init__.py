@@ -15,10 +15,8 @@ from cmfsim.pictures.distances import DISTANCE_LIMIT as DISTANCE_LIMIT
 from cmfsim.pictures.distances import band_picture as band_picture
 from cmfsim.pictures.distances import contacts_picture as contacts_picture
 from cmfsim.pictures.distances import distance_colour as distance_colour
-from cmfsim.pictures.distances import picture_band as picture_band
 from cmfsim.pictures.distances import picture_distance_grid as picture_distance_grid
 from cmfsim.pictures.distances import picture_distances as picture_distances
-from cmfsim.pictures.faces import picture_plan as picture_plan
 from cmfsim.pictures.faces import picture_prediction as picture_prediction
 from cmfsim.pictures.faces import plan_picture as plan_picture
 from cmfsim.pictures.faces import prediction_picture as prediction_picture

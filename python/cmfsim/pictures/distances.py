@@ -229,27 +229,12 @@ def _values(distances: ArrayLike, count: int) -> tuple[Floats, NDArray[np.bool_]
     return as_floats("distances", np.ma.filled(np.ma.asarray(distances, dtype=float), 0.0)), shown
 
 
-def picture_band(path: AnyPath, prediction: Prediction, *, size: tuple[int, int] = SIZE) -> None:
-    """Writes a picture of half the width of a band: from the right, the front and the left.
-
-    Where no calibration case has data, the skin is grey. Without a calibration, each view states
-    that.
-
-    path: Ends in `.png`.
-    prediction: With `band`.
-    size: pixels.
-    Raises `CaseError`: The prediction has no band; PyVista or OpenGL is missing, another ending.
-
-    Examples
-    --------
-    >>> import cmfsim.pictures
-    >>> cmfsim.pictures.picture_band("band.png", prediction)  # doctest: +SKIP
-    """
-    band_picture(prediction, size=size)(path)
-
-
 def band_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> Picture:
-    """The picture that `picture_band` writes, to be drawn later."""
+    """The picture of half the width of a band, to be drawn later.
+
+    It shows the right, the front and the left. Where no calibration case has data, the skin is
+    grey; without a calibration, each view states that. Raises `CaseError`: there is no band.
+    """
     if prediction.band is None:
         raise CaseInputError("the prediction has no band: use predict_with_band")
     return partial(picture_half_width, skin=prediction.skin, band=prediction.band, size=size)
@@ -258,7 +243,7 @@ def band_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> Pic
 def picture_half_width(
     path: AnyPath, *, skin: SurfaceData, band: SkinBand, size: tuple[int, int]
 ) -> None:
-    """Writes a picture of half the width of a band; see `picture_band`."""
+    """Writes a picture of half the width of a band; see `band_picture`."""
     half = band.half_width
     vertices = skin.vertices
     known = ~np.ma.getmaskarray(half)

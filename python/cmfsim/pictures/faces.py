@@ -176,30 +176,13 @@ def prediction_html(prediction: Prediction) -> str:
     return f'{lines}<img alt="prediction" src="data:image/png;base64,{data}">'
 
 
-def picture_plan(
-    path: AnyPath, prediction: Prediction, *, size: tuple[int, int] = canvas.SIZE
-) -> None:
-    """Writes a picture of a plan: bone segments where they go, and behind them where they were.
-
-    The motion of each segment stands below, in words.
-
-    path: Ends in `.png`.
-    size: pixels.
-    Raises `CaseError`: PyVista or OpenGL is missing, another ending.
-
-    Examples
-    --------
-    >>> import cmfsim.pictures
-    >>> cmfsim.pictures.picture_plan("plan.png", prediction)  # doctest: +SKIP
-    """
-    motions = prediction.summary.get("plan", {})
-    plan_picture(prediction.patient, motions, size=size)(path)
-
-
 def plan_picture(
     patient: PatientModel, motions: Mapping[str, Any], *, size: tuple[int, int] = canvas.SIZE
 ) -> canvas.Picture:
-    """The picture that `picture_plan` writes, to be drawn later; `motions` as in a summary."""
+    """The picture of a plan, to be drawn later; `motions` as in a summary.
+
+    Bone segments where they go, behind them where they were, and below each motion in words.
+    """
     after = patient.planned_bones
     plan = {name: m["clinical"] for name, m in motions.items()}
     return partial(
@@ -228,7 +211,7 @@ def picture_motions(
     words: Sequence[str],
     size: tuple[int, int],
 ) -> None:
-    """Writes a picture of segments of bone before and after; see `picture_plan`."""
+    """Writes a picture of segments of bone before and after; see `plan_picture`."""
     colours = segment_colours(list(before))
     corners = canvas.bounds([s.vertices for s in (*before.values(), *after.values())])
     shown = canvas.Shown()

@@ -7,7 +7,6 @@ mm; and `parameters`, a JSON text whose `head` names the `HeadParameters` that t
 """
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -21,7 +20,7 @@ from cmfsim.lab.virtual.population import PATIENTS
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy
-from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.checks import as_positive
 from cmfsim.values.surface_data import SurfaceData
 
 CASE_TEXT = """\
@@ -169,26 +168,13 @@ folder = "out"
 """
 
 
-@dataclass(frozen=True, eq=False)
-class DemoTruth:
-    """A face after the operation.
-
-    landmarks: mapping of str to (3,), mm, on the skin.
-    """
-
-    skin: SurfaceData
-    landmarks: Mapping[str, Floats]
-
-
-def read_demo_truth() -> DemoTruth:
+def read_demo_truth() -> SurfaceData:
     """The face after the operation, of the head of `DEMO_PARAMETERS`."""
     with (
         files("cmfsim.lab.virtual").joinpath(TRUTH_FILE).open("rb") as file,
         np.load(file, allow_pickle=False) as archive,
     ):
-        skin = SurfaceData(archive["vertices"], archive["triangles"])
-        names = (str(name) for name in archive["landmark_names"])
-        return DemoTruth(skin, dict(zip(names, archive["landmarks"], strict=True)))
+        return SurfaceData(archive["vertices"], archive["triangles"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +183,6 @@ class DemoCase:
 
     case: Case
     anatomy: Anatomy
-    truth: DemoTruth
 
 
 def write_demo_case(folder: str | os.PathLike[str], *, edge_length: float = 6.0) -> DemoCase:
@@ -217,7 +202,6 @@ def write_demo_case(folder: str | os.PathLike[str], *, edge_length: float = 6.0)
     edge_length = as_positive("edge length", edge_length)
     folder = Path(folder)
     _check_folder(folder)
-    after = read_demo_truth()
     head = make_head(DEMO_PARAMETERS)
     anatomy = head.anatomy(float(np.clip(edge_length / VOXELS_PER_EDGE, *VOXEL_BOUNDS)))
     folder.mkdir(parents=True, exist_ok=True)
@@ -227,8 +211,8 @@ def write_demo_case(folder: str | os.PathLike[str], *, edge_length: float = 6.0)
     options = SurfaceOptions(max_triangles=MOST_TRIANGLES, smoothing=0)
     for name, level in {"skin": anatomy.skin, **anatomy.bones}.items():
         write_surface(folder / f"{name}.ply", surface_of_level(name, level, options))
-    write_surface(folder / "after.ply", after.skin)
-    return DemoCase(Case.load(folder / "case.toml"), anatomy, after)
+    write_surface(folder / "after.ply", read_demo_truth())
+    return DemoCase(Case.load(folder / "case.toml"), anatomy)
 
 
 def _check_folder(folder: Path) -> None:
