@@ -24,10 +24,11 @@ WHOLE = WIDTH - 2 * MARGIN
 # Font sizes, and the distance between lines as a multiple of them. A text that is too wide is
 # shrunk to the least size or this share before it is shortened.
 TITLE, TEXT, SMALL, FINE, LEAST, SHRINK, LEADING = 15.0, 8.0, 6.5, 5.5, 4.5, 0.65, 1.3
-# Heights of a row of a table, of a heading, of the gap between parts and, at most, of pictures.
-ROW, HEADING, APART, PICTURES = LEADING * SMALL + 1.0, 17.0, 8.0, 220.0
+# Heights of a row of a table, of a heading, of the gap between parts, at most of pictures, and at
+# least of the bones.
+ROW, HEADING, APART, PICTURES, BONES = LEADING * SMALL + 1.0, 17.0, 8.0, 220.0, 75.0
 # Largest numbers of lines, and digits of the hashes of inputs.
-PLAN_LINES, ABSENT_LINES, BAND_ROWS, WARNING_LINES, INPUT_LINES, DIGITS = 7, 4, 11, 7, 3, 12
+PLAN_LINES, ABSENT_LINES, BAND_ROWS, WARNING_LINES, INPUT_LINES, DIGITS = 7, 4, 11, 8, 3, 12
 # Where versions and hashes begin.
 FOOT = HEIGHT - MARGIN - (INPUT_LINES + 2) * LEADING * FINE
 INK, PALE, RULE, ALARM = "#1d2530", "#5d6875", "#d5dbe2", "#c2410c"
@@ -152,7 +153,7 @@ def draw_chart_page(
     words = plan_lines({name: m["clinical"] for name, m in prediction["plan"].items()})
     y = page.paragraph((MARGIN, y), words, TEXT, PLAN_LINES) + APART
     found = prediction.get("clinical", {"cephalometry": (), "face": (), "sites": ()})
-    high = min(PICTURES, FOOT - APART - _height_below(found) - y)
+    high = min(PICTURES, FOOT - APART - _height_below(found, prediction.get("band")) - y)
     # The panel of the tracing that shows both; results of earlier versions have none.
     beside = ("lateral", 0.5) if "lateral" in pictures else ("plan", 1.0)
     ends = [
@@ -188,13 +189,15 @@ def draw_chart_page(
     _origin(page, prediction)
 
 
-def _height_below(found: Values) -> float:
+def _height_below(found: Values, band: Values | None) -> float:
     """The largest height of all between the pictures and the foot of the page."""
     rows = {kind: len(measure_rows(found, kind)) for kind in TITLES}
     measures = max(rows["cephalometry"] + rows["occlusion"], rows["face"])
-    sites = max(sum(row[0] in SITES for row in site_rows(found)), BAND_ROWS + 2)
-    texts = LEADING * (ABSENT_LINES * FINE + WARNING_LINES * SMALL)
-    return 3 * HEADING + (measures + sites + 2) * ROW + texts + 2 * APART
+    sites = sum(row[0] in SITES for row in site_rows(found)) + 1
+    widths = 1 if band is None else 2 + min(len(band["regions"]), BAND_ROWS)
+    left, right = sites * ROW + LEADING * WARNING_LINES * SMALL, widths * ROW + BONES
+    texts = (measures + 1) * ROW + LEADING * ABSENT_LINES * FINE
+    return 3 * HEADING + 2 * APART + texts + max(left, right)
 
 
 def _sites(page: _Page, y: float, found: Values) -> float:
