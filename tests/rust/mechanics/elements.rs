@@ -94,7 +94,8 @@ fn affine_motion_of_the_hull_gives_the_affine_field_inside() {
 
 #[test]
 fn stiffness_is_symmetric_with_six_zero_modes_and_no_negative_one() {
-    let mesh = BoxShape::cube(3).mesh();
+    // The time of dense eigenvalues grows with the cube of the nodes.
+    let mesh = BoxShape { cells: [2, 2, 3], ..BoxShape::cube(3) }.mesh();
     let mut list = tissues();
     list.push(("layers", layered(&mesh)));
     list.push(("nearly incompressible", isotropic(0.003, 0.4999)));
