@@ -48,17 +48,6 @@ def test_a_nodding_head_with_an_open_mouth_has_its_sites(nodding):
             assert np.linalg.norm(gap) < 2.0 * nodding.errors["skull", name], name
 
 
-def test_a_known_site_moves_its_neighbours_and_lowers_their_errors(nodding):
-    site, beside, far = ("skull", "menton"), ("skull", "pogonion"), ("skull", "glabella")
-    found = nodding.distribution.given({site: nodding.sites[site] + [6.0, 0.0, 0.0]})
-    places = dict(zip(found.names, found.mean, strict=True))
-    errors = dict(zip(found.names, found.errors, strict=True))
-    assert errors[beside] < nodding.errors[beside]
-    assert places[beside][0] > nodding.sites[beside][0]
-    shift = np.linalg.norm(places[far] - nodding.sites[far])
-    assert shift < np.linalg.norm(places[beside] - nodding.sites[beside])
-
-
 def test_a_head_that_lies_on_its_side_is_refused_with_how_it_lies():
     head = average_head()
     turn = rigid_motion(angle=90.0, axis=(0, 0, 1), centre=(0, 0, 0))

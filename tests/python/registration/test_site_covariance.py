@@ -6,6 +6,7 @@ import pytest
 from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
     SiteDistribution,
+    likeliest_places,
     placed_distribution,
     site_covariance,
 )
@@ -81,6 +82,22 @@ def test_a_missing_site_departs_from_the_average_as_its_partner_does():
     away = found.mean[row] - average_head().skull["supra_m2_R"]
     assert -6.0 < away[0] < -3.0
     assert 1.5 < away[2] < 3.0
+
+
+def test_a_site_is_likeliest_between_where_it_was_found_and_where_the_others_put_it():
+    """Alone 5 mm up, a site returns by its expected error; a motion of the whole head stays."""
+    head = average_head().skull
+    gaps = []
+    for error in (1.0, 6.0):
+        sites = {
+            ("skull", name): ProposedSite(p + [7.0, 0.0, 0.0], 2.0) for name, p in head.items()
+        }
+        up = head["nasion"] + [7.0, 0.0, 5.0]
+        found = likeliest_places({**sites, ("skull", "nasion"): ProposedSite(up, error)})
+        gaps.append(found["skull", "nasion"][0][2] - head["nasion"][2])
+        shift = [found["skull", n][0] - p for n, p in head.items() if n != "nasion"]
+        np.testing.assert_allclose(np.mean(shift, axis=0), [7.0, 0.0, 0.0], atol=0.4)
+    assert 0.5 < gaps[1] < gaps[0] - 0.5 < 4.5
 
 
 def test_a_head_in_another_pose_and_size_has_the_same_distribution(bone):

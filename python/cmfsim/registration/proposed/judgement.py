@@ -25,7 +25,7 @@ USUAL_ERROR, ALIKE_ERROR = 2.0, 1.0
 # How the reason of a site begins that the image does not show.
 IMAGE_ENDS = "the image ends there"
 # Left and right differ by so much in few faces, mm of the average head.
-MOST_UNEVEN = 6.0
+MOST_UNEVEN = 8.5
 # A point so near to where the image ends may lie on the cut instead of on bone, mm.
 AT_CUT = 3.0
 # The jaw below the lower incisors must be there as far down as this for its profile to be read,
@@ -151,7 +151,7 @@ def judged(
         usual = _ERRORS.get(base, USUAL_ERROR)
         gap = uneven.get(base, 0.0)
         error = likeness * ALIKE_ERROR + (1.0 - likeness) * usual
-        error = pose.size * float(np.hypot(error, 0.5 * max(gap - 1.0, 0.0)))
+        error = pose.size * float(np.hypot(error, 0.35 * max(gap - 1.4, 0.0)))
         doubts = []
         if gap > MOST_UNEVEN:
             doubts.append(f"left and right differ by {pose.size * gap:.1f} mm")

@@ -33,6 +33,7 @@ from cmfsim.registration.proposed.pose import (
 )
 from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead, fit_head
 from cmfsim.registration.proposed.shape_model.samples import cut_planes, samples_of
+from cmfsim.registration.proposed.shape_model.site_covariance import SiteKey, likeliest_places
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES, SKIN_LANDMARKS, SKULL_LANDMARKS
@@ -45,14 +46,11 @@ DOUBTFUL, REPLACED = 1.75, 2.5
 # Share of its distance from the model's that adds to the expected error of a site: the least with
 # which 95 % of the sites of five unseen scans lie within twice the error; of four, 0.15 to 0.3.
 GAP_SHARE = 0.3
-# Error of a site that is not doubtful, and how far from its surface
-# a site of the model may lie, mm of the average head.
-KNOWN, FARTHEST = 2.5, 8.0
+# How far from its surface a likely place may lie, mm of the average head.
+FARTHEST = 8.0
 
 # Distance of a head from a template at which the template's bias counts half, average-head mm.
 LIKENESS = 0.8
-# Share by which a pair moves towards its mirror image.
-MIRRORED = 0.3
 # Share that the model's place has in sites that lie where its surface is smooth: less than what
 # either of two real heads in six shapes suggests.
 MODEL_SHARES = {"supra_m2": 0.35, "infradentale": 0.2}
@@ -68,34 +66,48 @@ class SitesOfKind:
     kind: str
     sites: Mapping[str, ProposedSite]
     missing: Mapping[str, str]
-    surfaces: Mapping[bool, SurfaceData]
+    surfaces: Mapping[bool, Surface]
 
-    def surface_of(self, name: str) -> SurfaceData | None:
+    def surface_of(self, name: str) -> Surface | None:
         """The surface a site lies on; True is that of the lower jaw."""
         return self.surfaces.get(self.kind == "skull" and name.startswith(JAW_SITES))
 
 
-def with_model(
-    found: SitesOfKind, head: FittedHead, size: float
-) -> tuple[dict[str, ProposedSite], dict[str, str]]:
-    """Sites and missing ones after the model has its say.
+def likeliest(
+    kinds: Sequence[SitesOfKind], head: FittedHead
+) -> dict[SiteKey, tuple[Floats, float]]:
+    """Where definition, model and all other sites together place each site, and its error, mm."""
+    sites = {
+        (found.kind, name): site
+        for found in kinds
+        for name, site in found.sites.items()
+        if found.surface_of(name) is not None
+    }
+    for key, site in sites.items():
+        share = MODEL_SHARES.get(key[1].removesuffix("_L").removesuffix("_R"), 0.0)
+        sites[key] = replace(site, point=site.point + share * (head.sites[key] - site.point))
+    return likeliest_places(sites)
 
-    A site far from the model's is replaced by it, and one that was not found is the model's, where
-    the image goes on and a surface is near. Both are doubtful, with the model's expected error.
+
+def with_model(
+    found: SitesOfKind,
+    likely: Mapping[SiteKey, tuple[Floats, float]],
+    head: FittedHead,
+    size: float,
+) -> tuple[dict[str, ProposedSite], dict[str, str]]:
+    """Sites and missing ones after the others and the model have their say.
+
+    Each goes where it is likeliest. One far from the model's is replaced by that. One that was not
+    found is where the others place it, if the image goes on there and a surface is near. Both are
+    doubtful.
     """
     kind = found.kind
-    sound = {(kind, n): s.point for n, s in found.sites.items() if not s.doubt}
-    followed = head.distribution.given(sound, dict.fromkeys(sound, KNOWN * size / np.sqrt(3.0)))
-    places = dict(zip(followed.names, followed.mean, strict=True))
-    errors = dict(zip(followed.names, followed.errors.tolist(), strict=True))
     sites: dict[str, ProposedSite] = {}
     missing = dict(found.missing)
     for name, site in found.sites.items():
         model, error = head.sites[kind, name], head.errors[kind, name]
-        share = MODEL_SHARES.get(name.removesuffix("_L").removesuffix("_R"))
-        if share is not None:
-            place = _surface_place(found, name, site.point + share * (model - site.point), size)
-            site = site if place is None else replace(site, point=place)  # noqa: PLW2901
+        place = _surface_place(found, name, likely[kind, name][0], size)
+        site = site if place is None else replace(site, point=place)  # noqa: PLW2901
         gap = float(np.linalg.norm(site.point - model))
         deviations = gap / float(np.hypot(error, site.error))
         if deviations < DOUBTFUL:
@@ -113,11 +125,11 @@ def with_model(
     for name, reason in found.missing.items():
         if IMAGE_ENDS in reason or found.surface_of(name) is None:
             continue
-        place = places[kind, name]
+        place, error = likely[kind, name]
         moved = _surface_place(found, name, place, size) if head.shows(place) else None
         if moved is not None:
             doubt = f"{reason}; placed by the shape of the head"
-            sites[name] = ProposedSite(moved, errors[kind, name], doubt)
+            sites[name] = ProposedSite(moved, error, doubt)
             del missing[name]
     order = [name for of, name in head.sites if of == kind and name in sites]
     return {name: sites[name] for name in order}, missing
@@ -127,7 +139,7 @@ def _surface_place(found: SitesOfKind, name: str, place: Floats, size: float) ->
     surface = found.surface_of(name)
     if surface is None:
         return None
-    near, _, _ = Surface(surface.vertices, surface.triangles).closest(place[None])
+    near, _, _ = surface.closest(place[None])
     point: Floats = near[0]
     return point if float(np.linalg.norm(point - place)) < FARTHEST * size else None
 
@@ -172,12 +184,12 @@ def landmarks_from(
     pose, found = _best_sites(parts, (pose, fitted.pose), average, fitted)
     likeness = [_likeness(template, parts.upper, pose, templates) for template in templates]
     found = _corrected(found, templates, likeness)
-    skull = _evened({name: p for name, p in found.skull.items() if not name.startswith("_")})
-    surface = {False: parts.upper, True: parts.lower or parts.upper}
+    skull = {name: p for name, p in found.skull.items() if not name.startswith("_")}
+    upper = _searched(parts.upper)
+    surface = {False: upper, True: _searched(parts.lower) if parts.lower else upper}
     placed = _on_surface(skull, pose, surface)
-    on_skin = (
-        {} if skin is None else _on_surface(_evened(found.skin), pose, {False: skin, True: skin})
-    )
+    by_skin = {} if skin is None else dict.fromkeys((False, True), _searched(skin))
+    on_skin = _on_surface(found.skin, pose, by_skin)
     cuts = cut_planes([*([] if skin is None else [skin]), parts.upper])
     gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None)
     evidence = JawEvidence("", ())
@@ -192,14 +204,14 @@ def landmarks_from(
         # The model puts no site on a surface that is no jaw.
         del surface[True]
     of_skull = SitesOfKind("skull", weakened(sites, evidence, pose.size), gone.skull, surface)
-    by_skin = {} if skin is None else {False: skin}
     lost = gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given")
     of_mouth = weakened(judged("skin", on_skin, pose, max(likeness)), evidence, pose.size, "skin")
     of_skin = SitesOfKind("skin", of_mouth, lost, by_skin)
-    all_skull, missing_skull = with_model(of_skull, fitted, pose.size)
+    likely = likeliest((of_skull, of_skin), fitted)
+    all_skull, missing_skull = with_model(of_skull, likely, fitted, pose.size)
     added = {name: site for name, site in all_skull.items() if name not in of_skull.sites}
     all_skull |= weakened(added, evidence, pose.size)
-    all_skin, missing_skin = with_model(of_skin, fitted, pose.size)
+    all_skin, missing_skin = with_model(of_skin, likely, fitted, pose.size)
     return ProposedLandmarks(
         all_skull,
         all_skin,
@@ -209,6 +221,10 @@ def landmarks_from(
         evidence.reason,
         {} if evidence.is_only_open else separation_points(sites, pose, average.skull),
     )
+
+
+def _searched(surface: SurfaceData) -> Surface:
+    return Surface(surface.vertices, surface.triangles)
 
 
 def _surfaces(bones: Mapping[str, SurfaceData], skin: SurfaceData | None = None) -> HeadSurfaces:
@@ -332,22 +348,8 @@ def _corrected(
     return Detected(results[0], results[1])
 
 
-def _evened(sites: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Pairs moved a little towards their mirror images about their own midline."""
-    pairs = [n[:-2] for n in sites if n.endswith("_L") and f"{n[:-2]}_R" in sites]
-    result = dict(sites)
-    for pair in pairs:
-        left, right = sites[f"{pair}_L"], sites[f"{pair}_R"]
-        even = 0.5 * (left + right * [-1.0, 1.0, 1.0])
-        middle = 0.5 * (left[0] + right[0])
-        for letter, side, own in (("L", 1.0, left), ("R", -1.0, right)):
-            mirrored = even * [side, 1.0, 1.0] + [middle, 0.0, 0.0]
-            result[f"{pair}_{letter}"] = own + MIRRORED * (mirrored - own)
-    return result
-
-
 def _on_surface(
-    sites: Mapping[str, Floats], pose: Pose, surfaces: Mapping[bool, SurfaceData]
+    sites: Mapping[str, Floats], pose: Pose, surfaces: Mapping[bool, Surface]
 ) -> dict[str, Floats]:
     """The sites moved to the closest points of their surfaces, in the patient's frame."""
     placed: dict[str, Floats] = {}
@@ -356,7 +358,6 @@ def _on_surface(
         if not names:
             continue
         points = pose.out(np.array([sites[name] for name in names]) * pose.size)
-        whole = Surface(surface.vertices, surface.triangles)
-        near, _, _ = whole.closest(points)
+        near, _, _ = surface.closest(points)
         placed.update(zip(names, near, strict=True))
     return placed

@@ -28,7 +28,6 @@ from cmfsim.registration.proposed.shape_model.model import (
 )
 from cmfsim.registration.proposed.shape_model.samples import HeadSamples
 from cmfsim.registration.proposed.shape_model.search import STAGES, Start, found_poses
-from cmfsim.registration.proposed.shape_model.site_covariance import SiteDistribution
 from cmfsim.registration.proposed.shape_model.state import (
     JAW_DEVIATIONS,
     POSE_UNITS,
@@ -146,7 +145,8 @@ class FittedHead:
     @cached_property
     def errors(self) -> Mapping[tuple[str, str], float]:
         """Expected distance of each site from the true one, mm."""
-        return dict(zip(SITES, self.distribution.errors.tolist(), strict=True))
+        variances = np.maximum(np.diag(self.covariance), 0.0).reshape(-1, 3).sum(axis=1)
+        return dict(zip(SITES, np.sqrt(variances).tolist(), strict=True))
 
     @cached_property
     def breadth(self) -> float:
@@ -164,11 +164,6 @@ class FittedHead:
         weights = np.zeros((len(SITES), 3))
         weights[[SITES.index(site) for site in sites]] = direction / len(sites)
         return float(np.sqrt(weights.ravel() @ self.covariance @ weights.ravel()))
-
-    @property
-    def distribution(self) -> SiteDistribution:
-        """Where the sites are expected, and how their errors depend on one another."""
-        return SiteDistribution(SITES, np.array([*self.sites.values()]), self.covariance)
 
     def shows(self, point: Floats) -> bool:
         """Whether the image shows a place of the patient's frame."""

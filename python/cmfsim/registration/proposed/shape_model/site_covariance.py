@@ -102,25 +102,45 @@ def site_covariance(proposal: ProposedLandmarks, bone: Floats) -> SiteDistributi
         **{("skull", name): site for name, site in proposal.skull.items()},
         **{("skin", name): site for name, site in proposal.skin.items()},
     }
+    prior = _aligned_prior(sites, bone)
     known = [i for i, key in enumerate(SITES) if key in sites]
-    found = np.array([sites[SITES[i]].point for i in known]).reshape(-1, 3)
-    stds = np.array([sites[SITES[i]].error for i in known]) / np.sqrt(3.0)
-    mean, covariance = average_sites(), _spread()
-    if len(known) < LEAST_SITES:
-        mean = mean + _guessed_shift(mean, bone)
-    else:
-        linear, offset, _ = robust_similarity(mean[known], found, 1.0 / stds**2, HALF_DISTANCE)
-        turn = np.kron(np.eye(len(mean)), linear)
-        mean, covariance = mean @ linear.T + offset, turn @ covariance @ turn.T
     if not known:
-        return SiteDistribution(SITES, mean, covariance)
+        return prior
+    found = np.array([sites[SITES[i]].point for i in known])
+    stds = np.array([sites[SITES[i]].error for i in known]) / np.sqrt(3.0)
     rows = (3 * np.array(known)[:, None] + np.arange(3)).ravel()
-    shift, left = _conditional(
-        covariance, rows, (found - mean[known]).ravel(), _measured(found, known, stds)
-    )
-    places = mean + shift.reshape(-1, 3)
+    away = (found - prior.mean[known]).ravel()
+    shift, left = _conditional(prior.covariance, rows, away, _measured(found, known, stds))
+    places = prior.mean + shift.reshape(-1, 3)
     places[known] = found
     return SiteDistribution(SITES, places, left)
+
+
+def likeliest_places(sites: Mapping[SiteKey, ProposedSite]) -> dict[SiteKey, tuple[Floats, float]]:
+    """Where each site is likeliest, as it was found and as the others place it, and its error, mm.
+
+    What the errors of found sites have in common looks like shape, and stays: each one's own share
+    of the variance is weighed.
+    """
+    own = float(np.sqrt((1.0 - ALIKE_SHARE) / 3.0))
+    points = {key: site.point for key, site in sites.items()}
+    stds = {key: own * site.error for key, site in sites.items()}
+    prior = _aligned_prior(sites, np.array([*points.values()]).reshape(-1, 3))
+    after = prior.given(points, stds)
+    return dict(zip(SITES, zip(after.mean, after.errors.tolist(), strict=True), strict=True))
+
+
+def _aligned_prior(sites: Mapping[SiteKey, ProposedSite], bone: Floats) -> SiteDistribution:
+    """The average head's sites brought onto those of a head, before any is a measurement."""
+    known = [i for i, key in enumerate(SITES) if key in sites]
+    mean, covariance = average_sites(), _spread()
+    if len(known) < LEAST_SITES:
+        return SiteDistribution(SITES, mean + _guessed_shift(mean, bone), covariance)
+    found = np.array([sites[SITES[i]].point for i in known])
+    errors = np.array([sites[SITES[i]].error for i in known])
+    linear, offset, _ = robust_similarity(mean[known], found, 3.0 / errors**2, HALF_DISTANCE)
+    turn = np.kron(np.eye(len(mean)), linear)
+    return SiteDistribution(SITES, mean @ linear.T + offset, turn @ covariance @ turn.T)
 
 
 def placed_distribution(points: Mapping[str, Floats]) -> SiteDistribution:
@@ -182,6 +202,8 @@ def _is_partner(a: SiteKey, b: SiteKey) -> bool:
 
 def _guessed_shift(mean: Floats, bone: Floats) -> Floats:
     """What brings an average head to where the bone is foremost, in its middle, mm."""
+    if not len(bone):
+        return np.zeros(3)
     front = bone[bone[:, 1] <= np.percentile(bone[:, 1], FOREMOST)]
     ahead = mean[mean[:, 1] <= np.percentile(mean[:, 1], 50.0)]
     shift: Floats = front.mean(axis=0) - ahead.mean(axis=0)
