@@ -1,8 +1,11 @@
 """The distribution of landmarks, and how they follow those that are known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from cmfsim.registration.proposed.proposal import SitesOfKind, likeliest
 from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
     SiteDistribution,
@@ -98,6 +101,18 @@ def test_a_site_is_likeliest_between_where_it_was_found_and_where_the_others_put
         shift = [found["skull", n][0] - p for n, p in head.items() if n != "nasion"]
         np.testing.assert_allclose(np.mean(shift, axis=0), [7.0, 0.0, 0.0], atol=0.4)
     assert 0.5 < gaps[1] < gaps[0] - 0.5 < 4.5
+
+
+def test_a_site_far_from_the_models_goes_where_the_others_put_it_and_takes_none_with_it():
+    head = average_head().skull
+    sites = {n: ProposedSite(p + [0.0, 0.0, 100.0 * (n == "nasion")], 2.0) for n, p in head.items()}
+    places = {("skull", n): p for n, p in head.items()} | {
+        ("skin", n): p for n, p in average_head().skin_landmarks.items()
+    }
+    model = SimpleNamespace(sites=places, errors=dict.fromkeys(places, 6.0))
+    found = likeliest([SitesOfKind("skull", sites, {}, {False: object(), True: object()})], model)
+    for name, place in head.items():
+        assert np.linalg.norm(found["skull", name][0] - place) < 1.0, name
 
 
 def test_a_head_in_another_pose_and_size_has_the_same_distribution(bone):

@@ -40,7 +40,7 @@ from cmfsim.values.landmark_sites import JAW_SITES, SKIN_LANDMARKS, SKULL_LANDMA
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
-# Deviations from which a site is doubtful, and from which it is the model's: of normal errors along
+# Deviations from which a site is doubtful, and from which it says nothing: of normal errors along
 # three axes 3 % and 0.03 % are larger.
 DOUBTFUL, REPLACED = 1.75, 2.5
 # Share of its distance from the model's that adds to the expected error of a site: the least with
@@ -76,17 +76,32 @@ class SitesOfKind:
 def likeliest(
     kinds: Sequence[SitesOfKind], head: FittedHead
 ) -> dict[SiteKey, tuple[Floats, float]]:
-    """Where definition, model and all other sites together place each site, and its error, mm."""
+    """Where definition, model and all other sites together place each site, and its error, mm.
+
+    One that is far from the model's says nothing: it would take the others with it.
+    """
     sites = {
         (found.kind, name): site
         for found in kinds
         for name, site in found.sites.items()
         if found.surface_of(name) is not None
+        and _deviations(head, (found.kind, name), site) <= REPLACED
     }
     for key, site in sites.items():
         share = MODEL_SHARES.get(key[1].removesuffix("_L").removesuffix("_R"), 0.0)
         sites[key] = replace(site, point=site.point + share * (head.sites[key] - site.point))
-    return likeliest_places(sites)
+    places = likeliest_places(sites)
+    # The model knows better where few sites tell.
+    for key in places.keys() - sites.keys():
+        own = head.sites[key], head.errors[key]
+        places[key] = min(places[key], own, key=lambda placed: placed[1])
+    return places
+
+
+def _deviations(head: FittedHead, key: SiteKey, site: ProposedSite) -> float:
+    """How many expected errors a site lies from the model's."""
+    gap = np.linalg.norm(site.point - head.sites[key])
+    return float(gap / np.hypot(head.errors[key], site.error))
 
 
 def with_model(
@@ -97,31 +112,23 @@ def with_model(
 ) -> tuple[dict[str, ProposedSite], dict[str, str]]:
     """Sites and missing ones after the others and the model have their say.
 
-    Each goes where it is likeliest. One far from the model's is replaced by that. One that was not
-    found is where the others place it, if the image goes on there and a surface is near. Both are
-    doubtful.
+    Each goes where it is likeliest. One that lies far from the model's is doubtful, as is one that
+    was not found: it is where the others place it, if the image goes on and a surface is near.
     """
     kind = found.kind
     sites: dict[str, ProposedSite] = {}
     missing = dict(found.missing)
     for name, site in found.sites.items():
-        model, error = head.sites[kind, name], head.errors[kind, name]
-        place = _surface_place(found, name, likely[kind, name][0], size)
-        site = site if place is None else replace(site, point=place)  # noqa: PLW2901
-        gap = float(np.linalg.norm(site.point - model))
-        deviations = gap / float(np.hypot(error, site.error))
-        if deviations < DOUBTFUL:
-            sites[name] = replace(site, error=float(np.hypot(site.error, GAP_SHARE * gap)))
-            continue
-        doubt = f"the shape of the whole head places it {gap:.1f} mm away"
-        doubt = "; ".join(filter(None, (site.doubt, doubt)))
-        sites[name] = replace(site, error=max(site.error, 0.5 * gap), doubt=doubt)
-        if deviations > REPLACED:
-            # Others follow it no longer: the model's own place.
-            moved = _surface_place(found, name, model, size)
-            if moved is not None:
-                doubt = f"{doubt}; placed by that shape"
-                sites[name] = ProposedSite(moved, max(site.error, error, 0.5 * gap), doubt)
+        gap = float(np.linalg.norm(site.point - head.sites[kind, name]))
+        deviations = _deviations(head, (kind, name), site)
+        moved = _surface_place(found, name, likely[kind, name][0], size)
+        point = site.point if moved is None else moved
+        error, doubt = float(np.hypot(site.error, GAP_SHARE * gap)), site.doubt
+        if deviations >= DOUBTFUL:
+            reason = f"the shape of the whole head places it {gap:.1f} mm away"
+            reason += "; placed by the others" * (deviations > REPLACED and moved is not None)
+            error, doubt = max(site.error, 0.5 * gap), "; ".join(filter(None, (doubt, reason)))
+        sites[name] = ProposedSite(point, error, doubt)
     for name, reason in found.missing.items():
         if IMAGE_ENDS in reason or found.surface_of(name) is None:
             continue
