@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction, telling
+from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction
 
 NODES = 30
 BOXES = {
@@ -80,23 +80,6 @@ def test_smooth_errors_are_predicted_at_plans_that_were_not_fitted(numbers, fitt
     # What is stated of plans that were left out is what is found at other plans.
     stated = np.sqrt(np.mean(correction.left_out**2))
     assert stated == pytest.approx(np.sqrt(np.mean(np.square(left))), rel=0.35)
-
-
-def test_chosen_plans_leave_less_error_than_as_many_others(numbers):
-    squares = np.zeros(2)
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        plans, others = ([near(rng) for _ in range(count)] for count in (160, 60))
-        places = np.array([numbers.of(plan) for plan in plans])
-        chosen = telling(places, 40)
-        assert len(set(chosen)) == 40
-        assert telling(places, 10) == chosen[:10]
-        for k, at in enumerate((chosen, range(40))):
-            errors = np.array([curved(numbers, plans[n]) for n in at])
-            fit, _ = fitted_correction(numbers, places[list(at)], np.ones(40), errors)
-            away = [curved(numbers, plan) - fit.displacements(plan) for plan in others]
-            squares[k] += np.mean(np.square(away))
-    assert squares[0] < 0.9 * squares[1]
 
 
 def test_nothing_is_added_at_the_reference_and_little_near_it(fitted):

@@ -5,23 +5,21 @@ from dataclasses import replace
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction, telling
+from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction
 from cmfsim.planning.replanning.expected_error import (
     moving_segments,
     plan_distance,
-    plan_near,
+    plans_near,
     segment_boxes,
     solved_plans,
 )
 from cmfsim.planning.replanning.model import PlanningModel
-from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.checks import as_positive
 from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
 CORRECTING = "solving nearby plans to correct the operator"
 # Plans that are solved for a correction.
 CORRECTIONS = 16
-# Plans that are drawn for each one that is solved.
-DRAWN = 4
 # With fewer solved plans, interpolation between them is meaningless.
 LEAST_PLANS = 8
 
@@ -37,10 +35,9 @@ def corrected_planning(
 ) -> PlanningModel:
     """The planning model with its operator corrected by exact solutions, if this lowers the error.
 
-    Plans are drawn as in `expected_error`, but they are different plans and all from the whole
-    range; those are solved that tell most of the others. The error of the operator is interpolated
-    between them (`PlanCorrection`). The correction is not used if it does not lower the error at
-    plans to which it was not fitted.
+    Plans are drawn as in `expected_error`, but they are different plans. The error of the operator
+    is interpolated between them (`PlanCorrection`). The correction is not used if it does not lower
+    the error at plans to which it was not fitted.
 
     Parameters
     ----------
@@ -81,7 +78,8 @@ def corrected_planning(
         return bare
     boxes = segment_boxes(bare)
     numbers = PlanNumbers.about(bare.reference, {n: boxes[n] for n in moving_segments(bare)})
-    drawn = chosen_plans(bare, numbers, plans, (shift, turn), seed)
+    # A stream of its own, so that no plan is one of those by which the error is measured.
+    drawn = plans_near(bare, np.random.default_rng((seed, 1)), plans, (shift, turn))
     places, distances, errors = [], [], []
     with shown_progress(progress, {CORRECTING: PLANNING[CORRECTING]}) as shown:
         shown(f"{CORRECTING} (1 of {plans})")
@@ -97,13 +95,3 @@ def corrected_planning(
         numbers, np.array(places), np.array(distances), np.array(errors)
     )
     return replace(bare, correction=correction) if pays else bare
-
-
-def chosen_plans(
-    planning: PlanningModel, numbers: PlanNumbers, count: int, reach: tuple[float, float], seed: int
-) -> list[dict[str, Floats]]:
-    """The plans that a correction solves, within `reach`: shift, mm, and turn, degrees."""
-    # A stream of its own, so that no plan is one of those by which the error is measured.
-    rng = np.random.default_rng((seed, 1))
-    drawn = [plan_near(planning, rng, *reach) for _ in range(DRAWN * count)]
-    return [drawn[n] for n in telling(np.array([numbers.of(plan) for plan in drawn]), count)]

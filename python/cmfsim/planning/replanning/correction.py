@@ -27,8 +27,6 @@ from cmfsim.values.checks import Floats
 # Lengths ℓ, mm, and noise as a share of the variance, among which plans that are left out choose.
 LENGTHS = (10.0, 14.0, 20.0, 30.0)
 NOISES = (1e-3, 1e-2, 1e-1)
-# The length, mm, and noise for which plans are chosen, before there is anything to fit.
-CHOICE_LENGTH, CHOICE_NOISE = 20.0, 1e-2
 # A rotation counts by the path of a point at this share of the distance of the furthest corner.
 ARM_SHARE = 0.6
 # Shapes of the correction: as few as retain this share of the corrections, and at most this many.
@@ -134,28 +132,6 @@ class PlanCorrection:
     def at(self, nodes: NDArray[np.integer]) -> "PlanCorrection":
         """The correction restricted to some nodes, by their positions in the operator."""
         return replace(self, shapes=self.shapes[nodes])
-
-
-def telling(plans: Floats, count: int) -> list[int]:
-    """Which of the plans to solve, the most telling first.
-
-    Greedy: the next one is that which lowers the variance of the process most, summed over all
-    plans (Cohn, Ghahramani and Jordan 1996).
-
-    plans: (n, s, 6), mm.
-    count: At most n.
-    """
-    left = _covariance(plans, plans, CHOICE_LENGTH)
-    noise = CHOICE_NOISE * float(np.diagonal(left).mean())
-    chosen: list[int] = []
-    for _ in range(count):
-        gains = (left**2).sum(axis=1) / (np.diagonal(left) + noise)
-        gains[chosen] = -1.0
-        at = int(gains.argmax())
-        chosen.append(at)
-        column = left[:, at]
-        left = left - np.outer(column, column / (column[at] + noise))
-    return chosen
 
 
 def fitted_correction(

@@ -206,8 +206,7 @@ def expected_error(
     if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
         raise CaseInputError(f"trials is {trials!r}: a whole number of 1 or more is needed")
     rng = np.random.default_rng(seed)
-    shares = [SHARES[n % len(SHARES)] for n in range(1 if planning.is_exact else trials)]
-    plans = [plan_near(planning, rng, share * shift, share * turn) for share in shares]
+    plans = plans_near(planning, rng, 1 if planning.is_exact else trials, (shift, turn))
     found = []
     with shown_progress(progress, {TRYING: PLANNING[TRYING]}) as shown:
         shown(f"{TRYING} (1 of {len(plans)})")
@@ -229,19 +228,22 @@ def moving_segments(planning: PlanningModel) -> tuple[str, ...]:
     return tuple(moving) or planning.segments
 
 
-def plan_near(
-    planning: PlanningModel, rng: np.random.Generator, shift: float, turn: float
-) -> dict[str, Floats]:
-    """A random plan around the reference: up to `shift` mm along each axis, and `turn` degrees."""
-    boxes = segment_boxes(planning)
-    plan = dict(planning.reference)
-    for name in moving_segments(planning):
-        centre = boxes[name].mean(axis=0)
-        more = rigid_motion(
-            rng.uniform(-shift, shift, 3), turn * rng.uniform(), rng.normal(size=3), centre
-        )
-        plan[name] = plan[name] @ more
-    return plan
+def plans_near(
+    planning: PlanningModel, rng: np.random.Generator, count: int, reach: tuple[float, float]
+) -> list[dict[str, Floats]]:
+    """Random plans around the reference: up to `reach` mm along each axis and degrees."""
+    boxes, plans = segment_boxes(planning), []
+    for number in range(count):
+        shift, turn = SHARES[number % len(SHARES)] * np.array(reach)
+        plan = dict(planning.reference)
+        for name in moving_segments(planning):
+            centre = boxes[name].mean(axis=0)
+            more = rigid_motion(
+                rng.uniform(-shift, shift, 3), turn * rng.uniform(), rng.normal(size=3), centre
+            )
+            plan[name] = plan[name] @ more
+        plans.append(plan)
+    return plans
 
 
 @dataclass(frozen=True, eq=False)

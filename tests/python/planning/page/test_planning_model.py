@@ -13,7 +13,7 @@ from cmfsim.cli import main
 from cmfsim.cli.plan_command import _correction_text
 from cmfsim.planning.occlusion import patient_rows
 from cmfsim.planning.replanning import plan_distance
-from cmfsim.planning.replanning.corrected import chosen_plans
+from cmfsim.planning.replanning.expected_error import plans_near
 from planning_head import other_plan
 
 pytest.importorskip("skimage")
@@ -84,7 +84,7 @@ def test_corrections_are_the_same_each_time(bare, planning):
     again = cmfsim.corrected_planning(bare, 24).correction
     np.testing.assert_array_equal(again.shapes, planning.correction.shapes)
     np.testing.assert_array_equal(again.weights, planning.correction.weights)
-    plans = chosen_plans(bare, again.numbers, 24, (5.0, 5.0), 0)[:2]
+    plans = plans_near(bare, np.random.default_rng((0, 1)), 2, (5.0, 5.0))
     serial = [planning.solve(plan).skin_displacements for plan in plans]
     largest = [
         np.linalg.norm(exact - bare.displacements(plan), axis=1).max()
@@ -172,7 +172,7 @@ def test_the_expected_error_is_that_of_the_trials(planning, errors):
         trial.distance * np.percentile(ratios, 90.0)
     )
     assert errors.usual(trial.distance) < largest
-    drawn = chosen_plans(planning, correction.numbers, 24, (5.0, 5.0), 0)
+    drawn = plans_near(planning, np.random.default_rng((0, 1)), 1, (5.0, 5.0))
     assert correction.distances[0] == pytest.approx(plan_distance(planning, drawn[0]))
     # Trials differ from the reference, by no more than what was asked for.
     assert 1.0 < trial.distance < 5.0 * 3**0.5 + 15.0
