@@ -91,11 +91,11 @@ def _panel(
 ) -> None:
     """Draws one head with its tracing, sites and planes.
 
-    shells: By their vertices: most bone is the same in both panels.
+    shells: By place, shape and direction: most bone is the same in both panels.
     """
-    depth = 0.0
+    depth: Floats = np.zeros((1, 1))
     for surface in (view.skin, *view.bones.values()):
-        place = surface.vertices.tobytes()
+        place = b"".join(a.tobytes() for a in (surface.vertices, surface.triangles, view.axes))
         if place not in shells:
             shells[place] = _shells(surface, view.axes, window)
         depth = depth + (SKIN if surface is view.skin else BONE) * shells[place]
