@@ -27,7 +27,7 @@ pub fn squared_distance(grid: &Grid, most: f32, target: impl Fn(usize) -> bool +
         let mut lines = Lines::new(ny, grid.spacing[1], most);
         for k in (0..nz).step_by(TILE) {
             let width = TILE.min(nz - k);
-            if lines.load(|j| &slab[j * nz + k..][..width]) == Distances::Some {
+            if lines.load(|j| &slab[j * nz + k..][..width]) {
                 lines.transform(width);
                 for j in 0..ny {
                     lines.store(j, &mut slab[j * nz + k..][..width]);
@@ -35,37 +35,25 @@ pub fn squared_distance(grid: &Grid, most: f32, target: impl Fn(usize) -> bool +
             }
         }
     });
-    // Along i: one slab per j is computed in a separate buffer, then written back plane by plane.
-    let slabs: Vec<Vec<f32>> = (0..ny)
-        .into_par_iter()
-        .map_init(
-            || Lines::new(nx, grid.spacing[0], most),
-            |lines, j| {
-                let mut slab = vec![FAR; nx * nz];
-                for k in (0..nz).step_by(TILE) {
-                    let width = TILE.min(nz - k);
-                    match lines.load(|i| &squared[i * plane + j * nz + k..][..width]) {
-                        Distances::Far => {}
-                        Distances::Zero => {
-                            (0..nx).for_each(|i| slab[i * nz + k..][..width].fill(0.0));
-                        }
-                        Distances::Some => {
-                            lines.transform(width);
-                            for i in 0..nx {
-                                lines.store(i, &mut slab[i * nz + k..][..width]);
-                            }
-                        }
+    // Along i: all rows of one j together, which no other j shares.
+    let mut sheets: Vec<Vec<&mut [f32]>> = (0..ny).map(|_| Vec::with_capacity(nx)).collect();
+    for (row, values) in squared.chunks_mut(nz).enumerate() {
+        sheets[row % ny].push(values);
+    }
+    sheets.into_par_iter().for_each_init(
+        || Lines::new(nx, grid.spacing[0], most),
+        |lines, mut rows| {
+            for k in (0..nz).step_by(TILE) {
+                let width = TILE.min(nz - k);
+                if lines.load(|i| &rows[i][k..][..width]) {
+                    lines.transform(width);
+                    for (i, row) in rows.iter_mut().enumerate() {
+                        lines.store(i, &mut row[k..][..width]);
                     }
                 }
-                slab
-            },
-        )
-        .collect();
-    squared.par_chunks_mut(plane).enumerate().for_each(|(i, out)| {
-        for (j, row) in out.chunks_mut(nz).enumerate() {
-            row.copy_from_slice(&slabs[j][i * nz..(i + 1) * nz]);
-        }
-    });
+            }
+        },
+    );
     squared
 }
 
@@ -134,17 +122,6 @@ fn fill_away<'a>(values: impl Iterator<Item = (&'a mut f32, u32)>, spacing: f32,
     }
 }
 
-/// Content of the lines of a tile.
-#[derive(PartialEq)]
-enum Distances {
-    /// No finite distance.
-    Far,
-    /// Targets only.
-    Zero,
-    /// Distances, which have to be loaded.
-    Some,
-}
-
 /// Lines of one length, next to each other, along which squared distances are propagated.
 struct Lines {
     /// Line after line.
@@ -159,8 +136,8 @@ impl Lines {
         Self { values: vec![FAR; TILE * n], n, most, envelope: Envelope::new(n, spacing) }
     }
 
-    /// Loads lines from rows across them, unless all entries have the same value.
-    fn load<'a>(&mut self, row: impl Fn(usize) -> &'a [f32]) -> Distances {
+    /// Loads lines from rows across them; false, without that, where all entries are far or all targets.
+    fn load<'a>(&mut self, row: impl Fn(usize) -> &'a [f32]) -> bool {
         let (mut least, mut greatest) = ([FAR; TILE], [0.0; TILE]);
         for q in 0..self.n {
             for ((low, high), &value) in least.iter_mut().zip(&mut greatest).zip(row(q)) {
@@ -168,18 +145,15 @@ impl Lines {
                 *high = value.max(*high);
             }
         }
-        if least.iter().all(|&low| low == FAR) {
-            return Distances::Far;
-        }
-        if greatest.iter().all(|&high| high == 0.0) {
-            return Distances::Zero;
+        if least.iter().all(|&low| low == FAR) || greatest.iter().all(|&high| high == 0.0) {
+            return false;
         }
         for q in 0..self.n {
             for (line, &value) in row(q).iter().enumerate() {
                 self.values[line * self.n + q] = value;
             }
         }
-        Distances::Some
+        true
     }
 
     fn transform(&mut self, width: usize) {

@@ -259,30 +259,36 @@ impl Cover {
     /// Whether each cube, or one next to it, holds a voxel inside or next to one.
     fn active(&self, level: &LevelImage) -> Vec<bool> {
         let grid = level.grid();
-        let [nx, ny, nz] = self.counts;
-        (0..nx * ny * nz)
+        let ([_, ny, nz], [nx, cy, cz]) = (grid.shape, self.counts);
+        // Voxels from one before each cube to one after it, including the neighbouring cubes.
+        let spans = [0, 1, 2].map(|a| {
+            let span = |cube: usize| {
+                let low = self.origin[a] + (cube as f64 - 1.0) * self.edge;
+                let voxel = |x: f64| (x - grid.origin[a]) / grid.spacing[a];
+                let first = (voxel(low).floor() - 1.0).max(0.0);
+                let last =
+                    (voxel(low + 3.0 * self.edge).ceil() + 1.0).min(grid.shape[a] as f64 - 1.0);
+                let end = (last.max(-1.0) + 1.0) as usize;
+                (first as usize).min(end)..end
+            };
+            (0..self.counts[a]).map(span).collect::<Vec<_>>()
+        });
+        let rows = level.values().par_chunks(nz).flat_map_iter(|row| {
+            spans[2].iter().map(move |span| row[span.clone()].iter().any(|&v| v > 0.0))
+        });
+        let along_k: Vec<bool> = rows.collect();
+        // One axis after another: no voxel is looked at for each cube that it is near to.
+        let along_j: Vec<bool> = (0..grid.shape[0] * cy * cz)
             .into_par_iter()
             .map(|c| {
-                let cube = [c / (ny * nz), c / nz % ny, c % nz];
-                // Voxels from one before the cube to one after it, including the neighbouring cubes.
-                let span = |a: usize| {
-                    let low = self.origin[a] + (cube[a] as f64 - 1.0) * self.edge;
-                    let high = low + 3.0 * self.edge;
-                    let voxel = |x: f64| (x - grid.origin[a]) / grid.spacing[a];
-                    let first = (voxel(low).floor() - 1.0).max(0.0);
-                    let last = (voxel(high).ceil() + 1.0).min(grid.shape[a] as f64 - 1.0);
-                    (first as usize)..((last.max(-1.0) + 1.0) as usize)
-                };
-                let [i, j, k] = [span(0), span(1), span(2)];
-                i.clone().any(|i| {
-                    j.clone().any(|j| {
-                        let row = (i * grid.shape[1] + j) * grid.shape[2];
-                        level.values()[row + k.start.min(k.end)..row + k.end]
-                            .iter()
-                            .any(|&v| v > 0.0)
-                    })
-                })
+                spans[1][c / cz % cy]
+                    .clone()
+                    .any(|j| along_k[(c / (cy * cz) * ny + j) * cz + c % cz])
             })
+            .collect();
+        (0..nx * cy * cz)
+            .into_par_iter()
+            .map(|c| spans[0][c / (cy * cz)].clone().any(|i| along_j[i * cy * cz + c % (cy * cz)]))
             .collect()
     }
 }
