@@ -7,6 +7,7 @@ import pytest
 
 import cmfsim
 from benches.scenes import meshes
+from cmfsim.pictures import lateral
 from cmfsim.pictures.lateral import (
     BONE,
     PIXEL,
@@ -40,6 +41,20 @@ def test_a_shell_absorbs_by_its_area_in_front_of_each_pixel():
     exact = 2.0 * 30.0 / np.sqrt(30.0**2 - distance[inner] ** 2)
     assert np.abs(found[inner] / exact - 1.0).max() < 0.06
     assert not found[distance > 33.0].any()
+
+
+@pytest.mark.parametrize(("forwards", "made"), [(1.0, 2), (-1.0, 4)])
+def test_absorption_is_summed_once_for_what_both_views_show_alike(
+    forwards, made, monkeypatch, tmp_path
+):
+    calls = []
+    monkeypatch.setattr(lateral, "_shells", lambda *given: calls.append(given) or _shells(*given))
+    sites = {"N": np.array([40.0, 40.0]), "Me": np.array([40.0, -40.0])}
+    head = {"cranium": ball(8.0)}, ball(40.0), sites
+    before = LateralView(*head, AXES, 0.0)
+    planned = LateralView(*head, AXES * [[forwards], [1.0], [forwards]], 0.0)
+    picture_lateral(tmp_path / "lateral.png", before=before, planned=planned)
+    assert len(calls) == made
 
 
 def test_the_section_lies_on_the_circle_in_the_midsagittal_plane():
