@@ -37,7 +37,7 @@ from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours
 from cmfsim.pictures.window import OVER_BONES, prediction_parts
 from cmfsim.pipeline.predicting import case_for_models, prepare
 from cmfsim.report import Table
-from cmfsim.values.checks import as_positive
+from cmfsim.values.case_parts import EDGE_LENGTHS
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import SEVERITIES, Finding
 from cmfsim.values.mesh_report import MeshReport
@@ -170,8 +170,13 @@ def case_of(options: argparse.Namespace) -> Case:
     """The case given to a command, with the changes given on the command line."""
     case = Case.load(options.case)
     if options.edge_length is not None:
-        edge_length = as_positive("--edge-length", options.edge_length)
-        mesh = dataclasses.replace(case.mesh, edge_length=edge_length)
+        low, high = EDGE_LENGTHS
+        if not low <= options.edge_length <= high:
+            raise CaseInputError(
+                f"--edge-length is {options.edge_length:g}: must be at least {low:g} and at most "
+                f"{high:g} mm"
+            )
+        mesh = dataclasses.replace(case.mesh, edge_length=options.edge_length)
         case = dataclasses.replace(case, mesh=mesh)
     if getattr(options, "plan", None) is not None:
         case = case.with_plan(options.plan)

@@ -64,8 +64,9 @@ LIP_HEIGHTS = (3.0, 30.0)
 MOST_BLUR = 30.0
 # Points in a tet that a muscle's surface crosses.
 SAMPLES = (1, 100_000)
-# Edge lengths that make a mesh of a head, mm: below, more tets than any memory; above, no face.
-EDGE_LENGTHS = (0.3, 30.0)
+# Edge lengths that make a mesh of a head, mm: below, more tets than most memories hold (30 million
+# at 1 mm, a gigabyte each million); above, no face.
+EDGE_LENGTHS = (1.0, 30.0)
 MOST_CLEFT = 20.0
 # Coverages of a band that a calibration of up to a thousand cases can give.
 COVERAGES = (0.001, 0.999)

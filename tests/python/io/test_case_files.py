@@ -183,7 +183,7 @@ WRONG = {
     "frame": ('"RAS"', '"ras"', 9, "surfaces.frame is 'ras'"),
     "no text": ('"../scans/skin.ply"', "3", 7, "surfaces.skin is 3: a text"),
     "no number": ("edge_length = 2.5", 'edge_length = "2.5"', 25, "holds '2.5': a number"),
-    "range": ("edge_length = 2.5", "edge_length = -2.5", 25, "is -2.5: must be at least 0.3"),
+    "range": ("edge_length = 2.5", "edge_length = -2.5", 25, "is -2.5: must be at least 1"),
     "infinity": ("edge_length = 2.5", "edge_length = inf", 25, "must be finite"),
     "nan": ("lower = -40", "lower = nan", 21, "region.lower holds nan"),
     "swapped bounds": ("upper = 120.5", "upper = -41", 21, "lower is -40, upper -41"),
