@@ -23,8 +23,7 @@ fn rough_flexibility_between_directions_equals_the_exact_one() {
         .map(|(k, &node)| (node, unit(0.3 + k as f64, 1.7 * k as f64)))
         .collect();
     let softness: Vec<f64> = (0..directions.len()).map(|k| (k % 3) as f64 * 0.4).collect();
-    let (nodes, axes): (Vec<usize>, Vec<[f64; 3]>) = directions.iter().copied().unzip();
-    let exact = tail.normal_flexibility(&nodes, &axes, &softness);
+    let exact = tail.normal_flexibility(&directions, &softness);
     let rough = tail.rough_flexibility(&directions, &softness, vec![f32::NAN; 400]);
     let x: Vec<f64> =
         (0..directions.len()).map(|k| (k as f64).cos() / exact.column(k)[0].sqrt()).collect();

@@ -102,14 +102,9 @@ impl TailFlexibility {
         Ok(vectors(&lifted.pushes((sliding.as_flattened(), own.as_flattened()), flat)?))
     }
 
-    /// What lifted nodes add to the flexibility between `directions`, node and unit vector each, in numbers that
-    /// `narrow` makes.
-    pub fn more_along<T: Number>(
-        &self,
-        directions: &[(usize, [f64; 3])],
-        narrow: impl Fn(f64) -> T,
-    ) -> Option<LowRank<T>> {
-        self.lifted.as_ref().map(|lifted| lifted.more.along(directions, narrow))
+    /// What lifted nodes add to the flexibility between `directions`: node and unit vector each.
+    pub fn more_along<T: Number>(&self, directions: &[(usize, [f64; 3])]) -> Option<LowRank<T>> {
+        self.lifted.as_ref().map(|lifted| lifted.more.along(directions))
     }
 
     /// The displacements `moved` with what lifted nodes add under `forces`.
@@ -151,19 +146,16 @@ impl TailFlexibility {
         self.with_lifted(self.rough.multiply(forces.as_flattened()), forces)
     }
 
-    /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r constrains node i = `nodes[r]` along
-    /// the unit normal `normals[r]`; a node may have several rows. `softness[r]` (mm/N) is added to the
-    /// diagonal.
+    /// Normal flexibility n_rᵀ S⁻¹_ij n_s of constraint rows: row r constrains node i along the unit normal n_r, its
+    /// direction; a node may have several rows. `softness[r]` (mm/N) is added to the diagonal.
     pub fn normal_flexibility(
         &self,
-        nodes: &[usize],
-        normals: &[[f64; 3]],
+        directions: &[(usize, [f64; 3])],
         softness: &[f64],
     ) -> DenseSymmetric {
-        let directions: Vec<_> = nodes.iter().copied().zip(normals.iter().copied()).collect();
-        let more = self.more_along(&directions, |v| v).map(|more| more.product());
-        DenseSymmetric::from_columns(nodes.len(), |c, column| {
-            let (j, n_j) = (nodes[c], normals[c]);
+        let more = self.more_along(directions).map(|more| more.product());
+        DenseSymmetric::from_columns(directions.len(), |c, column| {
+            let (j, n_j) = directions[c];
             // S⁻¹ n_j for node j and those after it. The columns begin on the diagonal, and the part of the
             // block there that is missing in the second and third is in the first.
             let [c0, c1, c2] = [0, 1, 2].map(|b| self.flexibility.column(3 * j + b));
@@ -176,7 +168,7 @@ impl TailFlexibility {
             }
             along[0] += c0[1] * n_j[1] + c0[2] * n_j[2];
             along[1] += c1[1] * n_j[2];
-            for (out, (&i, n_i)) in column.iter_mut().zip(nodes[c..].iter().zip(&normals[c..])) {
+            for (out, &(i, n_i)) in column.iter_mut().zip(&directions[c..]) {
                 *out = if i >= j {
                     let v = &along[3 * (i - j)..3 * (i - j) + 3];
                     n_i[0] * v[0] + n_i[1] * v[1] + n_i[2] * v[2]

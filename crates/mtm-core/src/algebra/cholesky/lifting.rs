@@ -168,18 +168,13 @@ impl LowRank<f32> {
 }
 
 impl LowRank {
-    /// The same between directions, a node of S and a unit vector each, in numbers that `narrow` makes.
-    pub fn along<T: Number>(
-        &self,
-        directions: &[(usize, [f64; 3])],
-        narrow: impl Fn(f64) -> T,
-    ) -> LowRank<T> {
-        let mut rows = Vec::with_capacity(self.rows.len() / self.count.max(1) * directions.len());
-        for row in self.rows.chunks_exact(self.count.max(1)) {
-            rows.extend(
-                directions.iter().map(|&(node, way)| narrow(dot(&row[3 * node..][..3], &way))),
-            );
-        }
+    /// The same between directions, a node of S and a unit vector each.
+    pub fn along<T: Number>(&self, directions: &[(usize, [f64; 3])]) -> LowRank<T> {
+        let along =
+            |row: &[f64], (node, way): (usize, [f64; 3])| T::of(dot(&row[3 * node..][..3], &way));
+        let rows = self.rows.chunks_exact(self.count.max(1));
+        let rows =
+            rows.flat_map(|row| directions.iter().map(move |&way| along(row, way))).collect();
         LowRank::new(directions.len(), rows)
     }
 

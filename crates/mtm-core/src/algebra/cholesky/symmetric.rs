@@ -29,15 +29,23 @@ const SUMS: usize = 8;
 pub trait Number: Copy + Default + Send + Sync + AddAssign + Mul<Output = Self> + Sum {
     /// Runs [`DotsAndAdd`] in as many lanes as a register has.
     fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE];
+    /// The nearest one.
+    fn of(value: f64) -> Self;
 }
 
 impl Number for f64 {
+    fn of(value: f64) -> Self {
+        value
+    }
     fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE] {
         pass.in_lanes::<LANES>()
     }
 }
 
 impl Number for f32 {
+    fn of(value: f64) -> Self {
+        value as f32
+    }
     fn dots_and_add(pass: DotsAndAdd<'_, Self>) -> [Self; COLUMNS_AT_ONCE] {
         pass.in_lanes::<{ 2 * LANES }>()
     }

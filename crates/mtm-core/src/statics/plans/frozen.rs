@@ -37,11 +37,10 @@ impl FrozenContact {
         let unstable: Vec<Spring> = springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
         let n = rows.rows.len();
         let axes = unstable.iter().map(|s| (s.node, s.axis));
-        let all = rows.rows.iter().map(|r| (r.node, r.normal)).chain(axes);
-        let (nodes, directions): (Vec<usize>, Vec<[f64; 3]>) = all.unzip();
+        let all: Vec<_> = rows.rows.iter().map(|r| (r.node, r.normal)).chain(axes).collect();
         let mut softness = rows.softness.clone();
-        softness.resize(nodes.len(), 0.0);
-        let whole = tail.normal_flexibility(&nodes, &directions, &softness);
+        softness.resize(all.len(), 0.0);
+        let whole = tail.normal_flexibility(&all, &softness);
         let part = DenseSymmetric::from_columns(n, |c, column| {
             column.copy_from_slice(&whole.column(c)[..n - c]);
         });

@@ -25,13 +25,14 @@ impl Along {
         unstable: &[Spring],
         memory: Vec<f32>,
     ) -> Self {
-        let directions = directions(rows, unstable);
+        let rows_of = rows.rows.iter().map(|r| (r.node, r.normal));
+        let directions: Vec<_> = rows_of.chain(unstable.iter().map(|s| (s.node, s.axis))).collect();
         let mut order: Vec<usize> = (0..directions.len()).collect();
         order.sort_by_key(|&i| directions[i].0);
         let sorted: Vec<(usize, [f64; 3])> = order.iter().map(|&i| directions[i]).collect();
         let soft = |i: usize| rows.softness.get(i).copied().unwrap_or(0.0);
         let softness: Vec<f64> = order.iter().map(|&i| soft(i)).collect();
-        let more = tail.more_along(&sorted, |v| v as f32);
+        let more = tail.more_along(&sorted);
         Self { matrix: tail.rough_flexibility(&sorted, &softness, memory), more, order }
     }
 
@@ -54,10 +55,4 @@ impl Along {
     pub fn into_memory(self) -> Vec<f32> {
         self.matrix.into_memory()
     }
-}
-
-/// Node of each direction, and the unit vector.
-fn directions(rows: &ConditionRows, unstable: &[Spring]) -> Vec<(usize, [f64; 3])> {
-    let rows = rows.rows.iter().map(|r| (r.node, r.normal));
-    rows.chain(unstable.iter().map(|s| (s.node, s.axis))).collect()
 }

@@ -57,9 +57,8 @@ impl ConditionRows {
 
     /// Nᵀ S⁻¹ N with the softness.
     pub(super) fn flexibility(&self, tail: &TailFlexibility) -> DenseSymmetric {
-        let nodes: Vec<usize> = self.rows.iter().map(|r| r.node).collect();
-        let normals: Vec<[f64; 3]> = self.rows.iter().map(|r| r.normal).collect();
-        tail.normal_flexibility(&nodes, &normals, &self.softness)
+        let directions: Vec<_> = self.rows.iter().map(|r| (r.node, r.normal)).collect();
+        tail.normal_flexibility(&directions, &self.softness)
     }
 
     /// The factor of the flexibility.
