@@ -100,10 +100,11 @@ def _tilted(folder: Path, image: cmfsim.ImageData, tilt: float) -> None:
 
 def command(folder: Path, *words: str) -> tuple[int, str, float]:
     """Exit code, last lines and processor seconds of a command."""
+    # The writer of DICOM sets this process's own locale back to ASCII.
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(  # noqa: S603
-        [sys.executable, "-m", "cmfsim", *words], cwd=folder, capture_output=True, text=True,
-        timeout=SECONDS, check=False,
+        [sys.executable, "-m", "cmfsim", *words], cwd=folder, capture_output=True,
+        encoding="utf-8", timeout=SECONDS, check=False,
     )  # fmt: skip
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
