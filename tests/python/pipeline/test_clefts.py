@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.pipeline.building.skin import held_part
+from cmfsim.pipeline.building.skin import held_part, lifted_where_held
 from cmfsim.pipeline.building.tissue.contacts import (
     cleft_tets,
     crushed_tets,
     without_clefts,
     without_crushed,
 )
+from cmfsim.values.patient_model import LiftedTissue
 
 EDGE = 1.0
 
@@ -178,17 +179,50 @@ def test_crushed_tissue_is_reported_with_its_volume(bite):
     assert without_crushed(mesh, kinds, segments, {}, 4.0) == (mesh, kinds, ())
 
 
-def test_a_body_that_hangs_by_an_edge_goes():
-    """Two cubes share an edge: each is held only by what is held of its own."""
+def hinged(*sides):
+    """Two cubes that share an edge, fixed at these x."""
     nodes, tets = block((2, 2, 1))
     corner = nodes[tets].mean(axis=1)
     tets = tets[(corner[:, 0] < 1) == (corner[:, 1] < 1)]
     used, tets = np.unique(tets, return_inverse=True)
-    mesh = cmfsim.TetMesh(nodes[used], tets.reshape(-1, 4))
-    held = nodes[used][:, 0] == 0.0
+    held = np.isin(nodes[used][:, 0], sides)
     kinds = cmfsim.NodeKinds(held.astype(np.uint8), np.full(len(used), -1), ())
+    return cmfsim.TetMesh(nodes[used], tets.reshape(-1, 4)), kinds
+
+
+def test_a_body_that_hangs_by_an_edge_goes():
+    """Two cubes share an edge: each is held only by what is held of its own."""
+    mesh, kinds = hinged(0.0)
     left, now, findings = held_part(mesh, kinds)
     assert left.n_tets == 6
     assert np.asarray(left.nodes)[:, 0].max() == 1.0
     assert len(now.nodes("fixed")) == 4
     assert [(f.code, f.severity) for f in findings] == [("tissue-not-held", "note")]
+
+
+def test_no_plan_lifts_a_body_off_all_that_holds_it():
+    """Of two cubes that share an edge, lifted nodes alone hold one: these stay on the bone."""
+    mesh, kinds = hinged(0.0, 2.0)
+    nodes = np.asarray(mesh.nodes)
+    # All of the far side may be lifted, and one node of the near one, which four hold.
+    far = np.flatnonzero(nodes[:, 0] == 2.0)
+    near = np.flatnonzero((nodes[:, 0] == 0.0) & (nodes[:, 1] <= 1.0))[:1]
+    chosen = np.concatenate([far, near]).astype(np.uint32)
+    n = len(chosen)
+    lifted = LiftedTissue(
+        skull="cranium",
+        is_joined=False,
+        pieces=("maxilla",),
+        nodes=chosen,
+        piece=np.zeros(n, dtype=np.int64),
+        places=nodes[chosen],
+        normals=np.tile([0.0, -1.0, 0.0], (n, 1)),
+    )
+    left = lifted_where_held(mesh, kinds, lifted)
+    assert left.nodes.tolist() == near.tolist()
+    fixed = np.setdiff1d(kinds.nodes("fixed"), left.free({"maxilla": np.eye(4)}))
+    tensors = cmfsim.MassTensors(mesh, cmfsim.Tissue.isotropic(np.ones(mesh.n_tets), 0.3))
+    cmfsim.StaticSolver(tensors, cmfsim.Boundary(fixed=fixed))
+    every = np.setdiff1d(kinds.nodes("fixed"), lifted.free({"maxilla": np.eye(4)}))
+    with pytest.raises(cmfsim.BoundaryError, match="free rigid modes"):
+        cmfsim.StaticSolver(tensors, cmfsim.Boundary(fixed=every)).solve({})

@@ -30,6 +30,7 @@ from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.patient_model import LiftedTissue
 from cmfsim.values.surface_data import SurfaceData, used_nodes
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 
@@ -48,13 +49,7 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     Raises `MeshError`: Nothing of it is held.
     """
     tets = mesh.tets
-    body = tet_bodies(tets)
-    n_bodies = int(body.max(initial=-1)) + 1
-    holds = np.isin(kinds.kind, (1, 2))
-    corner = holds[tets]
-    # Each held node once for each body that it is in.
-    held = np.unique(np.repeat(body, 4)[corner.ravel()] * mesh.n_nodes + tets[corner])
-    loose = np.bincount(held // mesh.n_nodes, minlength=n_bodies) < LEAST_HELD
+    body, loose = _loose_bodies(tets, np.isin(kinds.kind, (1, 2)))
     if not loose.any():
         return mesh, kinds, ()
     if loose.all():
@@ -79,6 +74,25 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
         else "check skin and bone nearby; a larger bone threshold or closing may have cut them off",
     )
     return kept, kinds.of_nodes(used), (finding,)
+
+
+def _loose_bodies(
+    tets: Indices, holds: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """The body of each tet, and which bodies too few of the nodes hold that `holds` marks."""
+    body, corner = tet_bodies(tets), holds[tets]
+    # Each held node once for each body that it is in.
+    held = np.unique(np.repeat(body, 4)[corner.ravel()] * len(holds) + tets[corner])
+    counts = np.bincount(held // len(holds), minlength=int(body.max(initial=-1)) + 1)
+    return body, counts < LEAST_HELD
+
+
+def lifted_where_held(mesh: TetMesh, kinds: NodeKinds, lifted: LiftedTissue) -> LiftedTissue:
+    """The lifted nodes without those of bodies that too little else holds: these would drift."""
+    holds = np.isin(kinds.kind, (1, 2))
+    holds[lifted.nodes] = False
+    body, loose = _loose_bodies(mesh.tets, holds)
+    return lifted.without(np.unique(mesh.tets[loose[body]]))
 
 
 # Nodes of a lip further than this from the other lip, or from the teeth, do not come to them, mm.

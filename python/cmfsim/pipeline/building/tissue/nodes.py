@@ -36,7 +36,12 @@ from cmfsim.pipeline.building.case_checks import (
     untouched,
 )
 from cmfsim.pipeline.building.inputs import stated_frame
-from cmfsim.pipeline.building.skin import held_part, lip_contact, separated_at_seam
+from cmfsim.pipeline.building.skin import (
+    held_part,
+    lifted_where_held,
+    lip_contact,
+    separated_at_seam,
+)
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import (
@@ -298,6 +303,7 @@ def nodes_of(
             stages.add(held.findings)
             kinds = held.kinds
             lifted = None if lifted is None else lifted.without(held.nodes)
+        lifted = None if lifted is None else lifted_where_held(mesh, kinds, lifted)
         report = report if counted is None else counted.result()
     return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
 
