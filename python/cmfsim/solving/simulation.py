@@ -142,7 +142,8 @@ def solve_scene(scene: Scene, *, solver: StaticSolver | None = None) -> SceneRes
     ----------
     scene : Scene
     solver : StaticSolver, optional
-        Of this scene, with any plan and loads, if `scene_solver` has already made one.
+        Of this scene, with any plan and loads, if `scene_solver` has already made one. What touches
+        from one side and the solver's other options cannot be compared with those of the scene.
 
     Returns
     -------
@@ -190,6 +191,12 @@ def _check_solver(solver: StaticSolver, scene: Scene) -> None:
         "fixed nodes": [(given.fixed, needed.fixed)],
         "joined nodes": [(given.joined.get(name), j) for name, j in needed.joined.items()],
         "sliding nodes": [(given.sliding.get(name), s) for name, s in needed.sliding.items()],
+        "contact surfaces": [
+            (getattr(given.contact.get(name), of, None), getattr(surface, of))
+            for name, surface in needed.contact.items()
+            for of in ("vertices", "triangles")
+        ],
+        "gaps": [(given.gap.get(name), gap) for name, gap in needed.gap.items()],
         "element": [(solver.tensors.element, options.element)],
         "kinematics": [(solver.kinematics, options.kinematics)],
         "tissue": [(tissue.stiffness(), _tissue(scene.tissue).stiffness())],

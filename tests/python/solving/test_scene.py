@@ -14,6 +14,7 @@ from block_scene import HIGH, LOW, NODES, SIDE, TETS, floor, scene, tissue
 
 import cmfsim
 
+LOWER = np.asarray(floor().vertices) - [0.0, 0.0, 0.1]
 KINDS = ["isotropic", "transversely_isotropic", "stiffness", "preset"]
 
 
@@ -76,6 +77,24 @@ def test_a_solver_of_another_scene_is_refused(change, said):
     assert same.summary["residual"] >= 0.0
     with pytest.raises(cmfsim.BoundaryError, match=f"other {said}"):
         cmfsim.solve_scene(dataclasses.replace(one, **change), solver=solver)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"gap": np.full(len(LOW), 0.2)}, "gaps"),
+        ({"contact": cmfsim.SurfaceData(LOWER, floor().triangles)}, "contact surfaces"),
+    ],
+)
+def test_a_solver_with_other_contact_is_refused(change, said):
+    one = scene()
+    solver = cmfsim.scene_solver(one)
+    segments = dict(one.segments)
+    segments["floor"] = dataclasses.replace(segments["floor"], **change)
+    plan = {**one.plan, "floor": np.eye(4)}
+    other = dataclasses.replace(one, segments=segments, plan=plan)
+    with pytest.raises(cmfsim.BoundaryError, match=f"other {said}"):
+        cmfsim.solve_scene(other, solver=solver)
 
 
 def test_a_result_survives_its_file(tmp_path):
