@@ -9,7 +9,7 @@ from synthetic_head import AIR, SOFT, made_head
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
 pytest.importorskip("scipy.ndimage", reason="needs scipy")
 
-# How far the neck goes on below the made head, mm.
+# How far the neck goes on below the synthetic head, mm.
 NECK = 60.0
 
 

@@ -1,4 +1,4 @@
-"""The segmentation of a made head with known truth."""
+"""The segmentation of a synthetic head with known truth."""
 
 import numpy as np
 import pytest

@@ -153,7 +153,7 @@ def test_the_real_jaws_are_parted_without_landmarks(coarse_phantom, reference):
     assert parted_as(anatomy, reference) > 0.85
 
 
-# Its small twin is the test of the made head that is flipped.
+# Its small twin is the test of the synthetic head that is flipped.
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [1, 2])
 def test_a_flipped_real_ct_is_found(coarse_phantom, axis):
