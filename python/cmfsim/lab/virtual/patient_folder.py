@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim._core import __version__
-from cmfsim.errors import CaseInputError
+from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cases.cohorts import COHORT_FORMAT
 from cmfsim.io.files.reading_writing import replacing
@@ -220,6 +220,8 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     as_positive("skin_spacing", skin_spacing)
     if as_number("seed", seed) < 0 or int(seed) != seed:
         raise CaseInputError(f"seed is {seed!r}: a whole number from 0 is needed")
+    for package in ("skfem", "pyamg"):  # before half a minute of work
+        third_party(package, "virtual patients are solved", "study")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     stage = progress or no_progress

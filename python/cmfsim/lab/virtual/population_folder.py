@@ -122,7 +122,8 @@ def virtual_population(  # noqa: PLR0913 (options by name)
     ------
     CaseError
         (also `ValueError`) An invalid count, seed, number of workers or length; a folder that
-        contains a population of another seed, truth or resolution; a worker that died.
+        contains a population of another seed, truth or resolution; a worker that died; a missing
+        package of the extra "study".
     OSError
         The folder cannot be written to.
 
@@ -220,6 +221,9 @@ def make_patient(**values: Any) -> tuple[str, str]:
             skin_spacing=SKIN_SPACING * job.edge_length,
         )
     except (CmfsimError, np.linalg.LinAlgError) as error:
+        # The computer lacks a package: no patient failed, and once it is installed, none is to.
+        if isinstance(error.__cause__, ImportError):
+            raise
         found = {"settings": settings, "reason": str(error)}
         with replacing(failure) as file:
             file.write(json.dumps(found, indent=1).encode())

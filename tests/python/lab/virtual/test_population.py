@@ -265,6 +265,15 @@ def test_a_failure_is_recorded_and_not_tried_again(tmp_path, monkeypatch):
     assert record["reason"] == "Newton's method stalls"
 
 
+def test_a_missing_package_is_no_failure_of_a_patient(tmp_path, monkeypatch):
+    """It ends the command before a head is made, and leaves nothing that a later run believes."""
+    monkeypatch.setitem(sys.modules, "pyamg", None)
+    job = {"folder": str(tmp_path), "seed": 1, "index": 4, **COARSE}
+    with pytest.raises(CaseInputError, match=r"pyamg, which cannot be imported.*\[study\]"):
+        population_folder.make_patient(**job)
+    assert list(tmp_path.rglob("*.*")) == []
+
+
 def test_failures_are_in_the_record_and_counted(tmp_path, monkeypatch, capsys):
     """D002 fails: it stays in population.json with the reason, in its part, and is named."""
 
