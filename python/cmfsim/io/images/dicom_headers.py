@@ -76,8 +76,8 @@ class DicomHeader:
 
     tags: By name; absent where the file does not state it.
     frames: What an enhanced multi-frame image states of each frame, in the order of its pixels.
-    odd: The first byte of each private element of no known kind and that after its last, in the
-        file without those before.
+    odd: The first byte of each private element of no known kind, and of what fills the file up
+        behind its pixels, and that after its last, in the file without those before.
     """
 
     path: Path
@@ -89,8 +89,8 @@ class DicomHeader:
     def for_reader(self) -> bytes | None:
         """The file as ITK reads it rightly; None if it does so as it is.
 
-        Private elements of no known kind, which not all readers pass, are left out. Pixels that
-        are shown inverted would be inverted, although that does not concern their values in HU.
+        Private elements of no known kind and fillers, which not all readers pass, are left out.
+        Pixels that are shown inverted would be inverted, which does not concern their values in HU.
         """
         inverted = self.text("photometric") == SHOWN_INVERTED
         if not (self.odd or inverted):
@@ -153,7 +153,7 @@ def dicom_header(path: Path) -> DicomHeader | None:
                     elements = _Elements(stream)
                     found = reader.read_partial(stream, elements, force=True, specific_tags=TAGS)
                     if elements.odd is None:
-                        return _header(path, found, elements, tuple(odd))
+                        return _header(path, found, elements, (*odd, *elements.filler()))
                     odd.append(elements.odd)
                     raw = stream.without(*elements.odd)
             message = f"has more than {MOST_ODD} elements of no known kind (VR): {REWRITE}"
@@ -247,6 +247,19 @@ class _Elements:
             raise ValueError(message)
         return False
 
+    def filler(self) -> tuple[tuple[int, int], ...]:
+        """The bytes behind pixels of a stated length, if they are no element but fill a block."""
+        if self.pixels in {None, UNDEFINED} or self.left <= (length := self.pixels or 0):
+            return ()
+        end = self.stream.size - self.left + length
+        self.stream.seek(end)
+        head = self.stream.read(8) if self.left - length >= 8 else b""
+        if head and self.explicit:
+            is_element = head[4:6].decode("latin-1") in KINDS
+        else:
+            is_element = bool(head) and 0 < struct.unpack("<4xI", head)[0] <= self.left - length - 8
+        return () if is_element else ((end, self.stream.size),)
+
     def _span_of_no_kind(self, tag: int) -> tuple[int, int]:
         """The bytes of an element whose kind is none, if what follows it shows how many they are.
 
@@ -292,13 +305,13 @@ def _header(
         message = "it has no pixels, or does not state their rows and columns"
         raise ValueError(message)
     if elements.pixels not in {None, UNDEFINED}:
-        needed = elements.pixels or 0
+        needed = stated = elements.pixels or 0
         if "bits" in tags:
             # Readers give zeros for pixels that are not there.
             each = int(tags["rows"]) * int(tags["columns"]) * int(tags.get("samples", 1))
             needed = each * (int(tags["bits"]) // 8) * header.count
-        if elements.left < needed:
-            message = f"{elements.left} of {needed} bytes of pixels"
+        if min(elements.left, stated) < needed:
+            message = f"{min(elements.left, stated)} of {needed} bytes of pixels"
             raise ValueError(message)
     return header
 

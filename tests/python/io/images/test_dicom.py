@@ -245,6 +245,27 @@ def test_private_elements_of_no_known_kind_are_passed_over(tmp_path, odd):
     same(read_image_file(tmp_path / "ct"), noisy())
 
 
+@pytest.mark.parametrize("filler", [bytes(6), bytes(512), b"\xff" * 300])
+def test_what_fills_a_file_up_behind_its_pixels_is_passed_over(tmp_path, filler):
+    """As on media of fixed blocks; the reader of pixels takes some lengths for elements."""
+    explicit_series(tmp_path / "ct")
+    for path in (tmp_path / "ct").iterdir():
+        path.write_bytes(path.read_bytes() + filler)
+    same(read_image_file(tmp_path / "ct"), noisy())
+
+
+def test_pixels_whose_stated_length_is_too_short_are_refused(tmp_path):
+    """A reader gives zeros for the rest, although it is in the file."""
+    explicit_series(tmp_path / "ct")
+    path = tmp_path / "ct" / "3.dcm"
+    data, head = path.read_bytes(), b"\xe0\x7f\x10\x00OW\0\0"
+    length = 2 * noisy().values[:, :, 0].size
+    path.write_bytes(
+        data.replace(head + struct.pack("<I", length), head + struct.pack("<I", length - 2))
+    )
+    refused(tmp_path / "ct", "3.dcm", f"{length - 2} of {length} bytes of pixels")
+
+
 def test_an_element_whose_end_is_not_found_is_named_with_a_remedy(tmp_path):
     explicit_series(tmp_path / "ct")
     with_elements(tmp_path / "ct" / "3.dcm", private(b"\0\0", struct.pack("<H", 9999)))
