@@ -98,9 +98,7 @@ def read_mesh(path: Path) -> PlainMesh:
 def _by_meshio(path: Path) -> PlainMesh:
     suffix = path.suffix.lower()
     if suffix in NAME_OTHERS or not suffix:
-        raise CaseInputError(
-            f"files of {suffix or 'no ending'} are not supported: save it as .vtu (meshio convert)"
-        )
+        raise _unsupported(suffix)
     if find_spec("meshio") is None:
         raise CaseInputError(
             f"files of {suffix} are read with meshio: pip install '.[mesh]' in cmfsim's folder; "
@@ -132,9 +130,18 @@ def _by_meshio(path: Path) -> PlainMesh:
     return PlainMesh(points, tuple(blocks), point_data, cell_data)
 
 
+def _unsupported(suffix: str) -> CaseInputError:
+    return CaseInputError(
+        f"files of {suffix or 'no ending'} are not supported: save a surface as .stl, .ply, .obj "
+        "or .vtp, tets as .vtu"
+    )
+
+
 def meshio_answer(path: str) -> Answer:
     """What meshio reads from a file; called in the child process."""
     meshio: Any = import_module("meshio")
+    if not path.lower().endswith(tuple(meshio.extension_to_filetypes)):
+        raise _unsupported(Path(path).suffix.lower())
     try:
         # meshio prints what it finds and, in some readers, exits: neither is the caller's.
         with (

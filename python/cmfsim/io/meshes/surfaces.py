@@ -93,7 +93,7 @@ def _scale(path: Path, units: str, frame: str | None, stated: str | None) -> NDA
         check_one_of("frame", frame, FRAMES)
     if frame is not None and stated is not None and frame != stated:
         raise CaseInputError(
-            f"{path.name}: its header states {stated}, and frame is {frame}: remove frame(it is "
+            f"{path.name}: its header states {stated}, and frame is {frame}: remove frame (it is "
             "for files that state none), or export the file again"
         )
     # RAS to LPS is half a turn about the long axis: triangles keep their orientation.

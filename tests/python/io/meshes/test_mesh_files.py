@@ -2,6 +2,7 @@
 
 import os
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -415,9 +416,10 @@ def test_other_volume_elements_are_refused_not_left_out(tmp_path):
             cmfsim.read_tet_mesh(path)
 
 
-def test_files_that_name_other_files_are_refused(tmp_path):
-    for name in ("it.xdmf", "it.ele", "it"):
-        refused(saved(tmp_path, name, "<Xdmf/>"), "are not supported: save it as .vtu")
+def test_files_that_name_others_or_have_no_reader_are_refused(tmp_path):
+    for name in ("it.xdmf", "it.ele", "it", "it.stl.gz", "it.glb"):
+        ending = f"files of {Path(name).suffix or 'no ending'} are not supported"
+        refused(saved(tmp_path, name, "<Xdmf/>"), f"{ending}: save a surface as .stl")
 
 
 # What is no file.
