@@ -1,5 +1,6 @@
 """Meshes and images that other libraries hold in memory: meshio, PyVista, nibabel."""
 
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -8,13 +9,15 @@ import numpy as np
 
 from cmfsim._core import TetMesh
 from cmfsim.errors import ImageInputError
-from cmfsim.io.images.image_files import placed
+from cmfsim.io.images.image_files import logged, placed
 from cmfsim.io.images.image_headers import check_affine, check_shape
 from cmfsim.io.meshes.mesh_files import read_tets
 from cmfsim.io.meshes.plain_mesh import NAMES, Cells, PlainMesh, oriented
 from cmfsim.io.meshes.surfaces import surface_of
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
+
+_log = logging.getLogger(__name__)
 
 # nibabel's names of units of length, mm; others state none, and are mm.
 UNITS = {"meter": 1000.0, "micron": 0.001}
@@ -79,7 +82,8 @@ def from_nibabel(image: Any) -> ImageData:
     ----------
     image : nibabel image
         (nx, ny, nz), one number per voxel; its affine leads to RAS, in mm unless its header states
-        another unit. Oblique axes are resampled (SimpleITK).
+        another unit; a warning is logged if its codes say that this is a guess. Oblique axes are
+        resampled (SimpleITK).
 
     Raises
     ------
@@ -100,4 +104,8 @@ def from_nibabel(image: Any) -> ImageData:
     unit = UNITS.get(units[0], 1.0)
     affine = np.array([[-unit], [-unit], [unit]]) * np.asarray(image.affine)[:3]
     check_affine(name, affine, (shape[0], shape[1], shape[2]))
-    return placed(Path(name), values, affine, ()).image
+    asked = [getattr(image, get, None) for get in ("get_qform", "get_sform")]
+    codes = [get(coded=True)[1] for get in asked if get is not None]
+    if codes and not any(codes):
+        _log.warning("%s: its codes qform and sform are 0: its axes are nibabel's guess", name)
+    return logged(placed(Path(name), values, affine, ()))

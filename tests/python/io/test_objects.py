@@ -90,11 +90,27 @@ def test_images_that_are_no_volume_are_refused(nib):
         cmfsim.from_nibabel(nib.Nifti1Image(np.zeros((4, 5, 6, 2)), np.eye(4)))
     with pytest.raises(ImageInputError, match="not a set of axes"):
         cmfsim.from_nibabel(nib.Nifti1Image(voxels, np.ones((4, 4))))
-    voxels[1, 2, 3] = np.nan
-    with pytest.raises(ImageInputError, match="1 voxels are NaN"):
+    voxels[1, 2, 3] = np.inf
+    with pytest.raises(ImageInputError, match="1 voxels are NaN or infinite"):
         cmfsim.from_nibabel(nib.Nifti1Image(voxels, np.eye(4)))
     with pytest.raises(ImageInputError, match="no affine"):
         cmfsim.from_nibabel(nib.Nifti1Image(voxels, None))
+
+
+def test_what_was_assumed_of_an_image_is_logged(nib, caplog):
+    """Axes without a code, and voxels that are no number."""
+    voxels = np.zeros((4, 5, 6), dtype=np.float32)
+    voxels[1, 2, 3], voxels[0] = -1000.0, np.nan
+    image = nib.Nifti1Image(voxels, np.eye(4))
+    given = cmfsim.from_nibabel(image)
+    assert given.values.min() == -1000.0
+    assert np.count_nonzero(given.values == -1000.0) == 31
+    assert "30 voxels (25.0%) are no number: read as -1000" in caplog.text
+    assert "guess" not in caplog.text
+    image.set_sform(None, 0)
+    image.set_qform(None, 0)
+    cmfsim.from_nibabel(image)
+    assert "its codes qform and sform are 0" in caplog.text
 
 
 def test_repaired_tets_are_those_of_a_mesh_with_a_count_of_each_change():

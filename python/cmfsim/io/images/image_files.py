@@ -1,6 +1,7 @@
 """Images: which reader a file has by its content; DICOM's pixels, and writing, by ITK."""
 
 import glob
+import logging
 import shutil
 from dataclasses import dataclass
 from importlib import import_module
@@ -22,6 +23,8 @@ from cmfsim.processes.worker import Answer
 from cmfsim.values.checks import AnyPath
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+
+_log = logging.getLogger(__name__)
 
 # What the child process imports before the time of a file begins.
 LIBRARIES = ("SimpleITK",)
@@ -116,6 +119,8 @@ class ImageFile:
 def read_image(path: AnyPath, *, series: str | None = None) -> ImageData:
     """The image of a file or a DICOM folder, in LPS on an axis-aligned grid.
 
+    Warnings about the file, such as a frame that it does not state, are logged.
+
     Parameters
     ----------
     path : path
@@ -136,7 +141,15 @@ def read_image(path: AnyPath, *, series: str | None = None) -> ImageData:
     >>> import cmfsim
     >>> image = cmfsim.read_image("head.nii.gz")
     """
-    return read_image_file(path, series=series).image
+    return logged(read_image_file(path, series=series))
+
+
+def logged(read: ImageFile) -> ImageData:
+    """The image, with its warnings in the log, for callers who are not given the findings."""
+    for finding in read.findings:
+        if finding.severity == "warning":
+            _log.warning("%s: %s", finding.where, finding.what)
+    return read.image
 
 
 def read_image_file(path: AnyPath, *, series: str | None = None) -> ImageFile:
@@ -229,10 +242,23 @@ def placed(
 ) -> ImageFile:
     """The image of voxels with their map to LPS, on axes of the patient."""
     if values.dtype.kind == "f":
-        count = sum(int(np.count_nonzero(~np.isfinite(layer))) for layer in values.T)
-        if count:
+        nan, infinite = (
+            sum(int(np.count_nonzero(is_it(layer))) for layer in values.T)
+            for is_it in (np.isnan, np.isinf)
+        )
+        if infinite or nan == values.size:
             raise ImageInputError(
-                f"{path.name}: {count} voxels are NaN or infinite: every value must be finite"
+                f"{path.name}: {nan + infinite} voxels are NaN or infinite: export it with numbers "
+                "(air has -1000 HU)"
             )
+        if nan:
+            # As programs leave what lies outside the field of view when they resample an image.
+            lowest = float(np.nanmin(values))
+            values = np.nan_to_num(values, nan=lowest)
+            what = f"{nan} voxels ({nan / values.size:.1%}) are no number: read as {lowest:g}"
+            fix = "nothing to do if they lie outside the head; otherwise export the image again"
+            why = "a program that resamples an image leaves them where it has no data"
+            odd = Finding("field-ignored", what, where=path.name, why=why, fix=fix)
+            findings = (*findings, odd)
     image, more = on_axes(values, affine, path.name)
     return ImageFile(image, "", (*findings, *more))

@@ -101,10 +101,12 @@ def test_units_of_a_nifti_are_applied_to_spacing_and_place(tmp_path, units, scal
     assert not found.findings
 
 
-def test_what_a_file_does_not_state_is_reported(tmp_path):
+def test_what_a_file_does_not_state_is_reported(tmp_path, caplog):
     straight = [[1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 2, 7]]
     assert codes(write_nifti(tmp_path / "a.nii", units=0, rows=straight)) == ["image-unit-unstated"]
     assert codes(write_nifti(tmp_path / "b.nii", sform=0)) == ["frame-unstated"]
+    read_image(tmp_path / "b.nii")
+    assert "b.nii: its codes qform and sform are 0" in caplog.text
     bare = {"space": None, "space directions": None, "space origin": None, "spacings": "1 1 2"}
     found = read_image_file(write_nrrd(tmp_path / "c.nrrd", **bare))
     assert [f.code for f in found.findings] == ["frame-unstated"]
