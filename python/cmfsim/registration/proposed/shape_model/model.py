@@ -42,8 +42,11 @@ class Kernel:
         """Of one component of the displacement at points a and b, (n, k) mm²."""
         squares = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T
         total: Floats = np.zeros_like(squares)
+        part = np.empty_like(squares)
         for length, deviation in self.parts:
-            total += deviation**2 * np.exp(-squares / length**2)
+            np.exp(np.divide(squares, -(length**2), out=part), out=part)
+            part *= deviation**2
+            total += part
         return total
 
     def sides_covariance(self, points: Floats) -> Floats:
