@@ -18,12 +18,14 @@ class SideView:
 
     letter: "L" or "R".
     side: 1 on the left, −1 on the right.
+    middle: mm. Where the midline of nose and orbits lies in `front`.
     front, outer, jaw: The cranium from in front, not mirrored; cranium and mandible from this side.
     mandible: (n, 3). Points of the mandible, mirrored for the right side.
     """
 
     letter: str
     side: float
+    middle: float
     front: DepthMap
     outer: DepthMap
     jaw: DepthMap
@@ -60,7 +62,7 @@ def find_orbit(view: SideView) -> Orbit | None:
     """The orbit of a side: the largest hollow beside the nose; None where there is none."""
     front = view.front
     ndimage = third_party("scipy.ndimage", "landmarks are proposed", "imaging")
-    x = view.side * front.rows
+    x = view.side * (front.rows - view.middle)
     room = ((x > ORBIT_X[0]) & (x < ORBIT_X[1]))[:, None] & (
         (front.columns > ORBIT_Z[0]) & (front.columns < ORBIT_Z[1])
     )[None]
@@ -80,7 +82,8 @@ def find_orbit(view: SideView) -> Orbit | None:
     zs = np.quantile(height, [0.02, 0.98])
     middle = float(xs.mean()) + LATERAL_RIM
     near = np.abs(across - middle) < 3.0
-    return Orbit(middle, float(zs.mean()), float(height[near].min()), float(height[near].max()))
+    out = middle + view.side * view.middle
+    return Orbit(out, float(zs.mean()), float(height[near].min()), float(height[near].max()))
 
 
 # The bulge of the forehead is where its profile lies farthest in front of a chord of this length

@@ -36,7 +36,7 @@ def find_skin_sites(front: DepthMap, skull: Mapping[str, Floats]) -> Sites:
     """
     found: Sites = {}
     if "nasion" in skull:
-        _put(front, "nasion", 0.0, skull["nasion"][2] - NASION_BELOW, found)
+        _put(front, "nasion", skull["nasion"][0], skull["nasion"][2] - NASION_BELOW, found)
     tip = _tip(front, skull)
     if tip is not None:
         found["pronasale"] = tip
@@ -171,7 +171,8 @@ def _eye(
     upper, lower = skull.get(f"supraorbital_{letter}"), skull.get(f"suborbital_{letter}")
     if upper is None or lower is None:
         return
-    across = 0.5 * abs(upper[0] + lower[0])
+    middle = skull["nasion"][0] if "nasion" in skull else 0.0
+    across = side * (0.5 * (upper[0] + lower[0]) - middle)
     height = 0.5 * (upper[2] + lower[2])
     for name, share in (("endocanthion", INNER_CORNER), ("exocanthion", OUTER_CORNER)):
-        _put(front, f"{name}_{letter}", side * share * across, height - EYE_BELOW, found)
+        _put(front, f"{name}_{letter}", middle + side * share * across, height - EYE_BELOW, found)

@@ -13,6 +13,7 @@ from cmfsim.registration.proposed.definitions.profile import (
     upper_end,
 )
 from cmfsim.registration.proposed.definitions.side_sites import (
+    ORBIT_Z,
     SideView,
     Sites,
     find_orbit,
@@ -66,51 +67,47 @@ def skull_views(cranium: Floats, mandible: Floats) -> SkullViews:
 def find_skull_sites(views: SkullViews) -> Sites:
     """The sites that are found, (3,) each, average-head mm."""
     found: Sites = {}
+    # Nose and orbits of an uneven face lie beside the plane of symmetry of the whole cranium.
+    front = views.cranium_front
+    middle = local_midline(front, ORBIT_Z) or 0.0
     sides = [
-        SideView(
-            letter=letter,
-            side=side,
-            front=views.cranium_front,
-            outer=outer,
-            jaw=jaw,
-            mandible=views.mandible * [side, 1.0, 1.0],
-        )
+        SideView(letter, side, middle, front, outer, jaw, views.mandible * [side, 1.0, 1.0])
         for letter, side, outer, jaw in zip(
             "LR", (1.0, -1.0), views.cranium_sides, views.mandible_sides, strict=True
         )
     ]
     orbits = [find_orbit(view) for view in sides]
-    _midface(views, [orbit.z for orbit in orbits if orbit is not None], found)
+    _midface(views, middle, [orbit.z for orbit in orbits if orbit is not None], found)
     _jaw_profile(views, found)
     for view, orbit in zip(sides, orbits, strict=True):
         find_side_sites(view, orbit, found)
     return found
 
 
-def _midface(views: SkullViews, eyes: list[float], found: Sites) -> None:
+def _midface(views: SkullViews, middle: float, eyes: list[float], found: Sites) -> None:
     front = views.cranium_front
     z = front.columns
     centre = float(np.mean(eyes)) if eyes else 20.0
-    top = smoothed(front.column(0.0, 1.6), 1.0)
+    top = smoothed(front.column(middle, 1.6), 1.0)
     rhinion = _nasal_end(z, top, centre)
     if rhinion is not None:
-        found["rhinion"] = np.array([0.0, top[rhinion], z[rhinion]])
+        found["rhinion"] = np.array([middle, top[rhinion], z[rhinion]])
         high = min(z[rhinion] + 48.0, centre + 34.0)
         deepest = farthest_from_chord(z, top, (z[rhinion], high), -1.0)
         if deepest is not None:
             # The suture is at the upper end of a flat hollow, where the brow begins.
             deepest = upper_end(z, top, (z[rhinion], high), deepest, FLAT)
-            found["nasion"] = np.array([0.0, top[deepest], z[deepest]])
+            found["nasion"] = np.array([middle, top[deepest], z[deepest]])
             # A forehead that is cut off shows the glabella as long as it goes on above it.
             end = min(z[deepest] + 32.0, float(z[np.isfinite(top)].max()) - 1.0)
             brow = None
             if end > z[deepest] + LEAST_FOREHEAD:
                 brow = farthest_from_chord(z, top, (z[deepest], end), 1.0)
             if brow is not None:
-                found["glabella"] = np.array([0.0, top[brow], z[brow]])
+                found["glabella"] = np.array([middle, top[brow], z[brow]])
                 above = int(np.argmin(np.abs(z - z[brow] - 15.0)))
                 if np.isfinite(top[above]):
-                    found["supraglabella"] = np.array([0.0, top[above], z[above]])
+                    found["supraglabella"] = np.array([middle, top[above], z[above]])
     _upper_alveolus(views, found)
 
 
@@ -154,8 +151,7 @@ LOWER_SHARE, LOWER_CROWN = 0.27, 8.2
 def _upper_alveolus(views: SkullViews, found: Sites) -> None:
     front = views.cranium_front
     z = front.columns
-    middle = local_midline(front, (-40.0, -20.0))
-    lean = 0.0 if middle is None else middle
+    lean = local_midline(front, (-40.0, -20.0)) or 0.0
     line = smoothed(front.column(lean, 2.2), 1.0)
     teeth = np.isfinite(line) & (line < -60.0) & (z < -15.0) & (z > -75.0)
     if not teeth.any():
@@ -229,8 +225,7 @@ def _jaw_profile(views: SkullViews, found: Sites) -> None:
     heights = z[np.isfinite(whole) & (whole < -35.0)]
     if not len(heights):
         return
-    lean = local_midline(front, (heights.max() - 20.0, heights.max() - 2.0))
-    lean = 0.0 if lean is None else lean
+    lean = local_midline(front, (heights.max() - 20.0, heights.max() - 2.0)) or 0.0
     chin_lean = local_midline(front, (heights.min() - 2.0, heights.min() + 18.0), lean)
     chin_lean = lean if chin_lean is None else chin_lean
     line = smoothed(front.column(lean, 2.2), 0.8)
