@@ -112,7 +112,8 @@ def _stepped(
     own = model.points + model.modes @ state.shape
     moved, by_jaw = moved_with_jaw(own, model.jaw_share, state.jaw)
     seen = samples.shows(state.out(moved), SEEN_MARGIN)
-    derivatives = np.concatenate([by_jaw, model.modes[:, :, modes]], axis=2, dtype=np.float32)
+    leading = model.ordered_modes[:, :, : len(modes)]
+    derivatives = np.concatenate([by_jaw, leading], axis=2, dtype=np.float32)
     gaps = np.full(len(moved), np.nan)
     scores = []
     rows = [*_known_rows(model, state, modes, known)]

@@ -169,6 +169,11 @@ class HeadModel:
         size = np.einsum("n,nij,nij->j", self.areas, self.modes, self.modes)
         return np.argsort(-size)
 
+    @cached_property
+    def ordered_modes(self) -> NDArray[np.float32]:
+        """The modes in their order, for derivatives, (n, 3, r) mm."""
+        return self.modes[:, :, self.mode_order].astype(np.float32)
+
     def weight_of(self, rows: NDArray[np.int64]) -> Floats:
         """The area of points over the usual one of the face."""
         return np.minimum(self.areas[rows] / FACE_STEP**2, 9.0)
