@@ -105,7 +105,8 @@ def mesh_report(mesh: TetMesh, making: Mapping[str, Any] | None = None) -> MeshR
     volume = float(np.sum(mesh.volumes))
     wanted = making.get("level_volume")
     pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-    edges = [np.linalg.norm(nodes[tets[:, a]] - nodes[tets[:, b]], axis=1).mean() for a, b in pairs]
+    corners = [nodes[tets[:, corner]].T.copy() for corner in range(4)]
+    edges = [np.sqrt(((corners[a] - corners[b]) ** 2).sum(axis=0)).mean() for a, b in pairs]
     return MeshReport(
         n_nodes=mesh.n_nodes,
         n_tets=mesh.n_tets,
