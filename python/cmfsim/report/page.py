@@ -126,6 +126,8 @@ def _compact(png: bytes) -> tuple[bytes, str]:
     """A picture as WebP, an eighth of the PNG; as it is without Pillow, which matplotlib brings."""
     packed = io.BytesIO()
     try:
+        # Else Pillow loads its readers and writers of all formats.
+        import_module("PIL.WebPImagePlugin")
         import_module("PIL.Image").open(io.BytesIO(png)).save(
             packed, "WEBP", quality=QUALITY, method=WEBP_EFFORT
         )
