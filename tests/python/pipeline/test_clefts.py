@@ -13,6 +13,7 @@ from cmfsim.pipeline.building.tissue.contacts import (
     without_clefts,
     without_crushed,
 )
+from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.patient_model import LiftedTissue
 
 EDGE = 1.0
@@ -193,7 +194,8 @@ def hinged(*sides):
 def test_a_body_that_hangs_by_an_edge_goes():
     """Two cubes share an edge: each is held only by what is held of its own."""
     mesh, kinds = hinged(0.0)
-    left, now, findings = held_part(mesh, kinds)
+    left, now, body, findings = held_part(mesh, kinds)
+    assert body.tolist() == tet_bodies(left.tets).tolist()
     assert left.n_tets == 6
     assert np.asarray(left.nodes)[:, 0].max() == 1.0
     assert len(now.nodes("fixed")) == 4
@@ -218,7 +220,7 @@ def test_no_plan_lifts_a_body_off_all_that_holds_it():
         places=nodes[chosen],
         normals=np.tile([0.0, -1.0, 0.0], (n, 1)),
     )
-    left = lifted_where_held(mesh, kinds, lifted)
+    left = lifted_where_held(mesh, kinds, tet_bodies(mesh.tets), lifted)
     assert left.nodes.tolist() == near.tolist()
     fixed = np.setdiff1d(kinds.nodes("fixed"), left.free({"maxilla": np.eye(4)}))
     tensors = cmfsim.MassTensors(mesh, cmfsim.Tissue.isotropic(np.ones(mesh.n_tets), 0.3))

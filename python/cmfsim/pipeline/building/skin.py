@@ -23,7 +23,7 @@ from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.surfaces.depth import barycentric, distances
 from cmfsim.surfaces.levels import SurfaceOptions, contact_surface, surface_of_level
-from cmfsim.surfaces.topology import connected_labels, edges_of, tet_bodies
+from cmfsim.surfaces.topology import Integers, connected_labels, edges_of, tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats, Indices
@@ -40,7 +40,11 @@ LEAST_HELD = 3
 SPECKS = 100.0
 
 
-def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
+# A mesh, the kinds of its nodes, the body of each tet, and findings.
+Held = tuple[TetMesh, NodeKinds, Integers, tuple[Finding, ...]]
+
+
+def held_part(mesh: TetMesh, kinds: NodeKinds) -> Held:
     """The mesh without bodies that neither bone nor plane holds, and a finding for them.
 
     A body is connected by the faces of its tets: what an edge or a node joins to the rest can turn
@@ -49,9 +53,10 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
     Raises `MeshError`: Nothing of it is held.
     """
     tets = mesh.tets
-    body, loose = _loose_bodies(tets, np.isin(kinds.kind, (1, 2)))
+    body = tet_bodies(tets)
+    loose = _are_loose(body, tets, np.isin(kinds.kind, (1, 2)))
     if not loose.any():
-        return mesh, kinds, ()
+        return mesh, kinds, body, ()
     if loose.all():
         raise MeshInputError(
             "the tissue is not attached anywhere: no node is on the posterior plane or on a "
@@ -73,25 +78,29 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> tuple[TetMesh, NodeKinds, tupl
         if speck
         else "check skin and bone nearby; a larger bone threshold or closing may have cut them off",
     )
-    return kept, kinds.of_nodes(used), (finding,)
+    return kept, kinds.of_nodes(used), body[~dropped], (finding,)
 
 
-def _loose_bodies(
-    tets: Indices, holds: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The body of each tet, and which bodies too few of the nodes hold that `holds` marks."""
-    body, corner = tet_bodies(tets), holds[tets]
+def _are_loose(body: Integers, tets: Indices, holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which bodies of tets too few of the nodes hold that `holds` marks."""
+    corner = holds[tets]
     # Each held node once for each body that it is in.
     held = np.unique(np.repeat(body, 4)[corner.ravel()] * len(holds) + tets[corner])
     counts = np.bincount(held // len(holds), minlength=int(body.max(initial=-1)) + 1)
-    return body, counts < LEAST_HELD
+    loose: NDArray[np.bool_] = counts < LEAST_HELD
+    return loose
 
 
-def lifted_where_held(mesh: TetMesh, kinds: NodeKinds, lifted: LiftedTissue) -> LiftedTissue:
-    """The lifted nodes without those of bodies that too little else holds: these would drift."""
+def lifted_where_held(
+    mesh: TetMesh, kinds: NodeKinds, body: Integers, lifted: LiftedTissue
+) -> LiftedTissue:
+    """The lifted nodes without those of bodies that too little else holds: these would drift.
+
+    body: (m,). That of each tet, as `held_part` gives it.
+    """
     holds = np.isin(kinds.kind, (1, 2))
     holds[lifted.nodes] = False
-    body, loose = _loose_bodies(mesh.tets, holds)
+    loose = _are_loose(body, mesh.tets, holds)
     return lifted.without(np.unique(mesh.tets[loose[body]]))
 
 
@@ -124,9 +133,7 @@ def _upwards(surface: SurfaceData) -> SurfaceData:
     return replace(surface, triangles=triangles[:, ::-1])
 
 
-def separated_at_seam(
-    mesh: TetMesh, kinds: NodeKinds, seam: LipSeam
-) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
+def separated_at_seam(mesh: TetMesh, kinds: NodeKinds, body: Integers, seam: LipSeam) -> Held:
     """The mesh separated at the seam; new nodes have the kinds of those that they lie between.
 
     Kinds are found before: the faces of the lips along the edges of teeth look at these without
@@ -135,14 +142,14 @@ def separated_at_seam(
     Raises `MeshError`: A surface given as a file runs through no tissue.
     """
     if seam.surface is None:
-        return mesh, kinds, ()
+        return mesh, kinds, body, ()
     try:
         separated = separated_mesh(mesh, seam.surface)
     except MeshError:
         if seam.source != "gap":
             raise
         finding = Finding("lips-apart", where="lips")
-        return mesh, kinds, (finding,)
+        return mesh, kinds, body, (finding,)
     return held_part(separated.mesh, _with_new_nodes(mesh, kinds, separated.parents))
 
 

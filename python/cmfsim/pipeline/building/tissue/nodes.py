@@ -52,6 +52,7 @@ from cmfsim.pipeline.building.tissue.contacts import (
     without_crushed,
 )
 from cmfsim.surfaces.levels import block_of
+from cmfsim.surfaces.topology import Integers
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -268,11 +269,11 @@ def nodes_of(
     )
     stages.add(classified.findings)
     whole = mesh.n_tets
-    mesh, kinds = _remaining(stages, bones, mesh, classified.kinds, case)
+    mesh, kinds, body = _remaining(stages, bones, mesh, classified.kinds, case)
     lips = CaseLipContact({}, kinds)
     if tissue.seam is not None:
         stages.begin("separating the lips")
-        mesh, kinds, noticed = separated_at_seam(mesh, kinds, tissue.seam)
+        mesh, kinds, body, noticed = separated_at_seam(mesh, kinds, body, tissue.seam)
         stages.add(noticed)
         lips = lip_contact(
             mesh,
@@ -303,15 +304,15 @@ def nodes_of(
             stages.add(held.findings)
             kinds = held.kinds
             lifted = None if lifted is None else lifted.without(held.nodes)
-        lifted = None if lifted is None else lifted_where_held(mesh, kinds, lifted)
+        lifted = None if lifted is None else lifted_where_held(mesh, kinds, body, lifted)
         report = report if counted is None else counted.result()
     return Nodes(mesh, report, kinds, contacts, tissue.level, tissue.seam, lips, lifted)
 
 
 def _remaining(
     stages: Stages, bones: PlannedBones, mesh: TetMesh, kinds: NodeKinds, case: Case
-) -> tuple[TetMesh, NodeKinds]:
-    """The tets that are neither in a cleft nor crushed and are held by bone, and their nodes."""
+) -> tuple[TetMesh, NodeKinds, Integers]:
+    """The tets that are neither in a cleft nor crushed and are held by bone: kinds, bodies."""
     moved = _moved(case, bones)
     if case.mesh.file is None:
         mesh, kinds, noticed = without_clefts(mesh, kinds, bones.segments, moved, case.mesh.cleft)
@@ -321,9 +322,9 @@ def _remaining(
                 mesh, kinds, bones.segments, bones.motions, case.mesh.cleft
             )
             stages.add(noticed)
-    mesh, kinds, noticed = held_part(mesh, kinds)
+    mesh, kinds, body, noticed = held_part(mesh, kinds)
     stages.add(noticed)
-    return mesh, kinds
+    return mesh, kinds, body
 
 
 def _walls(
