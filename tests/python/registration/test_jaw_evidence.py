@@ -83,6 +83,21 @@ def test_tooth_rows_that_rise_too_steeply_make_their_sites_doubtful():
     assert [f.severity for f in found.findings if f.code == "jaw-doubtful"] == ["warning"]
 
 
+def test_a_lower_jaw_that_lost_its_teeth_has_doubtful_sites():
+    """Those of ramus and molars were up to 15 mm off, stated as 4 mm and without a doubt."""
+
+    def bare(points):
+        crowns = np.clip(points[:, 2] + 54.0, 0.0, None) * (points[:, 1] < -40.0)
+        return points - 0.95 * crowns[:, None] * [0.0, 0.0, 1.0]
+
+    found = proposed(bare)
+    assert "the lower ones are missing, or the mouth is open" in found.doubtful_jaw
+    assert not found.impossible_jaw
+    for name in ("occlusal_line_L", "occlusal_line_R", "sub_m2_L", "sub_m2_R"):
+        assert found.skull[name].error >= 9.0, name
+        assert "apart at the incisors" in found.skull[name].doubt, name
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [

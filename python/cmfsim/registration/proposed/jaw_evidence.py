@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cmfsim.registration.proposed.definitions.groups import FAR_JAW, jaw_distance
+from cmfsim.registration.proposed.definitions.skull_sites import LOWER_CROWN
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.values.checks import Floats
 from cmfsim.values.proposed_landmarks import ProposedSite
@@ -114,8 +115,10 @@ def _doubts(
             f"the tooth rows rise by {rise:.0f}° to the back against the Frankfort plane "
             f"({RISE[0]:g}° to {RISE[1]:g}° expected)"
         )
-    if opening > WIDE:
-        yield f"the tooth rows are {size * opening:.0f} mm apart at the incisors"
+    if opening > LOWER_CROWN:
+        # As much as a crown: the sites of the lower jaw are found from teeth that it has lost.
+        lost = "" if opening > WIDE else ": the lower ones are missing, or the mouth is open"
+        yield f"the tooth rows are {size * opening:.0f} mm apart at the incisors{lost}"
     low, high = VOLUMES
     if not low <= volume <= high:
         yield (

@@ -71,10 +71,9 @@ def _below_nose(front: DepthMap, tip: Floats, skull: Mapping[str, Floats], found
     z = front.columns
     line = smoothed(front.column(lean, 1.2), 0.8)
     chin = skull.get("pogonion")
-    chin_z = None if chin is None else float(chin[2])
-    if chin_z is None:
+    if chin is None:
         return
-    _put(front, "pogonion", float(chin[0]) if chin is not None else lean, chin_z + 1.0, found)
+    _put(front, "pogonion", float(chin[0]), float(chin[2]) + 1.0, found)
     if "pogonion" not in found:
         return
     lip = skull.get("supradentale")
@@ -86,7 +85,7 @@ def _below_nose(front: DepthMap, tip: Floats, skull: Mapping[str, Floats], found
     above = corner + round(CORNER_ABOVE / STEP)
     found["subnasale"] = np.array([lean, line[above], z[above]])
     _wings(front, tip, float(z[corner]), found)
-    _lips(front, lean, (chin_z, float(z[corner])), found)
+    _lips(front, lean, (float(chin[2]), float(z[corner])), found)
     if "labiale_superius" in found and "labiale_inferius" in found:
         height = 0.5 * (found["labiale_superius"][2] + found["labiale_inferius"][2])
         for side, letter in ((1.0, "L"), (-1.0, "R")):
