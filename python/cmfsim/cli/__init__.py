@@ -120,7 +120,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
 
 def _run(options: argparse.Namespace) -> int:
     from cmfsim.cli.case_commands import print_findings  # noqa: PLC0415 (loads numpy)
-    from cmfsim.cli.terminal import FindingsError  # noqa: PLC0415 (loads numpy)
+    from cmfsim.cli.terminal import FindingsError, print_text  # noqa: PLC0415 (loads numpy)
 
     try:
         return int(options.run(options))
@@ -138,7 +138,7 @@ def _run(options: argparse.Namespace) -> int:
         return _ended(options, error, FAILED)
     except KeyboardInterrupt:
         text = "stopped; existing files are unchanged"
-        print(f"cmfsim: {text}", file=sys.stderr)
+        print_text(f"cmfsim: {text}", file=sys.stderr)
         if getattr(options, "json", False):
             _print_json("KeyboardInterrupt", text, FAILED)
         return FAILED

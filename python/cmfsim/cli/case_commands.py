@@ -25,6 +25,7 @@ from cmfsim.cli.terminal import (
     columns,
     escaped,
     in_colour,
+    print_text,
 )
 from cmfsim.doctor import Examination, examine, findings_text
 from cmfsim.drafting import CASE_FILE, init_case, read_moves
@@ -109,12 +110,12 @@ def init(options: argparse.Namespace) -> int:
         is_open = entry.question or not entry.taken_for
         details = ", ".join(part for part in (entry.unit, entry.frame) if part)
         head = f"{entry.label}: {entry.taken_for or '?'}{f' ({details})' if details else ''}"
-        print(f"{'? ' if is_open else '  '}{escaped(head)}")
-        print(f"      {escaped(entry.why)}")
-    print(f"case  {escaped(str(case))}")
+        print_text(f"{'? ' if is_open else '  '}{escaped(head)}")
+        print_text(f"      {escaped(entry.why)}")
+    print_text(f"case  {escaped(str(case))}")
     for question in draft.questions:
-        print(f"decide  {escaped(question)}")
-    print(f"next  cmfsim doctor {argument(case)}")
+        print_text(f"decide  {escaped(question)}")
+    print_text(f"next  cmfsim doctor {argument(case)}")
     return DONE
 
 
@@ -135,7 +136,7 @@ def doctor(options: argparse.Namespace) -> int:
         print(json.dumps({**report, "findings": entries}, allow_nan=False))
     else:
         for line in plan_lines(plan):
-            print(f"plan: {escaped(line)}")
+            print_text(f"plan: {escaped(line)}")
         print_findings(findings, sys.stdout)
     return BAD_INPUT if _has_errors(findings) else DONE
 
@@ -161,7 +162,7 @@ def build(options: argparse.Namespace) -> int:
         print(json.dumps(summary, allow_nan=False))
         return DONE
     width = min(columns(), WIDTH) if sys.stdout.isatty() else WIDTH
-    print(build_text(summary, width=width))
+    print_text(build_text(summary, width=width))
     notices.summarise(str(Path(summary["output"]) / "build.json"))
     return DONE
 
@@ -218,7 +219,7 @@ def checked(
     if not options.quiet:
         # Before the work: a reversed plan is seen here, not in the face.
         for line in plan_lines(_plan_values(found)):
-            print(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
+            print_text(f"cmfsim: plan: {escaped(line)}", file=sys.stderr, flush=True)
     if _has_errors(found.findings):
         raise FindingsError(found.findings)
     notices.found(found.findings)
@@ -237,7 +238,7 @@ def print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
     """Wrapped and coloured on a terminal; one line per part in a pipe."""
     width = columns() if stream.isatty() else 0
     text = findings_text(findings, colour=in_colour(stream), width=width, escape=escaped)
-    print(text, file=stream)
+    print_text(text, file=stream)
 
 
 SURFACES = (".stl", ".ply", ".obj", ".vtp")
@@ -253,7 +254,7 @@ def view(options: argparse.Namespace) -> int:
         picture = None if options.screenshot is None else str(options.screenshot)
         print(json.dumps({"parts": names, "screenshot": picture}))
     elif options.screenshot is not None:
-        print(f"wrote {options.screenshot}")
+        print_text(f"wrote {options.screenshot}")
     return DONE
 
 

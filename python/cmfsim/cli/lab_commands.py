@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cmfsim.cli import DONE
-from cmfsim.cli.terminal import StageProgress, argument, escaped
+from cmfsim.cli.terminal import StageProgress, argument, escaped, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.io.results.populations import FAILED, MADE, PARTS, PENDING
@@ -78,8 +78,8 @@ def frontier(options: argparse.Namespace) -> int:
         answer = {**found.as_dict(), "output": str(options.output), "files": names}
         print(json.dumps(answer, allow_nan=False))
     else:
-        print(_frontier_text(found))
-        print(f"written  {escaped(str(options.output))}: {', '.join(names)}")
+        print_text(_frontier_text(found))
+        print_text(f"written  {escaped(str(options.output))}: {', '.join(names)}")
     return DONE
 
 
@@ -127,7 +127,7 @@ def phantom(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"case": str(case)}, allow_nan=False))
     else:
-        print(f"wrote {case}; build it with: cmfsim build {case}")
+        print_text(f"wrote {case}; build it with: cmfsim build {case}")
     return DONE
 
 
@@ -152,8 +152,8 @@ def virtual_patients(options: argparse.Namespace) -> int:
         print(json.dumps({"cases": [str(case) for case in cases]}, allow_nan=False))
     else:
         for case in cases:
-            print(f"wrote {case} (in silico); the truth is in {case.parent / 'truth'}")
-        print(f"next: cmfsim study {argument(options.folder / 'cohort.toml')}")
+            print_text(f"wrote {case} (in silico); the truth is in {case.parent / 'truth'}")
+        print_text(f"next: cmfsim study {argument(options.folder / 'cohort.toml')}")
     return DONE
 
 
@@ -166,7 +166,9 @@ def _population(options: argparse.Namespace) -> int:
         if not options.quiet:
             why = f": {outcome.reason}" if outcome.reason else ""
             counted = f"{outcome.done} of {outcome.count}"
-            print(f"{counted}  {outcome.name} {outcome.status}{why}", file=sys.stderr, flush=True)
+            print_text(
+                f"{counted}  {outcome.name} {outcome.status}{why}", file=sys.stderr, flush=True
+            )
 
     found = virtual_population(
         options.folder,
@@ -184,11 +186,11 @@ def _population(options: argparse.Namespace) -> int:
         print(json.dumps({"settings": dict(found.settings), "patients": patients}))
         return DONE
     counts = ", ".join(f"{len(found.named(MADE, part))} {part}" for part in PARTS)
-    print(f"{len(found.patients)} patients drawn (in silico): {counts}")
+    print_text(f"{len(found.patients)} patients drawn (in silico): {counts}")
     for state in (FAILED, PENDING):
         if found.named(state):
-            print(f"{state}: {', '.join(found.named(state))} (population.json)")
-    print(f"next: cmfsim benchmark {argument(options.folder)}")
+            print_text(f"{state}: {', '.join(found.named(state))} (population.json)")
+    print_text(f"next: cmfsim benchmark {argument(options.folder)}")
     return DONE
 
 
@@ -197,7 +199,7 @@ def benchmark(options: argparse.Namespace) -> int:
 
     def tell(line: str) -> None:
         if not options.quiet:
-            print(line, file=sys.stderr, flush=True)
+            print_text(line, file=sys.stderr, flush=True)
 
     found = run_benchmark(
         options.folder,
@@ -212,7 +214,7 @@ def benchmark(options: argparse.Namespace) -> int:
     if options.json:
         print(found.table.json(), end="")
         return DONE
-    print(found.table.markdown())
+    print_text(found.table.markdown())
     for path in found.files:
-        print(f"wrote {path}")
+        print_text(f"wrote {path}")
     return DONE

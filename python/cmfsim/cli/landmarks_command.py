@@ -13,7 +13,7 @@ import numpy as np
 
 from cmfsim.cli import DONE
 from cmfsim.cli.case_commands import print_findings
-from cmfsim.cli.terminal import StageProgress, escaped, open_page
+from cmfsim.cli.terminal import StageProgress, escaped, open_page, print_text
 from cmfsim.errors import CmfsimError, LandmarkError
 from cmfsim.io import Case
 from cmfsim.io.landmarks import write_landmarks
@@ -80,7 +80,7 @@ def landmarks(options: argparse.Namespace) -> int:
     print_findings(findings, sys.stdout)
     if options.page:
         path = case.output / PAGE_FILE
-        print(f"page   {escaped(str(path))} ({size / 1e6:.1f} MB): open it in a browser")
+        print_text(f"page   {escaped(str(path))} ({size / 1e6:.1f} MB): open it in a browser")
         open_page(path, wanted=not options.no_open)
     return DONE
 
@@ -152,13 +152,13 @@ def _from_given(case: Case, found: ProposedLandmarks) -> dict[str, dict[str, flo
 
 
 def _print(report: Mapping[str, Any], found: ProposedLandmarks) -> None:
-    print(f"{len(found.skull)} skull and {len(found.skin)} skin landmarks of {report['case']}")
+    print_text(f"{len(found.skull)} skull and {len(found.skin)} skin landmarks of {report['case']}")
     for kind, apart in report["from_given"].items():
         values = np.array(list(apart.values()))
         if len(values):
-            print(
+            print_text(
                 f"{kind}: {values.mean():.1f} mm on average from the landmarks of the case, "
                 f"{values.max():.1f} mm at most ({max(apart, key=lambda name: apart[name])})"
             )
     for name in report["files"]:
-        print(f"wrote {escaped(str(Path(report['output']) / name))}")
+        print_text(f"wrote {escaped(str(Path(report['output']) / name))}")

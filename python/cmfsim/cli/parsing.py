@@ -25,11 +25,14 @@ from cmfsim.muscles.template import WHERE
 from cmfsim.planning.replanning import CORRECTIONS, TRIALS
 from cmfsim.values.anatomy import JAWS
 from cmfsim.values.case_parts import PROCEDURES
+from cmfsim.values.language import translated
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS
 from cmfsim.values.solver_options import MODELS as SOLVED_MODELS
 
 MOST_PORT = 65535
+DESCRIPTION = "Predict soft tissue after cranio-maxillofacial surgery with the mass-tensor model."
+EXIT_CODES = "Exit codes: 0 done, 1 failed, 2 bad input. For research, not a medical device."
 Parser = argparse.ArgumentParser
 
 
@@ -42,7 +45,7 @@ def option(command: Parser, spec: str, words: str, **more: Any) -> None:
     names = spec.split()
     if names[-1].isupper() and not names[-1].startswith("-"):
         more["metavar"] = names.pop()
-    command.add_argument(*names, help=words, **more)
+    command.add_argument(*names, help=translated(words), **more)
 
 
 switch = partial(option, action="store_true")
@@ -56,10 +59,7 @@ models = partial(option, choices=(*MODELS, "all"), action="append")
 def make_parser() -> Parser:
     """The parser of every command; `options.run` is the function that does it."""
     parser = Parser(
-        prog="cmfsim",
-        description="Predict soft tissue after cranio-maxillofacial surgery with the "
-        "mass-tensor model.",
-        epilog="Exit codes: 0 done, 1 failed, 2 bad input. For research, not a medical device.",
+        prog="cmfsim", description=translated(DESCRIPTION), epilog=translated(EXIT_CODES)
     )
     parser.add_argument("--version", action="version", version=f"cmfsim {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
@@ -85,7 +85,8 @@ def _command(
     epilog: str | None = None,
 ) -> Parser:
     """A command with the options of its parent; `words` are its help."""
-    made: Parser = commands.add_parser(name, parents=[parent], help=words, epilog=epilog)
+    more = {"help": translated(words), "epilog": translated(epilog or "")}
+    made: Parser = commands.add_parser(name, parents=[parent], **more)
     made.set_defaults(run=run)
     return made
 

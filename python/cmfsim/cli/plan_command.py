@@ -13,7 +13,7 @@ import numpy as np
 
 from cmfsim.cli import DONE
 from cmfsim.cli.case_commands import band_options, case_of, checked
-from cmfsim.cli.terminal import StageProgress, can_open, escaped, open_page
+from cmfsim.cli.terminal import StageProgress, can_open, escaped, open_page, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface, write_plan, write_surface
 from cmfsim.pipeline.building.inputs import check_output, plan_key
@@ -61,13 +61,13 @@ def plan(options: argparse.Namespace) -> int:
         answer = {"case": case.name, "seconds": seconds, **made.as_dict()}
         print(json.dumps({**answer, "findings": notices.as_dicts()}, allow_nan=False))
         return DONE
-    print(f"page   {escaped(str(made.path))} ({made.path.stat().st_size / 1e6:.1f} MB)")
-    print(f"error  {_error_text(made.errors)}")
+    print_text(f"page   {escaped(str(made.path))} ({made.path.stat().st_size / 1e6:.1f} MB)")
+    print_text(f"error  {_error_text(made.errors)}")
     if made.planning.correction is not None:
-        print(f"       {_correction_text(made.planning.correction)}")
+        print_text(f"       {_correction_text(made.planning.correction)}")
     if made.found is not None:
-        print(_towards_text(made.found, str(made.path.with_name(PLAN_FILE))))
-    print(f"time   {seconds:.0f} s")
+        print_text(_towards_text(made.found, str(made.path.with_name(PLAN_FILE))))
+    print_text(f"time   {seconds:.0f} s")
     # The page lists no findings.
     notices.summarise(None)
     open_page(made.path, wanted=not options.no_open)
@@ -79,7 +79,7 @@ def _show(options: argparse.Namespace, what: str, url: str) -> None:
     if options.json:
         print(json.dumps({"url": url}), flush=True)
     else:
-        print(f"{what}   {url}\nOnly this machine can open it; stop with Ctrl-C.", flush=True)
+        print_text(f"{what}   {url}\nOnly this machine can open it; stop with Ctrl-C.", flush=True)
     if not options.no_open and can_open():
         webbrowser.open(url)
 
@@ -186,12 +186,12 @@ def splint_case(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"case": case.name, **values}, allow_nan=False))
         return DONE
-    print(f"splint {kind}: {escaped(str(path))}")
-    print(
+    print_text(f"splint {kind}: {escaped(str(path))}")
+    print_text(
         f"       {made.thickness:.2f} mm thick between the teeth, which seat to {made.seat:.2f} mm"
     )
     if made.opening:
-        print(f"       the lower jaw is opened by {made.opening:g}° about its joint heads")
+        print_text(f"       the lower jaw is opened by {made.opening:g}° about its joint heads")
     return DONE
 
 
@@ -217,8 +217,8 @@ def bite_case(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"case": case.name, "file": str(path), **bite.as_dict()}))
         return DONE
-    print(f"plan   {escaped(str(path))}: cmfsim predict --plan")
-    print(
+    print_text(f"plan   {escaped(str(path))}: cmfsim predict --plan")
+    print_text(
         f"       scans fit to {bite.upper_error:.2f} mm (upper) and {bite.lower_error:.2f} mm "
         f"(lower); rows overlap by {bite.overlap:.2f} mm, {bite.gap:.2f} mm apart"
     )

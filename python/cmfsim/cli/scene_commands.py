@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli import DONE, FAILED
-from cmfsim.cli.terminal import Notices, StageProgress, escaped, open_page
+from cmfsim.cli.terminal import Notices, StageProgress, escaped, open_page, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
 from cmfsim.lab.virtual.demo import DemoCase, write_demo_case
@@ -41,21 +41,21 @@ def solve(options: argparse.Namespace) -> int:
         extra = {"output": str(options.output), "seconds": seconds, "largest": float(size.max())}
         print(json.dumps({**summary, **extra}, allow_nan=False))
         return DONE
-    print(f"solved        {summary['n_tets']} tets, {summary['n_unknowns']} unknowns")
-    print(f"method        {summary['method']}, {summary['iterations']} iterations")
-    print(
+    print_text(f"solved        {summary['n_tets']} tets, {summary['n_unknowns']} unknowns")
+    print_text(f"method        {summary['method']}, {summary['iterations']} iterations")
+    print_text(
         f"residual      {summary['residual']:.2e} "
         f"(error {summary['error_estimate']:.2e} mm, estimated)"
     )
     if len(result.contact_nodes):
         gap = summary["contact_gap"]
         gap = "unknown" if gap is None else f"{gap:.2e}"
-        print(
+        print_text(
             f"contact       {len(result.contact_nodes)} nodes, largest gap {gap} mm, "
             f"{summary['contact_iterations']} iterations"
         )
-    print(f"displacement  {size.max():.3f} mm at most, {size.mean():.3f} mm on average")
-    print(f"time          {seconds:.3f} s")
+    print_text(f"displacement  {size.max():.3f} mm at most, {size.mean():.3f} mm on average")
+    print_text(f"time          {seconds:.3f} s")
     return DONE
 
 
@@ -107,12 +107,12 @@ def info(options: argparse.Namespace) -> int:
         }  # fmt: skip
         print(json.dumps(answer, allow_nan=False))
         return DONE
-    print("\n".join(map(escaped, repr(scene).split("\n"))))
+    print_text("\n".join(map(escaped, repr(scene).split("\n"))))
     if len(nodes):
         low, high = nodes.min(axis=0), nodes.max(axis=0)
         extent = " × ".join(f"{length:.1f}" for length in high - low)
-        print(f"  extent    {extent} mm")
-    print(f"  sha256    {scene.sha256()}")
+        print_text(f"  extent    {extent} mm")
+    print_text(f"  sha256    {scene.sha256()}")
     return DONE
 
 
@@ -143,12 +143,12 @@ def demo(options: argparse.Namespace) -> int:
         answer = {"case": str(made.case.file), "report": str(page), "seconds": seconds}
         print(json.dumps({**answer, "findings": notices.as_dicts()}, allow_nan=False))
         return DONE
-    print(f"case    {escaped(str(made.case.file))}")
+    print_text(f"case    {escaped(str(made.case.file))}")
     for finding in notices.findings:
         if finding.code == "landmarks-proposed":
-            print(f"note    {escaped(finding.what)}")
-    print(f"report  {escaped(str(page))}")
-    print(f"time    {seconds:.0f} s")
+            print_text(f"note    {escaped(finding.what)}")
+    print_text(f"report  {escaped(str(page))}")
+    print_text(f"time    {seconds:.0f} s")
     notices.summarise(str(page))
     open_page(page, wanted=not options.no_open)
     return DONE

@@ -13,7 +13,7 @@ from typing import Any
 
 from cmfsim.cli import DONE, FAILED
 from cmfsim.cli.case_commands import band_options, case_of, checked
-from cmfsim.cli.terminal import Notices, StageProgress, escaped
+from cmfsim.cli.terminal import Notices, StageProgress, escaped, print_text
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
 from cmfsim.io.results.predictions import predictions_of
@@ -84,9 +84,9 @@ def predict(options: argparse.Namespace) -> int:
         print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
         return FAILED if failed else DONE
     summary = written.predictions[0].summary
-    print(_plan_text(summary))
+    print_text(_plan_text(summary))
     for entry in written.predictions:
-        print(_prediction_text(_figures(entry, case.output)))
+        print_text(_prediction_text(_figures(entry, case.output)))
     _print_report(case.output, written.report)
     _end(notices, case.output, written)
     _print_failed(failed)
@@ -148,8 +148,8 @@ def evaluate(options: argparse.Namespace) -> int:
         more = {"findings": notices.as_dicts(), "left_out": written.left_out}
         print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
         return code
-    print(_plan_text(found.predictions[0].summary))
-    print(_text_of(summary_blocks(values)))
+    print_text(_plan_text(found.predictions[0].summary))
+    print_text(_text_of(summary_blocks(values)))
     _print_report(case.output, written.report)
     _end(notices, case.output, written)
     _print_failed(found.failed)
@@ -191,21 +191,21 @@ def sensitivity(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(values, allow_nan=False))
         return DONE
-    print(
+    print_text(
         f"{escaped(case.name)}, model {options.model}: mean distances from the positions under "
         "the case's own landmarks, mm"
     )
-    print("  trial  landmarks  muscles  masseter    skin  skin 95 %")
+    print_text("  trial  landmarks  muscles  masseter    skin  skin 95 %")
     for number, trial in enumerate(found.trials):
         masseter = [d for name, d in trial.muscle_deviation.items() if "masseter" in name]
         muscles = list(trial.muscle_deviation.values())
         skin = trial.as_dict()["skin"]
-        print(
+        print_text(
             f"  {number + 1:5d}  {trial.landmark_deviation:9.2f}  {_mean(muscles):7.2f}  "
             f"{_mean(masseter):8.2f}  {skin['mean']:6.3f}  {skin['p95']:9.3f}"
         )
     moved = found.skin_deviation(moved=True)
-    print(f"  skin that the operation moves: {moved:.3f} mm on average")
+    print_text(f"  skin that the operation moves: {moved:.3f} mm on average")
     notices.summarise(str(case.output / "sensitivity.json"))
     return DONE
 
@@ -236,8 +236,8 @@ def study(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({**found.as_dict(), "files": names}, allow_nan=False))
     else:
-        print(_shown(study_text(found.as_dict())))
-        print(f"written       {escaped(str(cohort.output))}: {', '.join(names)}")
+        print_text(_shown(study_text(found.as_dict())))
+        print_text(f"written       {escaped(str(cohort.output))}: {', '.join(names)}")
     _print_reasons((outcome.name, outcome) for outcome in found.failed)
     return FAILED if found.failed else DONE
 
@@ -256,7 +256,7 @@ def _counted(cases: int, *, quiet: bool) -> Iterator[Callable[[str, CaseOutcome]
             else:
                 done += 1
             if not (quiet or sys.stderr.isatty()):
-                print(f"{name}: {outcome.status}, {outcome.seconds:.0f} s", file=sys.stderr)
+                print_text(f"{name}: {outcome.status}, {outcome.seconds:.0f} s", file=sys.stderr)
             progress.stage(f"{COMPARING} ({min(done + 1, cases)} of {cases})")
 
         progress.stage(f"{COMPARING} (1 of {cases})")
@@ -266,9 +266,9 @@ def _counted(cases: int, *, quiet: bool) -> Iterator[Callable[[str, CaseOutcome]
 def _print_reasons(failed: Iterable[tuple[str, CaseOutcome]]) -> None:
     """Prints why cases failed."""
     for name, outcome in failed:
-        print(f"cmfsim: error: {escaped(name)}:", file=sys.stderr)
+        print_text(f"cmfsim: error: {escaped(name)}:", file=sys.stderr)
         for line in outcome.error.splitlines():
-            print(f"  {escaped(line)}", file=sys.stderr)
+            print_text(f"  {escaped(line)}", file=sys.stderr)
 
 
 def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
@@ -289,8 +289,8 @@ def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
         more = {"output": str(found.output), "files": names}
         print(json.dumps({**found.as_dict(), **more}, allow_nan=False))
     else:
-        print(_shown(found.text()))
-        print(f"written       {escaped(str(found.output))}: {', '.join(names)}")
+        print_text(_shown(found.text()))
+        print_text(f"written       {escaped(str(found.output))}: {', '.join(names)}")
     _print_reasons((f"{variant}, {outcome.name}", outcome) for variant, outcome in found.failed)
     return FAILED if found.failed else DONE
 
@@ -382,9 +382,9 @@ def _prediction_text(entry: dict[str, Any]) -> str:
 def _print_failed(failed: Mapping[str, str]) -> None:
     """Prints which of several models have no result; the others were written."""
     for model, reason in failed.items():
-        print(f"cmfsim: error: model {model}: {escaped(reason)}", file=sys.stderr)
+        print_text(f"cmfsim: error: model {model}: {escaped(reason)}", file=sys.stderr)
 
 
 def _print_report(folder: Path, name: str | None) -> None:
     if name is not None:
-        print(f"report: {escaped(str(folder / name))}")
+        print_text(f"report: {escaped(str(folder / name))}")

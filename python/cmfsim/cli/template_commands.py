@@ -12,7 +12,7 @@ import numpy as np
 
 from cmfsim.cli import BAD_INPUT, DONE
 from cmfsim.cli.case_commands import print_findings
-from cmfsim.cli.terminal import StageProgress, escaped
+from cmfsim.cli.terminal import StageProgress, escaped, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.muscles.template import (
     MorphedMusculature,
@@ -45,7 +45,7 @@ def list_templates(options: argparse.Namespace) -> int:
         return DONE
     for entry in entries:
         counts = f"{len(entry['muscles'])} muscles, {len(entry['landmarks'])} landmarks"
-        print(f"{entry['name']}: {counts}; {entry['source']}; {entry['licence']}")
+        print_text(f"{entry['name']}: {counts}; {entry['source']}; {entry['licence']}")
     return DONE
 
 
@@ -85,8 +85,10 @@ def import_atlas(options: argparse.Namespace) -> int:
         print(json.dumps({"folder": str(options.output), **report}, allow_nan=False))
         return DONE
     print_findings(template.findings, sys.stdout)
-    print(f"wrote {options.output}: {len(template.muscles)} muscles; {template.licence}, ", end="")
-    print(template.attribution)
+    print_text(
+        f"wrote {options.output}: {len(template.muscles)} muscles; {template.licence}, ", end=""
+    )
+    print_text(template.attribution)
     return DONE
 
 
@@ -108,7 +110,7 @@ def morph(options: argparse.Namespace) -> int:
     if muscles.findings:
         print_findings(muscles.findings, sys.stdout)
     _print_landmarks(muscles)
-    print(f"wrote {options.output}: {len(muscles)} muscles")
+    print_text(f"wrote {options.output}: {len(muscles)} muscles")
     return DONE
 
 
@@ -125,7 +127,7 @@ def show(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps({"picture": str(path), "muscles": [m.name for m in muscles]}))
     else:
-        print(f"wrote {path}: {len(muscles)} muscles")
+        print_text(f"wrote {path}: {len(muscles)} muscles")
     return DONE
 
 
@@ -149,11 +151,11 @@ def _chosen(template: MuscleTemplate, names: Sequence[str]) -> Musculature:
 def _print_landmarks(muscles: MorphedMusculature) -> None:
     """How well the landmarks agree: the worst ones, by the distance the others would put them."""
     residual = max(muscles.residuals.values())
-    print(f"{len(muscles.landmarks)} landmarks, matched to {residual:.2g} mm")
+    print_text(f"{len(muscles.landmarks)} landmarks, matched to {residual:.2g} mm")
     left_out = muscles.leave_one_out
     if left_out is None:
         return
     median = float(np.median(left_out.distances))
-    print(f"predicted from the others, each is off by {median:.1f} mm off (median); worst:")
+    print_text(f"predicted from the others, each is off by {median:.1f} mm off (median); worst:")
     for line in left_out.table().splitlines()[: 1 + WORST_SHOWN]:
-        print(f"  {escaped(line)}")
+        print_text(f"  {escaped(line)}")

@@ -17,6 +17,7 @@ from typing import Any, TextIO
 from cmfsim.errors import CmfsimError, error_text
 from cmfsim.pictures import has_screen
 from cmfsim.values.finding import Finding, FindingGroup, counted, grouped, severity_text
+from cmfsim.values.language import translated
 from cmfsim.values.progress import COUNT, Observer, TimeLeft
 
 # Back to the start of the line and erase it.
@@ -56,8 +57,7 @@ class ProgressHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Prints one line, over the line of the stage where there is one."""
-        clear = CLEAR_LINE if sys.stderr.isatty() else ""
-        print(f"{clear}cmfsim: {escaped(record.getMessage())}", file=sys.stderr, flush=True)
+        _print(f"cmfsim: {escaped(record.getMessage())}")
 
 
 class StageProgress:
@@ -106,7 +106,7 @@ class StageProgress:
         if self._live:
             self._show()
         elif is_new and not self._quiet:
-            self._write(f"cmfsim: {escaped(plain)}\n")
+            self._write(f"cmfsim: {escaped(translated(plain))}\n")
 
     def _tick(self) -> None:
         while not self._stopped.wait(TICK):
@@ -117,7 +117,7 @@ class StageProgress:
             name, seconds = self._stage, time.perf_counter() - self._begun
             left = self._left.text()
         if name:
-            text = f"cmfsim: {left}{escaped(name)} {seconds:.1f} s"
+            text = f"cmfsim: {translated(left)}{escaped(translated(name))} {seconds:.1f} s"
             # A line that wraps could not be erased.
             self._write(f"{CLEAR_LINE}{text[: columns() - 1]}")
 
@@ -146,9 +146,17 @@ def _spelled(error: UnicodeError) -> tuple[str, int]:
     return "".join(text), error.end
 
 
+def print_text(
+    text: str, *, file: TextIO | None = None, flush: bool = False, end: str = "\n"
+) -> None:
+    """Prints lines in the reader's language."""
+    lines = "\n".join(map(translated, text.split("\n")))
+    print(lines, file=file, flush=flush, end=end)
+
+
 def print_error(error: BaseException) -> None:
     """Prints an error as one line on standard error."""
-    print(f"cmfsim: error: {escaped(error_text(error))}", file=sys.stderr)
+    print_text(f"cmfsim: error: {escaped(error_text(error))}", file=sys.stderr)
 
 
 def escaped(text: str) -> str:
@@ -206,7 +214,7 @@ class Notices(Observer):
         self._found.update(dict.fromkeys(new))
         for group in grouped(new):
             if group.severity != "note":
-                _print(f"cmfsim: {_head(group)}: {escaped(group.line)}")
+                _print(f"cmfsim: {_head(group)}: {escaped(group.text(translated))}")
 
     def failed(self, model: str, error: CmfsimError) -> None:
         """Records the error: the other models continue."""
@@ -223,12 +231,12 @@ class Notices(Observer):
             groups = [group for group in groups if group.severity != "note"]
         if not groups and (self._quiet or not self._found):
             return
-        full = "" if where is None else f"; in full: {escaped(where)}"
+        full = "" if where is None else f"; {translated('in full:')} {escaped(where)}"
         _print(f"cmfsim: {counted(self._found)}{full}")
         for group in groups:
-            _print(f"  {_head(group)}: {escaped(group.line)}")
+            _print(f"  {_head(group)}: {escaped(group.text(translated))}")
             if group.worst.fix:
-                _print(f"    fix: {escaped(group.worst.fix)}")
+                _print(f"    {translated('fix:')} {escaped(translated(group.worst.fix))}")
 
     def as_dicts(self) -> list[dict[str, Any]]:
         """Plain values, ready for JSON."""
@@ -242,4 +250,4 @@ def _head(group: FindingGroup) -> str:
 def _print(line: str) -> None:
     # Over the line of the stage, where there is one.
     clear = CLEAR_LINE if sys.stderr.isatty() else ""
-    print(f"{clear}{line}", file=sys.stderr, flush=True)
+    print_text(f"{clear}{line}", file=sys.stderr, flush=True)

@@ -27,13 +27,15 @@ from cmfsim.io import Case, read_landmark_file, replacing, write_landmarks
 from cmfsim.io.files.reading_writing import toml_module
 from cmfsim.pipeline.building.inputs import plan_key, read_placed_sites
 from cmfsim.planning.landmark_page import LandmarkContent, landmark_page_text
-from cmfsim.planning.page.document import Document, document_text
+from cmfsim.planning.page.document import Document, document_text, shown_values
 from cmfsim.planning.server import SOLVE, LocalServer, RefusedError, Reply, solved_reply
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import plan_digits, rigid_motion
 
 JSON = "application/json"
+# What people read of the state.
+READ_OF_STATE = ("name", "stage", "error", "severity", "what", "fix")
 MADE_BY = "planned on the desk"
 # Results that are served once the desk has made them. Scripts of a page may not ask this server;
 # browsers show no PDF in a sandbox.
@@ -120,7 +122,8 @@ class Calls:
 
     def state(self) -> dict[str, Any]:
         """The state of the session, with the digest of the case file."""
-        return {**self._session.state(), "seen": _digest(self._session.text())}
+        values = shown_values(self._session.state(), READ_OF_STATE)
+        return {**values, "seen": _digest(self._session.text())}
 
     def bones(self) -> dict[str, Floats]:
         """The vertices of each bone that is drawn, mm."""

@@ -342,7 +342,11 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
     """
     before = head_distribution(head)
     points = {key: point for key, (point, _) in given.items()}
-    stds = {key: _std(state) for key, (_, state) in given.items()}
+    # How far a given point may be off along each axis, mm.
+    stds = {
+        key: PLACED_STD if s.by_person else max(PLACED_STD, s.error / np.sqrt(3.0))
+        for key, (_, s) in given.items()
+    }
     after = before.given(points, stds)
     surfaces = _surfaces(head)
     sites: dict[str, dict[str, ProposedSite]] = {kind: {} for kind in KINDS}
@@ -377,11 +381,6 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
         missing_skull=missing["skull"],
         missing_skin=missing["skin"],
     )
-
-
-def _std(state: SiteState) -> float:
-    """How far a given point may be off along each axis, mm."""
-    return PLACED_STD if state.by_person else max(PLACED_STD, state.error / np.sqrt(3.0))
 
 
 def _surfaces(head: ProposedHead) -> dict[str, list[Surface]]:

@@ -126,7 +126,7 @@ def plan_of_body(planning: PlanningModel, body: bytes) -> dict[str, Floats]:
         count = len(planning.segments)
         raise RefusedError(400, f"16 finite numbers are needed for each of {count} segments")
     plan = {name: row.reshape(4, 4) for name, row in zip(planning.segments, rows, strict=True)}
-    for name, segment in _centres(planning).items():
+    for name, segment in zip(planning.segments, planning.columns.centres, strict=True):
         way = plan[name][:3, :3] @ segment + plan[name][:3, 3] - segment
         if float(np.linalg.norm(way)) > MOST_SHIFT:
             raise RefusedError(400, f"{name} would move by more than {MOST_SHIFT:g} mm")
@@ -143,10 +143,6 @@ def _are_numbers(given: object) -> bool:
         and all(isinstance(v, int | float) and not isinstance(v, bool) for v in row)
         for row in given
     )
-
-
-def _centres(planning: PlanningModel) -> dict[str, Floats]:
-    return dict(zip(planning.segments, planning.columns.centres, strict=True))
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from cmfsim.report.document import (
 from cmfsim.report.page import MEASURES, MESH, MUSCLES, labelled, plan_name, whose
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, counted, grouped
+from cmfsim.values.language import translated
 
 Values = Mapping[str, Any]
 
@@ -105,22 +106,23 @@ def case_document(
         _time_section(predictions),
         _input_section(entry),
     ]
+    appended = translated("Appendix:")
     sections = [
         *_note_section(entry),
         _plan_section(entry, pictures),
         _prediction_section(predictions, entry, pictures, view),
         *clinical_sections(entry, _picture("contacts", pictures)),
-        *_band_sections(entry, pictures),
+        *([band_section(entry["band"], _picture("band", pictures))] if "band" in entry else []),
         *_evaluation_sections(evaluation, figures),
         _finding_section(findings_of(predictions, evaluation)),
-        *(replace(part, title=f"Appendix: {part.title.lower()}") for part in appendix),
+        *(replace(s, title=f"{appended} {translated(s.title).lower()}") for s in appendix),
     ]
     versions = ", ".join(f"{name} {version}" for name, version in entry["versions"].items())
     several = "Models" if len(predictions) > 1 else "Model"
     return Document(
         title=f"{entry['case']}: predicted face",
-        subtitle=f"{whose(entry)}{several} {models}. {plan_name(entry)}Lengths in mm; L is the "
-        "patient's left, P posterior, S up.",
+        subtitle=f"{whose(entry)}{translated(several)} {models}. {plan_name(entry)}"
+        + translated("Lengths in mm; L is the patient's left, P posterior, S up."),
         facts=_facts(entry, evaluation),
         sections=sections,
         footer=f"Made by {versions}. Mass-tensor model after Kim, Jürgens, Weber, Nolte and Reyes "
@@ -172,7 +174,7 @@ def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
     for name, motion in prediction["plan"].items():
         shift, _, place = motion["clinical"]["text"].partition(";")[0].partition(" at the ")
         if shift != "stays" and place:
-            facts[f"{name} at the {place}"] = shift
+            facts[f"{name} {translated(f'at the {place}')}"] = shift
     chin = [s for s in prediction.get("clinical", {"sites": ()})["sites"] if s["name"] == CHIN]
     for site in chin:
         way = "forwards" if site["forwards_mm"] >= 0.0 else "backwards"
@@ -205,10 +207,10 @@ def _alerts(findings: Sequence[Finding], left_out: str) -> list[Alert]:
             continue
         several = len(group.findings) > 1
         details = [_sentence(f, with_what=several) for f in group.findings]
-        alerts.append(Alert(group.severity, group.line, tuple(d for d in details if d)))
+        alerts.append(Alert(group.severity, group.text(translated), tuple(d for d in details if d)))
     notes = [finding for finding in findings if finding.severity == "note"]
     if notes:
-        lines = tuple(group.line for group in grouped(notes))
+        lines = tuple(group.text(translated) for group in grouped(notes))
         alerts.append(
             Alert("note", f"{counted(notes)}, listed in full below under Findings", lines)
         )
@@ -240,18 +242,14 @@ def _prediction_section(
     columns = ("model", "mean", "mean in the face", "95 %", "largest")
     caption = "How far the skin moves, mm: all that is simulated, and the face alone."
     table = Table(columns, rows, caption)
-    turned = [View(*view, f"{VIEW} Model {shown['model']}.")] if view else []
+    model = translated(f"Model {shown['model']}.")
+    turned = [View(*view, f"{translated(VIEW)} {model}")] if view else []
     drawn: Sequence[Figure | Note] = [
-        Figure(figure.image, f"{figure.caption} Model {shown['model']}.")
+        Figure(figure.image, f"{translated(figure.caption)} {model}")
         for name in ("prediction", "lateral")
         for figure in _picture(name, pictures)
     ]
     return Section("Prediction", (*turned, *(drawn or (Note(NO_PICTURES, "warning"),)), table))
-
-
-def _band_sections(shown: Values, pictures: Mapping[str, bytes]) -> list[Section]:
-    """The section on how far to trust the model that is shown, if requested."""
-    return [band_section(shown["band"], _picture("band", pictures))] if "band" in shown else []
 
 
 def motion_blocks(prediction: Values) -> list[Note | Table]:
@@ -481,13 +479,14 @@ def _finding_section(findings: Sequence[Finding]) -> Section:
 def _sentence(finding: Finding, *, with_what: bool = True) -> str:
     """What a finding states, where, why it matters and what to do, as far as it does."""
     what = _placed(finding) if with_what else ""
-    fix = f"Fix: {finding.fix}" if finding.fix else ""
-    parts = [text.rstrip(". ") for text in (what, finding.why, fix) if text]
+    fix = f"{translated('Fix:')} {translated(finding.fix)}" if finding.fix else ""
+    parts = [text.rstrip(". ") for text in (what, translated(finding.why), fix) if text]
     return "".join(f"{text}. " for text in parts).strip()
 
 
 def _placed(finding: Finding) -> str:
-    return f"{finding.what} ({finding.where})" if finding.where else finding.what
+    what = translated(finding.what)
+    return f"{what} ({finding.where})" if finding.where else what
 
 
 def _input_section(prediction: Values) -> Section:

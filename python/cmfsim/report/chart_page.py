@@ -13,6 +13,7 @@ from cmfsim.report.clinical import TITLES, WAYS, absent_text, measure_rows, site
 from cmfsim.report.page import DISCLAIMER, plan_name, whose
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, grouped
+from cmfsim.values.language import translated
 
 Values = Mapping[str, Any]
 
@@ -62,7 +63,11 @@ class _Page:
         font = self._fonts.FontProperties(size=size, weight=weight)
         return float(self._path.get_text_width_height_descent(text, font, ismath=False)[0])
 
-    def line(
+    def line(self, x: float, y: float, text: str, size: float, **style: Any) -> None:
+        """Writes one line in the reader's language."""
+        self._write(x, y, translated(text), size, **style)
+
+    def _write(
         self, x: float, y: float, text: str, size: float, *, room: float = WHOLE, **style: Any
     ) -> None:
         """Writes one line with its top at y, smaller or shortened where it is too wide."""
@@ -87,15 +92,15 @@ class _Page:
         lines: list[str] = []
         for text in texts:
             lines.append("")
-            for word in text.split():
+            for word in translated(text).split():
                 longer = f"{lines[-1]} {word}".strip()
                 if lines[-1] and self._width(longer, size) > room:
                     lines.append(word)
                 else:
                     lines[-1] = longer
         x, y = place
-        for line in lines if len(lines) <= most else [*lines[: most - 1], ELSEWHERE]:
-            self.line(x, y, line, size, room=room)
+        for line in lines if len(lines) <= most else [*lines[: most - 1], translated(ELSEWHERE)]:
+            self._write(x, y, line, size, room=room)
             y += LEADING * size
         return y
 
@@ -145,8 +150,8 @@ def draw_chart_page(
     page, y = _Page(figure), MARGIN
     page.line(MARGIN, y, f"{prediction['case']}: predicted face", TITLE, weight="bold")
     page.line(MARGIN, y + 21.0, DISCLAIMER, TEXT, weight="bold", color=ALARM)
-    skin = f"The skin moves by up to {prediction['skin']['largest']:.1f} mm."
-    about = f"Model {prediction['model']}. {plan_name(prediction)}Lengths in mm. {skin}"
+    skin = f"Lengths in mm. The skin moves by up to {prediction['skin']['largest']:.1f} mm."
+    about = f"Model {prediction['model']}. {plan_name(prediction)}{translated(skin)}"
     page.line(MARGIN, y + 33.0, whose(prediction), TEXT)
     page.line(MARGIN, y + 45.0, about, TEXT, color=PALE)
     y = page.heading(MARGIN, y + 60.0, "Plan")
@@ -165,7 +170,7 @@ def draw_chart_page(
     ends = []
     for kind, x, room in (("cephalometry", MARGIN, LEFT), ("face", COLUMN, RIGHT)):
         kinds = [kind, "occlusion"] if kind == "cephalometry" else [kind]
-        end = page.heading(x, y, ", ".join(TITLES[name] for name in kinds), room)
+        end = page.heading(x, y, ", ".join(translated(TITLES[name]) for name in kinds), room)
         rows = [row[:5] for name in kinds for row in measure_rows(found, name)]
         rows.insert(0, ("", "before", "planned", "change", "norm"))
         end = page.table(x, end, rows, [share * room for share in SHARES[kind]])
@@ -183,7 +188,9 @@ def draw_chart_page(
         ends, room = [max(ends)], WHOLE
     y = page.heading(MARGIN, ends[0] + APART, "Warnings", room)
     groups = [group for group in grouped(findings) if group.severity != "note"]
-    lines = [f"{group.severity}: {group.line}" for group in groups] or ["None."]
+    lines = [f"{translated(group.severity)}: {group.text(translated)}" for group in groups] or [
+        "None."
+    ]
     most = int((FOOT - y) / (LEADING * SMALL))
     page.paragraph((MARGIN, y), lines, SMALL, most, room)
     _origin(page, prediction)
@@ -227,5 +234,6 @@ def _origin(page: _Page, prediction: Values) -> None:
     key = f"Plan, inputs and version: SHA-256 {prediction['case_key']}."
     for number, text in enumerate((f"Made by {versions}.", key)):
         page.line(MARGIN, FOOT + number * LEADING * FINE, text, FINE)
-    texts = [f"Inputs (first {DIGITS} digits of SHA-256): {inputs}."] if inputs else []
+    about = translated(f"Inputs (first {DIGITS} digits of SHA-256):")
+    texts = [f"{about} {inputs}."] if inputs else []
     page.paragraph((MARGIN, FOOT + 2 * LEADING * FINE), texts, FINE, INPUT_LINES)

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cmfsim.report.document import NOTHING, Figure, Note, Section, Table
+from cmfsim.values.language import translated
 
 Values = Mapping[str, Any]
 # A site that moves by less, mm, stays: half of the last digit of the tables.
@@ -91,8 +92,13 @@ def absent_text(found: Values, kind: str) -> str:
     reasons: dict[str, list[str]] = {}
     for entry in found.get(kind, ()):
         if entry["before"] is None and entry["planned"] is None:
-            reasons.setdefault(entry["absent"], []).append(f"{entry['label']}, {entry['unit']}")
-    return "; ".join(f"{' and '.join(names)} ({why})" for why, names in reasons.items())
+            reasons.setdefault(entry["absent"], []).append(
+                f"{translated(entry['label'])}, {entry['unit']}"
+            )
+    with_and = f" {translated('and')} "
+    return "; ".join(
+        f"{with_and.join(names)} ({translated(why)})" for why, names in reasons.items()
+    )
 
 
 def site_rows(found: Values) -> list[tuple[str, ...]]:

@@ -9,6 +9,7 @@ from importlib.resources import files
 
 from cmfsim.errors import third_party
 from cmfsim.report.document import Document, Figure, Note, Table, View
+from cmfsim.values.language import language, translated
 
 # How a distance between skins was measured, by the method of `compare_skins`.
 MEASURES: Mapping[str, str] = {
@@ -92,7 +93,11 @@ def render_page(document: Document) -> str:
     """
     jinja2 = third_party("jinja2", "reports are made", "report")
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=lambda value: translated(value) if type(value) is str else value,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     text = files("cmfsim.report").joinpath("page.html").read_text(encoding="utf-8")
     blocks = [block for section in document.sections for block in section.blocks]
@@ -104,6 +109,7 @@ def render_page(document: Document) -> str:
     page: str = environment.from_string(text).render(
         document=document,
         disclaimer=DISCLAIMER,
+        language=language(),
         scripts=[block.script for block in blocks if isinstance(block, View)],
     )
     return page
@@ -139,11 +145,11 @@ def _compact(png: bytes) -> tuple[bytes, str]:
 def whose(prediction: Mapping[str, object]) -> str:
     """Whose face was predicted, and when, as sentences; empty parts are left out."""
     patient, date = prediction.get("patient"), prediction.get("written_at")
-    texts = (f"Predicted {date}. " if date else "", f"Patient: {patient}. " if patient else "")
-    return "".join(texts)
+    texts = (f"Predicted {date}." if date else "", f"Patient: {patient}." if patient else "")
+    return "".join(f"{translated(text)} " for text in texts if text)
 
 
 def plan_name(prediction: Mapping[str, object]) -> str:
     """What the planning page and a saved plan call the plan: its digits, as a sentence."""
     digits = prediction.get("plan_digits")
-    return f"Plan {digits}. " if digits else ""
+    return f"{translated('Plan')} {digits}. " if digits else ""

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from cmfsim._core import rigid_fit
 from cmfsim.errors import BoundaryInputError, RegistrationError
 from cmfsim.values.checks import Floats
+from cmfsim.values.language import translated
 from cmfsim.values.motion import decompose_motion, rigid_motion
 from cmfsim.values.surface_data import MovedSurface
 
@@ -258,10 +259,12 @@ def plan_lines(plan: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for name, motion in plan.items():
         if motion["text"] != "stays":
             source = f" [{motion['source']}]" if motion["source"] else ""
-            lines.append(f"{name}: {motion['text']}{source}")
+            moved, at, rest = motion["text"].partition(" at the ")
+            at = f" {translated(f'{at}{rest}'.strip())}" if at else ""
+            lines.append(f"{name}: {translated(moved)}{at}{source}")
     still = [name for name, motion in plan.items() if motion["text"] == "stays"]
     if still:
-        lines.append(f"{', '.join(still)}: {'stays' if len(still) == 1 else 'stay'}")
+        lines.append(f"{', '.join(still)}: {translated('stays' if len(still) == 1 else 'stay')}")
     return lines
 
 

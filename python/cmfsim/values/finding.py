@@ -9,6 +9,7 @@ from typing import Any
 
 from cmfsim.values.checks import as_text, check_one_of
 from cmfsim.values.finding_table import FINDING_KINDS, FORMER_CODES, filled
+from cmfsim.values.language import translated
 
 # What several findings of one code have in common. Others are stated by the worst of them.
 TITLES: Mapping[str, str] = {
@@ -131,18 +132,23 @@ class FindingGroup:
     @property
     def line(self) -> str:
         """What they state, as one line of text; names in it are those of files."""
+        return self.text()
+
+    def text(self, said: Callable[[str], str] = str) -> str:
+        """The line, each of its texts as `said` gives it: in the reader's language, for one."""
         worst = self.worst
         count = len(self.findings)
         if self.code not in TITLES or count == 1:
             stated = self._wordings()[:MOST_WORDINGS]
-            line = "; ".join(_stated(finding) for finding in stated)
+            line = "; ".join(_stated(finding, said) for finding in stated)
             more = count - len(stated)
-            return f"{line}; and {more} more of this kind [{self.code}]" if more else line
+            rest = said(f"and {more} more of this kind")
+            return f"{line}; {rest} [{self.code}]" if more else line
         size = _size(worst)[1]
-        title = TITLES[self.code].format(n=count)
+        title = said(TITLES[self.code].format(n=count))
         if size and worst.where:
-            return f"{title} (largest: {worst.where} {size})"
-        return f"{title} (such as: {_shortened(worst.what)})"
+            return f"{title} ({said('largest:')} {worst.where} {size})"
+        return f"{title} ({said('such as:')} {said(_shortened(worst.what))})"
 
     def _wordings(self) -> list[Finding]:
         """The worst finding of each wording, figures apart; the worst of all first."""
@@ -175,11 +181,11 @@ def _shortened(text: str) -> str:
     return text if len(text) <= MOST_TEXT else f"{text[:MOST_TEXT]}…"
 
 
-def _stated(finding: Finding) -> str:
+def _stated(finding: Finding, said: Callable[[str], str]) -> str:
     """The fact and its place, unless the fact names it."""
     what = _shortened(finding.what)
     place = f" ({finding.where})" if finding.where and finding.where not in what else ""
-    return f"{what}{place}"
+    return f"{said(what)}{place}"
 
 
 def _size(finding: Finding) -> tuple[float, str]:
@@ -233,7 +239,7 @@ def findings_text(
         lines.append(f"{head}: {escape(finding.where or 'case')}: [{finding.code}]")
         for label, text in (("", finding.what), ("why: ", finding.why), ("fix: ", finding.fix)):
             if text:
-                lines += _wrapped(label, escape(text), width)
+                lines += _wrapped(translated(label), escape(translated(text)), width)
     return "\n".join([*lines, counted(findings) or "nothing found"])
 
 

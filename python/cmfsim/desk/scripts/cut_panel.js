@@ -1,10 +1,10 @@
 // The choice of procedures with their options, and the first moves of what they cut.
 
 import { call } from "./desk_calls.js";
-import { element, numberField, typedNumber } from "./elements.js";
+import { _, element, numberField, typedNumber } from "./elements.js";
 import { History } from "./history.js";
 
-const NAMES = { le_fort_1: "Le Fort I", le_fort_3: "Le Fort III", bsso: "Sagittal split of both rami (BSSO)", genioplasty: "Genioplasty" };
+const NAMES = { le_fort_1: _`Le Fort I`, le_fort_3: _`Le Fort III`, bsso: _`Sagittal split of both rami (BSSO)`, genioplasty: _`Genioplasty` };
 const ANGLES = ["tilt", "cant", "angle"];
 const STAYING = ["ramus_left", "ramus_right"];
 const SENSES = ["forwards", "up", "left"];
@@ -24,12 +24,12 @@ export class CutPanel {
     this.fields = {};
     this.notes = element("div", { id: "cut-notes", role: "status" });
     this.rows = element("div", { className: "moves", id: "moves" });
-    this.root = element("section", { className: "step", "aria-label": "Procedures" },
-      element("h2", { textContent: "2. Procedures" }),
+    this.root = element("section", { className: "step", "aria-label": _`Procedures` },
+      element("h2", { textContent: _`2. Procedures` }),
       ...app.page.procedures.map((p) => this.procedure(p)),
       this.notes,
-      element("h2", { textContent: "First moves, mm" }),
-      element("p", { className: "note", textContent: "The face is computed exactly for these; turns are added on the page of the plan. Left is the patient's left; negative numbers go the other way." }),
+      element("h2", { textContent: _`First moves, mm` }),
+      element("p", { className: "note", textContent: _`The face is computed exactly for these; turns are added on the page of the plan. Left is the patient's left; negative numbers go the other way.` }),
       this.rows);
   }
 
@@ -47,7 +47,7 @@ export class CutPanel {
     const step = high - low <= 2 ? 0.05 : 0.5;
     const id = `option-${kind}-${name}`;
     const label = `${stated}, ${unit}`;
-    const field = numberField({ id, title: `${name} in the case file: ${low} to ${high} ${unit}`, onchange: () => this.set(kind, name, typedNumber(field.value), true) });
+    const field = numberField({ id, title: _`${name} in the case file: ${low} to ${high} ${unit}`, onchange: () => this.set(kind, name, typedNumber(field.value), true) });
     const slide = element("input", {
       type: "range", min: low, max: high, step, "aria-label": label,
       oninput: () => this.set(kind, name, Number(slide.value)), onchange: () => this.keep(),
@@ -74,11 +74,11 @@ export class CutPanel {
   /** Sets an option within its range, as far as it is a number. */
   set(kind, name, value, keep = false) {
     const { low, high, step } = this.fields[kind].options[name];
-    if (!Number.isFinite(value)) this.app.work.fail(`Type a number from ${low} to ${high}; nothing was changed.`);
+    if (!Number.isFinite(value)) this.app.work.fail(_`Type a number from ${low} to ${high}; nothing was changed.`);
     else {
       const digits = step < 0.1 ? 100 : 10;
       const within = Math.min(high, Math.max(low, Math.round(digits * value) / digits));
-      if (keep && within !== Math.round(digits * value) / digits) this.app.work.fail(`${words(name)} goes from ${low} to ${high}: ${within} is used.`);
+      if (keep && within !== Math.round(digits * value) / digits) this.app.work.fail(_`${words(name)} goes from ${low} to ${high}: ${within} is used.`);
       this.cuts = { ...this.cuts, [kind]: { ...this.cuts[kind], [name]: within } };
     }
     if (keep) this.keep();
@@ -159,10 +159,10 @@ export class CutPanel {
   moveRow(name) {
     this.swatches[name] = element("span", { className: "swatch" });
     const label = element("span", { className: "choice" }, this.swatches[name], words(name));
-    if (this.app.page.kept.includes(name)) return [label, element("span", { className: "note", textContent: "moves as the case file states" }), element("span"), element("span")];
+    if (this.app.page.kept.includes(name)) return [label, element("span", { className: "note", textContent: _`moves as the case file states` }), element("span"), element("span")];
     this.typed[name] ??= [0, 0, 0];
     return [label, ...SENSES.map((sense, k) => numberField({
-      id: `move-${name}-${sense}`, "aria-label": `${words(name)}: ${sense}, mm`, value: String(tenth(this.typed[name][k])),
+      id: `move-${name}-${sense}`, "aria-label": _`${words(name)}: ${sense}, mm`, value: String(tenth(this.typed[name][k])),
       onchange: (e) => { this.typed[name][k] = typedNumber(e.target.value); },
     }))];
   }
@@ -172,7 +172,7 @@ export class CutPanel {
     const moves = {};
     for (const name of this.segments.filter((n) => !this.app.page.kept.includes(n))) {
       const wrong = this.typed[name].findIndex((v) => !(Math.abs(v) <= MOST));
-      if (wrong >= 0) return `${words(name)}, ${SENSES[wrong]}: type a number from -${MOST} to ${MOST} mm. Nothing was saved.`;
+      if (wrong >= 0) return _`${words(name)}, ${SENSES[wrong]}: type a number from -${MOST} to ${MOST} mm. Nothing was saved.`;
       moves[name] = this.typed[name];
     }
     return moves;

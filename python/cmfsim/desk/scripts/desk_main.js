@@ -5,7 +5,7 @@ import { DISTINCT, SKIN, STILL_BONE, rgb } from "./colours.js";
 import { CutPanel } from "./cut_panel.js";
 import { WorkView, call, findingList } from "./desk_calls.js";
 import { Drawing } from "./drawing.js";
-import { button, element } from "./elements.js";
+import { _, button, element } from "./elements.js";
 import { PlaneView } from "./plane_view.js";
 import { connectKeys, connectPointing } from "./pointing.js";
 import { questionStep } from "./questions.js";
@@ -43,14 +43,14 @@ class App {
     if (page.error) this.work.fail(page.error);
     if (page.questions.length) panel.append(questionStep(page.questions, (question, toml) => this.answer(question, toml)));
     if (page.taken.length) {
-      panel.append(element("details", {}, element("summary", { textContent: "What the files were taken for" }),
+      panel.append(element("details", {}, element("summary", { textContent: _`What the files were taken for` }),
         ...page.taken.map((t) => element("p", { className: "note", textContent: `${t.file}: ${t.taken_for || "?"} (${t.why})` }))));
     }
     if (this.isOpen) {
-      addViews(this, "Whole head");
+      addViews(this, _`Whole head`);
       document.getElementById("controls").append(
         ...[["bones", "Bones"], ["skin", "Skin"]].map(([key, label]) => slider(`show-${key}`, label, this.opacity[key], (v) => { this.opacity[key] = v; this.redraw(); })),
-        element("span", { className: "note", textContent: "Drag to rotate, Shift-drag to move, wheel to zoom. Drag a round handle to move its plane." }));
+        element("span", { className: "note", textContent: _`Drag to rotate, Shift-drag to move, wheel to zoom. Drag a round handle to move its plane.` }));
       this.cutting = new CutPanel(this);
       panel.append(this.landmarkStep(), this.cutting.root, this.planStep());
       connectPointing(this);
@@ -58,7 +58,7 @@ class App {
       new ResizeObserver(() => this.redraw()).observe(this.overlay);
       this.cutting.changed();
     } else if (!page.questions.length) {
-      panel.append(button("Open the head", () => this.begin("open"), { id: "open", hidden: true }));
+      panel.append(button(_`Open the head`, () => this.begin("open"), { id: "open", hidden: true }));
     }
     this.redraw();
     panel.append(this.findings = element("div"));
@@ -69,20 +69,20 @@ class App {
     const open = sites.filter((s) => !s.placed && (s.doubt || s.why));
     const placed = sites.filter((s) => s.placed).length;
     const text = open.length
-      ? `${open.length} of ${sites.length} sites ${open.length === 1 ? "is" : "are"} doubtful or missing: ${open.slice(0, 4).map((s) => s.name).join(", ")}${open.length > 4 ? ", …" : ""}. Cuts and muscles are placed by them: check these first.`
-      : `${sites.length} sites, none of them doubtful; ${placed} placed or accepted.`;
-    return element("section", { className: "step", "aria-label": "Landmarks" },
-      element("h2", { textContent: "1. Landmarks" }),
+      ? _`${open.length} of ${sites.length} sites ${open.length === 1 ? "is" : "are"} doubtful or missing: ${open.slice(0, 4).map((s) => s.name).join(", ")}${open.length > 4 ? ", …" : ""}. Cuts and muscles are placed by them: check these first.`
+      : _`${sites.length} sites, none of them doubtful; ${placed} placed or accepted.`;
+    return element("section", { className: "step", "aria-label": _`Landmarks` },
+      element("h2", { textContent: _`1. Landmarks` }),
       element("p", { className: open.length ? "state warning" : "state", id: "site-note", textContent: text }),
-      element("a", { href: "landmarks", id: "to-landmarks", textContent: "Check the landmarks" }));
+      element("a", { href: "landmarks", id: "to-landmarks", textContent: _`Check the landmarks` }));
   }
 
   planStep() {
-    this.computing = button("Save, and compute the plan", () => this.compute(), { id: "compute", className: "main-action" });
-    this.link = element("a", { href: "plan", id: "to-plan", textContent: "Plan the moves, predict and print", hidden: true });
-    return element("section", { className: "step", "aria-label": "Plan" },
-      element("h2", { textContent: "3. Plan" }),
-      element("p", { className: "note", textContent: `Saves cuts and moves in ${this.page.case_file}, builds the face, and opens the page on which it follows the bones.` }),
+    this.computing = button(_`Save, and compute the plan`, () => this.compute(), { id: "compute", className: "main-action" });
+    this.link = element("a", { href: "plan", id: "to-plan", textContent: _`Plan the moves, predict and print`, hidden: true });
+    return element("section", { className: "step", "aria-label": _`Plan` },
+      element("h2", { textContent: _`3. Plan` }),
+      element("p", { className: "note", textContent: _`Saves cuts and moves in ${this.page.case_file}, builds the face, and opens the page on which it follows the bones.` }),
       element("div", { className: "row" }, this.computing, this.link));
   }
 
@@ -121,7 +121,7 @@ class App {
       await call("answer", { seen: this.seen, line, toml });
       globalThis.location.reload();
     } catch (error) {
-      this.work.fail(`Not saved: ${error.message}.`);
+      this.work.fail(_`Not saved: ${error.message}.`);
     }
   }
 
@@ -191,7 +191,7 @@ try {
   globalThis.cmfsimDesk = new App(page, arrays);
 } catch (error) {
   const box = document.getElementById("failure");
-  box.textContent = `The desk cannot be shown: ${error.message}`;
+  box.textContent = _`The desk cannot be shown: ${error.message}`;
   box.hidden = false;
   throw error;
 }

@@ -1,5 +1,6 @@
 // The planes of the cuts in the picture, and the handles by which they are dragged.
 
+import { _ } from "./elements.js";
 import { STAYS } from "./rigid.js";
 
 // A plane that three others and the box of its bone clip has at most this many corners.

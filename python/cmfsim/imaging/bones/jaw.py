@@ -148,7 +148,7 @@ def part_jaws(
                     f"the image seems to show the tooth rows elsewhere than {', '.join(against)}"
                 )
                 return Jaws(None, None, None, (_not_parted(elsewhere),))
-        findings.append(_guessed())
+        findings.append(Finding("jaws-parted-by-shape", where="bone"))
     box = _box(work, bone, given) if head is None else model_box(work, head)
     domain = np.asfortranarray(bone.mask[box])
     part = work.part(box)
@@ -233,10 +233,6 @@ def _on_other_jaw(work: Working, given: Mapping[str, Floats]) -> Finding | None:
         "upper teeth",
         where="landmarks.skull",
     )
-
-
-def _guessed() -> Finding:
-    return Finding("jaws-parted-by-shape", where="bone")
 
 
 def _implausible(mandible: Mask, work: Working) -> str | None:

@@ -87,8 +87,9 @@ def poor_bite(rows: Iterable[Mapping[str, Any]]) -> list[Finding]:
         if out > EDGE_ERROR and out > out_before + WORSE:
             limits = f"{low:g} or more" if np.isinf(high) else f"{low:g} to {high:g}"
             unit = measure.unit if measure.unit == "°" else f" {measure.unit}"
-            numbers = f"{now:.1f}{unit}, {was:.1f} before (limits: {limits}".replace("-", "−")
-            texts.append(f"{measure.label.lower()} is {numbers}, {source})")
+            name, after = measure.label.lower(), f"{now:.1f}{unit}"
+            text = f"{name} is {after}, {was:.1f} before (limits: {limits}, {source})"
+            texts.append(text.replace("-", "−"))
     return [Finding("plan-bite-poor", f"as planned, {'; '.join(texts)}")] if texts else []
 
 
@@ -221,8 +222,9 @@ def missing_for_occlusion(
         **dict.fromkeys(("upper_midline", "lower_midline"), f"{middle}: not given or found"),
         "cant": "upper molars of both sides: not given or found",
         **{
-            key: "U6 and L6 of the side, by the same cusp: not given"
-            + (f", nor found ({unfound[key]})" if unfound.get(key) else "")
+            key: f"U6 and L6 of the side, by the same cusp: not given, nor found ({unfound[key]})"
+            if unfound.get(key)
+            else "U6 and L6 of the side, by the same cusp: not given"
             for key in ("molar_left", "molar_right")
         },
     }

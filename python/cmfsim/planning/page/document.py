@@ -13,7 +13,7 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.page.content import PageContent
+from cmfsim.values.language import language, script_texts, translated
 
 TYPES = ("float32", "float16", "uint32")
 # Arrays begin at multiples of this, bytes, as typed arrays of JavaScript need it.
@@ -36,6 +37,14 @@ IMPORT = re.compile(r'^import \{[^}]*\} from "\./([a-z_]+\.js)";\n', re.MULTILIN
 EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const|class)\b)", re.MULTILINE)
 # A name that a module defines at its top.
 DEFINED = re.compile(r"^(?:export )?(?:async )?(?:function|const|let|class) (\w+)", re.MULTILINE)
+# What stands in a template for people to read: between tags, and as a label.
+TAGGED = re.compile(r"(<p[^>]*>|aria-label=\")([^<>@\"]+)(<|\")")
+# Values of pages that people read; others are names.
+READ = (
+    *("about", "absent", "caption", "choices", "doubt", "exact_note", "label", "measure_notes"),
+    *("note", "occlusion_absent", "problems", "profile_absent", "text", "title", "where", "why"),
+    "words",
+)
 FIELD = re.compile(r"@([a-z]+)@")
 # Parts that templates have in common, and the template of a picture within another page.
 INCLUDED = ("canvases", "scripts")
@@ -95,10 +104,11 @@ def document_text(document: Document) -> str:
     packages = tuple(dict.fromkeys((SHARED, document.package)))
     parts = _parts(document.values, document.arrays, packages, document.main)
     fields = {
-        **{name: html.escape(getattr(document, name)) for name in texts},
+        **{name: html.escape(translated(getattr(document, name))) for name in texts},
         "policy": _policy(parts["script"], parts["style"], is_served=document.is_served),
         "state": html.escape(document.made_for),
-        "disclaimer": DISCLAIMER,
+        "disclaimer": html.escape(translated(DISCLAIMER)),
+        "language": language(),
         **parts,
     }
     return _filled(_template("page"), fields)
@@ -119,7 +129,7 @@ def view_markup(
     Raises `CaseError`: As `document_text`.
     """
     parts = _parts(values, arrays, (package,), main)
-    fields = {**parts, "picture": html.escape(picture)}
+    fields = {**parts, "picture": html.escape(translated(picture))}
     return _filled(VIEW, fields), f"'sha256-{_digest(parts['script'])}'"
 
 
@@ -138,20 +148,35 @@ def _parts(
         for entry in (files(package) / "scripts").iterdir()
         if entry.name.endswith(".js")
     }
+    script = joined_scripts(scripts, main)
+    shown = {**shown_values(values), "arrays": table, "texts": script_texts(script)}
     return {
         "style": "".join(p.read_text(encoding="utf-8") for p in paths if p.is_file()),
-        "script": joined_scripts(scripts, main),
-        "values": _json_in_html({**values, "arrays": table}),
+        "script": script,
+        "values": _json_in_html(shown),
         "numbers": numbers,
     }
+
+
+def shown_values(values: Any, read: Container[str] = READ, key: str = "") -> Any:
+    """Values of a page, with those that people read, by their keys, in their language."""
+    if isinstance(values, str):
+        return translated(values) if key in read else values
+    if isinstance(values, Mapping):
+        return {name: shown_values(value, read, name) for name, value in values.items()}
+    return [shown_values(v, read, key) for v in values] if isinstance(values, list) else values
 
 
 def _filled(text: str, fields: Mapping[str, str]) -> str:
     """A template with its fields, after the templates that it includes."""
     for part in INCLUDED:
-        text = text.replace(f"@{part}@\n", _template(part))
+        text = text.replace(f"@{part}@\n", TAGGED.sub(_in_language, _template(part)))
     # In one pass, so that no text is searched for the fields of another.
     return FIELD.sub(lambda match: fields[match[1]], text)
+
+
+def _in_language(match: re.Match[str]) -> str:
+    return f"{match[1]}{html.escape(translated(match[2]), quote=False)}{match[3]}"
 
 
 def _template(name: str) -> str:

@@ -20,7 +20,7 @@ from cmfsim.planning.replanning.model import Motions, PlanColumns, PlanningModel
 from cmfsim.solving.models import model_scene
 from cmfsim.solving.rates import ACCURACY, scene_parts, tissue_load
 from cmfsim.solving.simulation import scene_plan
-from cmfsim.values.calibration import TISSUE, BandFactor, Source
+from cmfsim.values.calibration import TISSUE, Source
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import decompose_motion
 from cmfsim.values.prediction import Prediction
@@ -84,8 +84,9 @@ class PlanBand:
     def half_widths(self, plan: Motions) -> dict[str, float]:
         """The mean half-width of the band in each region of the face, mm."""
         sd, band = self.sd(plan), self.at_reference
+        factors = {name: known.factor for name, known in band.factors.items()}
         return {
-            name: _factor(band, band.factors.get(name)) * float(sd[part].mean())
+            name: factors.get(name, band.plain_factor) * float(sd[part].mean())
             for name, part in band.regions.items()
         }
 
@@ -94,10 +95,6 @@ class PlanBand:
         """How many standard deviations the band has at each vertex, (k,); NaN where it has none."""
         band = self.at_reference
         return np.ma.filled(band.half_width, np.nan) / band.sd
-
-
-def _factor(band: SkinBand, factor: BandFactor | None) -> float:
-    return band.plain_factor if factor is None else factor.factor
 
 
 def plan_band(planning: PlanningModel, reference: Prediction) -> PlanBand:

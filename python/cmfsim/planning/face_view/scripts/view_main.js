@@ -3,7 +3,7 @@
 import { Camera } from "./camera.js";
 import { SKIN, STILL_BONE, DISTINCT, mapped, rgb } from "./colours.js";
 import { Drawing, vertexNormals } from "./drawing.js";
-import { cleared } from "./elements.js";
+import { _, cleared } from "./elements.js";
 import { Ruler } from "./measuring.js";
 import { connectKeys, connectPointing } from "./pointing.js";
 import { STAYS } from "./rigid.js";
@@ -91,8 +91,8 @@ class App {
     drawing.draw(camera, this.shown(false), side ? 0.5 : 0, 1);
     const { pen, width, height } = cleared(this.overlay);
     if (!side) this.ruler.draw(pen, camera, width, height);
-    const after = share === 1 ? "After" : share === 0 ? "Before" : `${Math.round(100 * share)} % of the way`;
-    document.getElementById("caption-left").textContent = side ? "Before" : after;
+    const after = share === 1 ? _`After` : share === 0 ? _`Before` : _`${Math.round(100 * share)} % of the way`;
+    document.getElementById("caption-left").textContent = side ? _`Before` : after;
     document.getElementById("caption-right").textContent = side ? after : "";
     this.view.showLegend(this.most);
   }

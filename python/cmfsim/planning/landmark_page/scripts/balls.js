@@ -1,13 +1,15 @@
 // Sites as balls in the picture: coloured by their state, hidden by what lies in front of them.
 
+import { _ } from "./elements.js";
+
 export const STATES = {
-  missing: { label: "missing", colour: "#8b3fa8" },
-  doubtful: { label: "doubtful", colour: "#d55e00" },
-  filled: { label: "filled in", colour: "#56b4e9" },
-  moved: { label: "moved", colour: "#56b4e9" },
-  proposed: { label: "proposed", colour: "#0072b2" },
-  accepted: { label: "accepted", colour: "#009e73" },
-  placed: { label: "placed", colour: "#009e73" },
+  missing: { label: _`missing`, colour: "#8b3fa8" },
+  doubtful: { label: _`doubtful`, colour: "#d55e00" },
+  filled: { label: _`filled in`, colour: "#56b4e9" },
+  moved: { label: _`moved`, colour: "#56b4e9" },
+  proposed: { label: _`proposed`, colour: "#0072b2" },
+  accepted: { label: _`accepted`, colour: "#009e73" },
+  placed: { label: _`placed`, colour: "#009e73" },
 };
 // Radius as a share of the height of the picture, and its bounds, mm.
 const SIZE = 0.0085, LEAST = 0.7, MOST = 2.6;

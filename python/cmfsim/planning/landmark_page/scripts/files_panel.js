@@ -1,7 +1,7 @@
 // Files of landmarks: saved for the case, and loaded by the file picker or by dropping them.
 
 import { call, deskState } from "./desk_calls.js";
-import { button, copied, element } from "./elements.js";
+import { _, button, copied, element } from "./elements.js";
 import { save } from "./exporting.js";
 import { decidedOf, sitesOf } from "./loading.js";
 import { markupsOf, markupsText } from "./markups.js";
@@ -20,18 +20,18 @@ export class FilesPanel {
     this.lines = ["[landmarks]", ...kinds.map((kind) => `${kind} = "${fileOf(kind)}"`), 'automatic = "missing"'].join("\n");
     this.kinds = kinds;
     this.root = element("div", {},
-      element("h2", { textContent: "Save" }),
+      element("h2", { textContent: _`Save` }),
       app.page.on_desk ? this.caseRow() : null,
       element("div", { className: "row" }, ...kinds.map((kind) =>
-        button(`Save the ${kind}`, () => this.save(kind), { id: `save-${kind}`, title: fileOf(kind) }))),
+        button(_`Save the ${kind}`, () => this.save(kind), { id: `save-${kind}`, title: fileOf(kind) }))),
       this.note = element("p", { className: "note", id: "save-note" }),
-      element("p", { className: "note", textContent: "Put the files next to the case file, and these lines into it:" }),
+      element("p", { className: "note", textContent: _`Put the files next to the case file, and these lines into it:` }),
       element("code", { textContent: this.lines, className: "lines" }),
       element("div", { className: "row" },
-        button("Copy the lines", async () => app.report((await copied(this.lines)) ? "Copied." : "Not copied, because the browser does not allow it: select the text instead."))),
-      element("h2", { textContent: "Load" }),
-      element("div", { className: "row" }, element("label", { for: "landmark-files", textContent: "Landmark files" }), this.file),
-      element("p", { className: "note", textContent: "Files of 3D Slicer (.mrk.json), or drop them anywhere on this page. Loaded sites replace those placed here; undo brings them back." }));
+        button(_`Copy the lines`, async () => app.report((await copied(this.lines)) ? _`Copied.` : _`Not copied, because the browser does not allow it: select the text instead.`))),
+      element("h2", { textContent: _`Load` }),
+      element("div", { className: "row" }, element("label", { for: "landmark-files", textContent: _`Landmark files` }), this.file),
+      element("p", { className: "note", textContent: _`Files of 3D Slicer (.mrk.json), or drop them anywhere on this page. Loaded sites replace those placed here; undo brings them back.` }));
     document.addEventListener("dragover", (e) => e.preventDefault());
     document.addEventListener("drop", (e) => {
       e.preventDefault();
@@ -42,16 +42,16 @@ export class FilesPanel {
   show() {
     const open = this.app.shown.filter(({ state }) => state === "missing").length;
     this.note.textContent = open
-      ? `${open} missing sites are saved as not placed.`
-      : "All sites are saved, each with its state as its description.";
+      ? _`${open} missing sites are saved as not placed.`
+      : _`All sites are saved, each with its state as its description.`;
   }
 
   /** Saves into the case, where the page was opened from the desk. */
   caseRow() {
     deskState().then(({ seen }) => { this.seen = seen; });
     return element("div", { className: "row" },
-      button("Save in the case", () => this.saveInCase(), { id: "save-in-case" }),
-      element("a", { href: "./", textContent: "Back to the desk" }));
+      button(_`Save in the case`, () => this.saveInCase(), { id: "save-in-case" }),
+      element("a", { href: "./", textContent: _`Back to the desk` }));
   }
 
   async saveInCase() {
@@ -61,7 +61,7 @@ export class FilesPanel {
       this.app.savedAt = this.app.history.now;
       globalThis.location.assign("./");
     } catch (error) {
-      this.app.report(`Not saved: ${error.message}.`);
+      this.app.report(_`Not saved: ${error.message}.`);
     }
   }
 
@@ -82,7 +82,7 @@ export class FilesPanel {
     let decided = new Map(this.app.decided);
     for (const file of files) {
       try {
-        if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes, which is too large for landmarks`);
+        if (file.size > MOST_BYTES) throw new Error(_`it has ${file.size} bytes, which is too large for landmarks`);
         const { app } = this;
         const { points, stated } = markupsOf(await file.text());
         const { kind, found, warnings } = sitesOf(points, app.page.sites, (part, point) => app.away(part, point), file.name);
@@ -92,10 +92,10 @@ export class FilesPanel {
         const shown = app.derived(first);
         const placed = decidedOf(found, shown, MOVED);
         decided = new Map([...kept, ...placed.map(({ site, point, origin }) => [site, { point, origin: origin === "accepted" ? "accepted" : "placed" }])]);
-        if (!stated) warnings.unshift("it does not state its frame: read as LPS");
-        reports.push(`${file.name}: ${placed.length} ${kind} sites loaded${warnings.length ? `; ${warnings.join("; ")}` : ""}.`);
+        if (!stated) warnings.unshift(_`it does not state its frame: read as LPS`);
+        reports.push(_`${file.name}: ${placed.length} ${kind} sites loaded${warnings.length ? `; ${warnings.join("; ")}` : ""}.`);
       } catch (error) {
-        reports.push(`${file.name}: ${error.message}. Nothing was loaded from it.`);
+        reports.push(_`${file.name}: ${error.message}. Nothing was loaded from it.`);
       }
     }
     if (decided.size !== this.app.decided.size || [...decided].some(([i, d]) => this.app.decided.get(i) !== d)) this.app.decide(decided);

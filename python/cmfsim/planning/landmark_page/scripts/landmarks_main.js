@@ -5,7 +5,7 @@ import { Camera } from "./camera.js";
 import { ClosestPoint } from "./closest.js";
 import { SKIN, STILL_BONE, rgb } from "./colours.js";
 import { Drawing } from "./drawing.js";
-import { cleared, element } from "./elements.js";
+import { _, cleared, element } from "./elements.js";
 import { FilesPanel } from "./files_panel.js";
 import { History } from "./history.js";
 import { seenPoint } from "./picking.js";
@@ -63,12 +63,12 @@ class App {
     this.panel = new SitePanel(this);
     this.files = new FilesPanel(this);
     document.getElementById("panel").append(this.panel.root, this.files.root);
-    addViews(this, "Whole head");
+    addViews(this, _`Whole head`);
     const parts = { cranium: "Cranium", mandible: "Mandible", skin: "Skin" };
     document.getElementById("controls").append(
       ...Object.entries(parts).filter(([part]) => this.surfaces.some((s) => s.part === part)).map(([part, label]) =>
         slider(`show-${part}`, label, this.opacity[part], (value) => { this.opacity[part] = value; this.redraw(); })),
-      element("span", { className: "note", textContent: "Drag to rotate, Shift-drag to move, wheel to zoom. N and P: next and previous to check; Enter: accept; Delete: remove; Ctrl+Z: undo." }));
+      element("span", { className: "note", textContent: _`Drag to rotate, Shift-drag to move, wheel to zoom. N and P: next and previous to check; Enter: accept; Delete: remove; Ctrl+Z: undo.` }));
     connectPointing(this);
     connectKeys(this);
     document.addEventListener("keydown", (e) => this.pressed(e));
@@ -154,7 +154,7 @@ class App {
     if (state === "placed" || state === "accepted" || !onSurface) return;
     const { label } = this.site;
     this.put(this.chosen, [...point], "accepted");
-    this.report(`${label} accepted.`);
+    this.report(_`${label} accepted.`);
     this.step(1);
   }
 
@@ -163,7 +163,7 @@ class App {
     const left = new Map(this.history.now);
     left.delete(this.chosen);
     this.decide(left);
-    this.report(`${this.site.label} is no longer placed.`);
+    this.report(_`${this.site.label} is no longer placed.`);
   }
 
   /** Places the other side at the mirror image of the chosen site. */
@@ -173,12 +173,12 @@ class App {
     const image = mirrored(this.decided.get(this.chosen).point, this.midplane());
     const near = this.closest(this.site.part, image);
     if (near.distance > this.page.surface_reach) {
-      this.report(`There is no ${this.site.part} at the mirror image.`);
+      this.report(_`There is no ${this.site.part} at the mirror image.`);
       return;
     }
     this.put(other, near.point);
     this.choose(other);
-    this.report(`${this.site.label} placed at the mirror image: check it.`);
+    this.report(_`${this.site.label} placed at the mirror image: check it.`);
   }
 
   /** The plane of symmetry of the sites without doubt: a point and a unit normal to the left. */
@@ -327,8 +327,8 @@ class App {
     const { site } = this;
     const { part } = seen.surface;
     if (part !== site.part) {
-      const advice = part === "skin" ? "make the skin fainter" : `hide the ${part} if it is in front`;
-      this.report(`${site.label} lies on the ${site.part}, and this is the ${part}: click on the ${site.part} (${advice}).`);
+      const advice = part === "skin" ? _`make the skin fainter` : _`hide the ${part} if it is in front`;
+      this.report(_`${site.label} lies on the ${site.part}, and this is the ${part}: click on the ${site.part} (${advice}).`);
       return;
     }
     this.put(this.chosen, seen.point);
@@ -340,7 +340,7 @@ class App {
     const point = this.shown[i].point;
     const other = this.partner === null ? null : this.shown[this.partner].point;
     const wrong = other && (name.endsWith("_L") ? point[0] < other[0] : point[0] > other[0]);
-    this.report(wrong ? `${label} is now on the other side of its partner: left is the patient's left. Undo with Ctrl+Z.` : `${label} placed.`);
+    this.report(wrong ? _`${label} is now on the other side of its partner: left is the patient's left. Undo with Ctrl+Z.` : _`${label} placed.`);
   }
 
   pressed(e) {
@@ -372,10 +372,10 @@ class App {
     const open = toCheck.length;
     const done = this.decided.size;
     const next = this.model.mostUseful([...this.decided.keys()].sort((a, b) => a - b), toCheck);
-    const hint = open > 1 ? ` ${this.page.sites[next].label} would help the others most.` : "";
+    const hint = open > 1 ? _` ${this.page.sites[next].label} would help the others most.` : "";
     box.textContent = open
-      ? `${open} of ${this.page.sites.length} sites to check; ${done} placed or accepted.${hint}`
-      : `Nothing is left to check; ${done} of ${this.page.sites.length} sites placed or accepted.`;
+      ? _`${open} of ${this.page.sites.length} sites to check; ${done} placed or accepted.${hint}`
+      : _`Nothing is left to check; ${done} of ${this.page.sites.length} sites placed or accepted.`;
     box.classList.toggle("warning", open > 0);
   }
 

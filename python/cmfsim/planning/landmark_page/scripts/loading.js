@@ -1,5 +1,6 @@
 // Landmarks that come back from files: whose they are, and whether they can be this head's.
 
+import { _ } from "./elements.js";
 import { isDecided } from "./site_states.js";
 
 // Medians of distances from bone or skin, mm: above FAR the file is of something else, and a frame
@@ -25,16 +26,16 @@ export function sitesOf(points, sites, away, name) {
   for (const entry of points) {
     const site = known.get(labelKey(entry.label));
     if (site === undefined) unknown.push(entry.label);
-    else if (found.some((f) => f.site === site)) throw new Error(`it has ${sites[site].name} twice`);
+    else if (found.some((f) => f.site === site)) throw new Error(_`it has ${sites[site].name} twice`);
     else found.push({ ...entry, site });
   }
-  if (!found.length) throw new Error(`none of its labels is a site of the ${kind}: ${listed(unknown)}`);
+  if (!found.length) throw new Error(_`none of its labels is a site of the ${kind}: ${listed(unknown)}`);
   checkFrame(found, sites, away);
   checkSides(found, sites);
   const off = found.filter((f) => away(sites[f.site].part, f.point) > OFF);
   const warnings = [];
-  if (unknown.length) warnings.push(`unknown labels were skipped: ${listed(unknown)}`);
-  if (off.length) warnings.push(`skipped because they lie more than ${OFF} mm from their surface: ${listed(off.map((f) => f.label))}`);
+  if (unknown.length) warnings.push(_`unknown labels were skipped: ${listed(unknown)}`);
+  if (off.length) warnings.push(_`skipped because they lie more than ${OFF} mm from their surface: ${listed(off.map((f) => f.label))}`);
   return { kind, found: found.filter((f) => !off.includes(f)), warnings };
 }
 
@@ -45,10 +46,10 @@ function kindOf(points, sites, name) {
     const kinds = new Set(sites.filter((s) => s.labels.includes(labelKey(label))).map((s) => s.kind));
     if (kinds.size === 1) counts[[...kinds][0]]++;
   }
-  if (counts.skull && counts.skin) throw new Error("it has sites of both skull and skin: save them in two files");
+  if (counts.skull && counts.skin) throw new Error(_`it has sites of both skull and skin: save them in two files`);
   if (counts.skull || counts.skin) return counts.skull ? "skull" : "skin";
   const said = ["skull", "skin"].filter((kind) => name.toLowerCase().includes(kind));
-  if (said.length !== 1) throw new Error("its labels do not tell skull from skin: put “skull” or “skin” into the name of the file");
+  if (said.length !== 1) throw new Error(_`its labels do not tell skull from skin: put “skull” or “skin” into the name of the file`);
   return said[0];
 }
 
@@ -57,9 +58,9 @@ function checkFrame(found, sites, away) {
   const own = distance([1, 1, 1]);
   if (own <= FAR) return;
   if (distance([-1, -1, 1]) < NEAR) {
-    throw new Error("its points fit this head only with x and y reversed: the file states the wrong frame (LPS and RAS are exchanged)");
+    throw new Error(_`its points fit this head only with x and y reversed: the file states the wrong frame (LPS and RAS are exchanged)`);
   }
-  throw new Error(`half of its points lie more than ${own.toFixed(0)} mm from the bone or skin: it belongs to another patient or image`);
+  throw new Error(_`half of its points lie more than ${own.toFixed(0)} mm from the bone or skin: it belongs to another patient or image`);
 }
 
 function checkSides(found, sites) {
@@ -68,7 +69,7 @@ function checkSides(found, sites) {
     const right = at.get(name.replace(/_L$/, "_R"));
     return name.endsWith("_L") && right && at.get(name)[0] < right[0] - SIDE_MARGIN;
   });
-  if (wrong.length) throw new Error(`left and right are exchanged: ${listed(wrong)} lies on the patient's right`);
+  if (wrong.length) throw new Error(_`left and right are exchanged: ${listed(wrong)} lies on the patient's right`);
 }
 
 function median(values) {
@@ -77,7 +78,7 @@ function median(values) {
 }
 
 export const listed = (names, most = 5) =>
-  names.slice(0, most).join(", ") + (names.length > most ? ` and ${names.length - most} more` : "");
+  names.slice(0, most).join(", ") + (names.length > most ? _` and ${names.length - most} more` : "");
 
 /** Of the loaded sites, those that a person placed: also by moving a proposed one elsewhere. */
 export function decidedOf(found, shown, moved) {

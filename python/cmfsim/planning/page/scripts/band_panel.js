@@ -1,6 +1,6 @@
 // How far to trust the face under the plan that is shown, by region.
 
-import { element } from "./elements.js";
+import { _, element } from "./elements.js";
 
 export class BandPanel {
   constructor(app) {
@@ -12,14 +12,14 @@ export class BandPanel {
     const percent = Math.round(100 * band.coverage);
     const cases = band.regions[0]?.cases;
     const meaning = band.state === "calibrated"
-      ? `In ${percent} % of cases like the ${cases} of the calibration, all of a region is within this distance, along the skin's normal.`
-      : `Uncalibrated: a multiple of the standard deviation that follows from assumptions about tissue and surgery. No case with a known outcome shows that it covers ${percent} %.`;
+      ? _`In ${percent} % of cases like the ${cases} of the calibration, all of a region is within this distance, along the skin's normal.`
+      : _`Uncalibrated: a multiple of the standard deviation that follows from assumptions about tissue and surgery. No case with a known outcome shows that it covers ${percent} %.`;
     this.root.append(
-      element("h2", { textContent: `How far to trust it (${band.state})` }),
+      element("h2", { textContent: _`How far to trust it (${band.state})` }),
       element("table", { id: "band" },
         element("thead", {}, element("tr", {}, ...["", "± mm"].map((h) => element("th", { scope: "col", textContent: h })))),
         this.body),
-      element("p", { className: "note", textContent: band.note ? `${meaning} Calibrated on: ${band.note}.` : meaning }));
+      element("p", { className: "note", textContent: band.note ? _`${meaning} Calibrated on: ${band.note}.` : meaning }));
   }
 
   show() {

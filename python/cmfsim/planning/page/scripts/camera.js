@@ -3,15 +3,16 @@
 // Angles in degrees: azimuth 0 and elevation 0 look at the face from the front; azimuth 90 from the
 // patient's left; elevation −90 from below.
 
+import { _ } from "./elements.js";
 import { DEGREE } from "./rigid.js";
 
 export const VIEWS = [
-  { name: "Front", azimuth: 0, elevation: 0 },
-  { name: "Right profile", azimuth: -90, elevation: 0 },
-  { name: "Left profile", azimuth: 90, elevation: 0 },
-  { name: "Three-quarter", azimuth: -40, elevation: 5 },
-  { name: "From below", azimuth: 0, elevation: -89.9 },
-  { name: "From above", azimuth: 0, elevation: 89.9 },
+  { name: _`Front`, azimuth: 0, elevation: 0 },
+  { name: _`Right profile`, azimuth: -90, elevation: 0 },
+  { name: _`Left profile`, azimuth: 90, elevation: 0 },
+  { name: _`Three-quarter`, azimuth: -40, elevation: 5 },
+  { name: _`From below`, azimuth: 0, elevation: -89.9 },
+  { name: _`From above`, azimuth: 0, elevation: 89.9 },
 ];
 
 export class Camera {

@@ -4,15 +4,16 @@
 // the rotation vector in degrees: pitch with the front up, yaw with the front to the left, roll
 // with the left side up.
 
+import { _ } from "./elements.js";
 import { motionOf, moved, rotationOf, rotationVector } from "./rigid.js";
 
 export const NUMBERS = [
-  { key: "forwards", label: "Forwards", unit: "mm", low: "back", high: "forwards" },
-  { key: "up", label: "Up", unit: "mm", low: "down", high: "up" },
-  { key: "left", label: "To the left", unit: "mm", low: "right", high: "left" },
-  { key: "pitch", label: "Pitch", unit: "°", low: "front down", high: "front up" },
-  { key: "yaw", label: "Yaw", unit: "°", low: "front to right", high: "front to left" },
-  { key: "roll", label: "Roll", unit: "°", low: "left side down", high: "left side up" },
+  { key: "forwards", label: _`Forwards`, unit: "mm", low: _`back`, high: _`forwards` },
+  { key: "up", label: _`Up`, unit: "mm", low: _`down`, high: _`up` },
+  { key: "left", label: _`To the left`, unit: "mm", low: _`right`, high: _`left` },
+  { key: "pitch", label: _`Pitch`, unit: "°", low: _`front down`, high: _`front up` },
+  { key: "yaw", label: _`Yaw`, unit: "°", low: _`front to right`, high: _`front to left` },
+  { key: "roll", label: _`Roll`, unit: "°", low: _`left side down`, high: _`left side up` },
 ];
 const SHIFTS = { forwards: [1, -1], up: [2, 1], left: [0, 1] };
 const TURNS = { pitch: [0, -1], yaw: [2, 1], roll: [1, -1] };

@@ -1,6 +1,6 @@
 // What pages of the desk ask its server, and the work that runs there.
 
-import { button, element } from "./elements.js";
+import { _, button, element } from "./elements.js";
 
 const EVERY_MS = 600;
 
@@ -19,8 +19,8 @@ export const deskState = async () => answered(await fetch("state"));
 
 /** Warnings and errors that were noticed, with their remedies; closed at first. */
 export const findingList = (findings) => element("details", { hidden: !findings.length, className: "findings" },
-  element("summary", { textContent: `${findings.length} warning${findings.length === 1 ? "" : "s"}` }),
-  ...findings.map(({ severity, code, what, where, fix }) => element("p", { className: "state warning", textContent: `${severity} (${code}${where ? `, ${where}` : ""}): ${what}${fix ? `. Fix: ${fix}` : ""}` })));
+  element("summary", { textContent: _`${findings.length} warning${findings.length === 1 ? "" : "s"}` }),
+  ...findings.map(({ severity, code, what, where, fix }) => element("p", { className: "state warning", textContent: `${severity} (${code}${where ? `, ${where}` : ""}): ${what}${fix ? _`. Fix: ${fix}` : ""}` })));
 
 /** The progress of the work on the server, with a button that stops it. */
 export class WorkView {
@@ -28,10 +28,10 @@ export class WorkView {
   constructor(ended) {
     this.ended = ended;
     this.name = element("strong", { role: "status" });
-    this.bar = element("progress", { max: 1, "aria-label": "Share of the time that has passed" });
+    this.bar = element("progress", { max: 1, "aria-label": _`Share of the time that has passed` });
     this.stage = element("span", { className: "note" });
     this.running = element("div", { id: "work", hidden: true }, this.name, this.bar, this.stage,
-      button("Stop", async () => { await call("cancel"); }, { id: "stop" }));
+      button(_`Stop`, async () => { await call("cancel"); }, { id: "stop" }));
     this.error = element("p", { className: "state warning", id: "work-error", role: "alert" });
     this.root = element("div", { className: "work" }, this.running, this.error);
   }
@@ -42,7 +42,7 @@ export class WorkView {
     try {
       state = await deskState();
     } catch (error) {
-      this.fail(`The program that served this page does not answer (${error.message}): start cmfsim desk again.`);
+      this.fail(_`The program that served this page does not answer (${error.message}): start cmfsim desk again.`);
       return;
     }
     const { work } = state;
@@ -56,7 +56,7 @@ export class WorkView {
     if (this.name.textContent !== work.name) this.name.textContent = work.name;
     if (work.share === null) this.bar.removeAttribute("value");
     else this.bar.value = work.share;
-    const left = work.left === null ? "" : `${Math.round(100 * work.share)} %, about ${work.left < 100 ? `${Math.round(work.left)} s` : `${Math.round(work.left / 60)} min`} left: `;
+    const left = work.left === null ? "" : _`${Math.round(100 * work.share)} %, about ${work.left < 100 ? `${Math.round(work.left)} s` : _`${Math.round(work.left / 60)} min`} left: `;
     this.stage.textContent = `${left}${work.stage}`;
     setTimeout(() => this.watch(true), EVERY_MS);
   }

@@ -1,4 +1,13 @@
-// Elements of the document. Texts go in as text, never as markup.
+// Elements of the document, and its texts, which go in as text, never as markup.
+
+/** The translations of texts that the page has: see values/language.py. */
+const TEXTS = JSON.parse(globalThis.document?.getElementById("page-values")?.textContent ?? "{}").texts ?? {};
+
+/** A text in the reader's language, as the tag of a template; the message has {0} for a value. */
+export function _(parts, ...values) {
+  const message = parts.reduce((text, part, i) => `${text}{${i - 1}}${part}`);
+  return (TEXTS[message] ?? message).replace(/\{(\d+)\}/g, (whole, i) => values[i] ?? whole);
+}
 
 /** An element with properties, `data-` and `aria-` attributes, listeners (`on…`) and children. */
 export function element(tag, properties = {}, ...children) {

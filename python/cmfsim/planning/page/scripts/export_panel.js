@@ -1,6 +1,6 @@
 // What leaves the page: the plan, its transforms, the face, a picture; and a plan that comes back.
 
-import { button, copied, element } from "./elements.js";
+import { _, button, copied, element } from "./elements.js";
 import { fileName, planDigits, planOf, planText, save, stlBytes, transformText } from "./exporting.js";
 
 // A plan of a hundred segments has some 30 kB.
@@ -11,25 +11,25 @@ export class ExportPanel {
     this.app = app;
     const { page } = app;
     this.direction = element("select", { id: "direction" },
-      element("option", { value: "from-parent", textContent: "from-parent: as 3D Slicer saves and shows it" }),
-      element("option", { value: "to-parent", textContent: "to-parent: the motion of the bone itself" }));
+      element("option", { value: "from-parent", textContent: _`from-parent: as 3D Slicer saves and shows it` }),
+      element("option", { value: "to-parent", textContent: _`to-parent: the motion of the bone itself` }));
     this.file = element("input", { type: "file", accept: ".toml", id: "plan-file", onchange: (e) => this.load(e.target) });
     this.command = element("code", { id: "command" });
     this.root = element("div", {},
-      element("h2", { textContent: "Solve exactly" }),
+      element("h2", { textContent: _`Solve exactly` }),
       element("p", { className: "note", textContent: page.exact_note }),
       this.command,
       element("div", { className: "row" },
-        button("Save the plan", () => this.savePlan(), { id: "save-plan" }),
-        button("Copy the command", async () => app.report((await copied(this.command.textContent)) ? "Copied." : "Not copied, because the browser does not allow it: select the text instead."))),
-      element("h2", { textContent: "Files" }),
-      element("div", { className: "row" }, element("label", { for: "plan-file", textContent: "Load a plan" }), this.file),
-      element("div", { className: "row" }, element("label", { for: "direction", textContent: "Direction" }), this.direction,
-        button("Save the segment's transform (.tfm)", () => this.saveTransform(), { id: "save-transform" })),
+        button(_`Save the plan`, () => this.savePlan(), { id: "save-plan" }),
+        button(_`Copy the command`, async () => app.report((await copied(this.command.textContent)) ? _`Copied.` : _`Not copied, because the browser does not allow it: select the text instead.`))),
+      element("h2", { textContent: _`Files` }),
+      element("div", { className: "row" }, element("label", { for: "plan-file", textContent: _`Load a plan` }), this.file),
+      element("div", { className: "row" }, element("label", { for: "direction", textContent: _`Direction` }), this.direction,
+        button(_`Save the segment's transform (.tfm)`, () => this.saveTransform(), { id: "save-transform" })),
       element("div", { className: "row" },
-        button("Save the face (STL)", () => this.saveFace(), { id: "save-face" }),
-        button("Save a picture (PNG)", () => app.savePicture(), { id: "save-picture" })),
-      element("p", { className: "note", textContent: "Coordinates are LPS in mm. The face comes from the plan operator and is not solved exactly." }));
+        button(_`Save the face (STL)`, () => this.saveFace(), { id: "save-face" }),
+        button(_`Save a picture (PNG)`, () => app.savePicture(), { id: "save-picture" })),
+      element("p", { className: "note", textContent: _`Coordinates are LPS in mm. The face comes from the plan operator and is not solved exactly.` }));
   }
 
   get stem() {
@@ -61,11 +61,11 @@ export class ExportPanel {
     const file = input.files[0];
     if (!file) return;
     try {
-      if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes, which is too large for a plan`);
+      if (file.size > MOST_BYTES) throw new Error(_`it has ${file.size} bytes, which is too large for a plan`);
       const { motions, warning } = planOf(this.app.page, await file.text());
       this.app.load(motions, warning);
     } catch (error) {
-      this.app.report(`${file.name}: ${error.message}. No plan was loaded.`);
+      this.app.report(_`${file.name}: ${error.message}. No plan was loaded.`);
     }
     input.value = "";
   }

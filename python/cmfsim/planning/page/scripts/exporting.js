@@ -1,5 +1,6 @@
 // Files that leave the page, and plans that come back.
 
+import { _ } from "./elements.js";
 import { inverse, rigidError } from "./rigid.js";
 
 // A segment's name as a key of TOML, quoted where it has to be.
@@ -71,19 +72,19 @@ export function planOf(page, text) {
   const found = readTables(text);
   const names = page.segments.map((s) => s.name);
   const strange = Object.keys(found).filter((name) => !names.includes(name));
-  if (strange.length) throw new Error(`the plan moves ${strange[0]}, which this page does not have: ${names.join(", ")}`);
+  if (strange.length) throw new Error(_`the plan moves ${strange[0]}, which this page does not have: ${names.join(", ")}`);
   const missing = names.filter((name) => !(name in found));
-  if (missing.length) throw new Error(`the plan does not mention ${missing.join(", ")}: give the identity matrix to segments that do not move`);
+  if (missing.length) throw new Error(_`the plan does not mention ${missing.join(", ")}: give the identity matrix to segments that do not move`);
   for (const name of names) {
     const matrix = found[name];
-    if (matrix.slice(12).join() !== "0,0,0,1") throw new Error(`${name}: the last row is not 0, 0, 0, 1`);
+    if (matrix.slice(12).join() !== "0,0,0,1") throw new Error(_`${name}: the last row is not 0, 0, 0, 1`);
     const error = rigidError(matrix);
-    if (!(error <= MOST_ROUNDING)) throw new Error(`${name}: not a rotation and a translation (off by ${error.toExponential(1)})`);
+    if (!(error <= MOST_ROUNDING)) throw new Error(_`${name}: not a rotation and a translation (off by ${error.toExponential(1)})`);
   }
   const made = /^# made for: (.+)$/m.exec(text)?.[1].trim();
   let warning = "";
-  if (!made) warning = "The file does not state which case it was made for: check the numbers.";
-  else if (made !== page.built_for) warning = "The file was made for another case, or for an earlier version of this one: check the numbers.";
+  if (!made) warning = _`The file does not state which case it was made for: check the numbers.`;
+  else if (made !== page.built_for) warning = _`The file was made for another case, or for an earlier version of this one: check the numbers.`;
   return { motions: names.map((name) => found[name]), warning };
 }
 
@@ -94,28 +95,28 @@ function readTables(text) {
   text.split(/\r?\n/).forEach((raw, i) => {
     const line = raw.trim();
     if (!line || line.startsWith("#")) return;
-    const fail = (why) => { throw new Error(`line ${i + 1}: ${why}; the page reads only plans that it saved itself`); };
+    const fail = (why) => { throw new Error(_`line ${i + 1}: ${why}; the page reads only plans that it saved itself`); };
     const head = /^\[plan\.(?:([A-Za-z0-9_-]+)|("(?:[^"\\]|\\.)*"))\]$/.exec(line);
     if (head && !pending) {
       name = head[1] ?? JSON.parse(head[2]);
-      if (Object.hasOwn(found, name)) fail(`${name} appears a second time`);
+      if (Object.hasOwn(found, name)) fail(_`${name} appears a second time`);
       return;
     }
-    if (name === null) fail("not a table [plan.SEGMENT]");
-    if (!pending && !line.startsWith("matrix")) fail("not a matrix");
+    if (name === null) fail(_`not a table [plan.SEGMENT]`);
+    if (!pending && !line.startsWith("matrix")) fail(_`not a matrix`);
     pending += line;
     if ((pending.match(/\[/g) ?? []).length > (pending.match(/\]/g) ?? []).length) return;
     const body = /^matrix\s*=\s*(\[.*\])$/.exec(pending)?.[1];
-    if (!body) fail("not a matrix");
+    if (!body) fail(_`not a matrix`);
     let rows;
-    try { rows = JSON.parse(body.replace(/,\s*\]/g, "]")); } catch { fail("not numbers"); }
+    try { rows = JSON.parse(body.replace(/,\s*\]/g, "]")); } catch { fail(_`not numbers`); }
     const flat = Array.isArray(rows) ? rows.flat() : [];
-    if (rows.length !== 4 || flat.length !== 16 || !flat.every(Number.isFinite)) fail("not 4 × 4 finite numbers");
+    if (rows.length !== 4 || flat.length !== 16 || !flat.every(Number.isFinite)) fail(_`not 4 × 4 finite numbers`);
     found[name] = flat;
     name = null;
     pending = "";
   });
-  if (pending || name !== null) throw new Error("the file ends inside a table");
+  if (pending || name !== null) throw new Error(_`the file ends inside a table`);
   return found;
 }
 

@@ -5,7 +5,7 @@ import { Camera } from "./camera.js";
 import { SKIN, STILL_BONE, DISTINCT, mapped, rgb } from "./colours.js";
 import { DeskPanel } from "./desk_panel.js";
 import { Drawing, vertexNormals } from "./drawing.js";
-import { element } from "./elements.js";
+import { _, element } from "./elements.js";
 import { ExportPanel } from "./export_panel.js";
 import { fileName, save } from "./exporting.js";
 import { Handles } from "./handles.js";
@@ -81,12 +81,12 @@ class App {
     this.trusting = new BandPanel(this);
     this.exporting = new ExportPanel(this);
     this.desk = new DeskPanel(this);
-    this.profile = element("canvas", { className: "profile", role: "img", "aria-label": "Midline profile" });
+    this.profile = element("canvas", { className: "profile", role: "img", "aria-label": _`Midline profile` });
     this.profileNote = element("p", { className: "note" });
     this.photo = new ProfilePhoto(this);
     document.getElementById("panel").append(
       this.desk.root, this.panel.root, this.pulling.root, this.variants.root,
-      element("div", {}, element("h2", { textContent: "Midline profile" }), this.profile, this.profileNote, this.page.has_profile ? this.photo.root : null),
+      element("div", {}, element("h2", { textContent: _`Midline profile` }), this.profile, this.profileNote, this.page.has_profile ? this.photo.root : null),
       this.measuring.root, this.trusting.root, this.exporting.root);
     connectPointing(this);
     connectKeys(this);
@@ -166,7 +166,7 @@ class App {
       if (why) throw new Error(`${this.page.segments[s].label}: ${why}`);
     });
     this.plans.add(motions);
-    this.report(warning || "Loaded as a new variant.");
+    this.report(warning || _`Loaded as a new variant.`);
     this.changed();
   }
 
@@ -250,14 +250,14 @@ class App {
     const { side, handles, share } = this.view.values;
     this.drawing.fit();
     this.drawing.clear(BACKGROUND);
-    const after = share === 1 ? `After: ${this.plans.active.name}` : share === 0 ? "Before" : `${Math.round(100 * share)} % of ${this.plans.active.name}`;
+    const after = share === 1 ? _`After: ${this.plans.active.name}` : share === 0 ? _`Before` : _`${Math.round(100 * share)} % of ${this.plans.active.name}`;
     if (side) {
       this.drawing.draw(this.camera, this.parts(true), 0, 0.5);
       this.drawing.draw(this.camera, this.parts(false), 0.5, 1);
     } else {
       this.drawing.draw(this.camera, this.parts(false));
     }
-    document.getElementById("caption-left").textContent = side ? "Before" : after;
+    document.getElementById("caption-left").textContent = side ? _`Before` : after;
     document.getElementById("caption-right").textContent = side ? after : "";
     // Handles stand where the segment is after the move, so only there; a point that is pulled lies
     // under them.
@@ -295,19 +295,19 @@ class App {
     let warned = false;
     if (this.face.isExact(this.motions)) {
       const { seconds, contact_converged: converged } = this.face.exact.figures;
-      box.textContent = `Solved exactly on this machine in ${seconds.toFixed(1)} s${converged ? "" : "; contact stopped above its tolerance"}.`;
+      box.textContent = _`Solved exactly on this machine in ${seconds.toFixed(1)} s${converged ? "" : _`; contact stopped above its tolerance`}.`;
       warned = !converged;
-    } else if (distance <= SAME_PLAN) box.textContent = "The case's plan: this face was solved exactly.";
-    else if (isExact) box.textContent = "In this model no tissue slides or is lifted off the bone: the face equals the exact solution (rounding 0.01 mm).";
+    } else if (distance <= SAME_PLAN) box.textContent = _`The case's plan: this face was solved exactly.`;
+    else if (isExact) box.textContent = _`In this model no tissue slides or is lifted off the bone: the face equals the exact solution (rounding 0.01 mm).`;
     else if (!found) {
-      box.textContent = `This plan is ${distance.toFixed(1)} mm from the case's own, farther than any plan that was tested (${reach.toFixed(1)} mm): the face may be wrong. Solve it exactly.`;
+      box.textContent = _`This plan is ${distance.toFixed(1)} mm from the case's own, farther than any plan that was tested (${reach.toFixed(1)} mm): the face may be wrong. Solve it exactly.`;
       warned = true;
     } else {
       const count = trials.filter((t) => !t.failed).length;
       const failed = trials.length - count;
-      const corrected = leftOut.length ? ` and ${leftOut.length} left out of the correction one by one` : "";
-      box.textContent = `The face differs from this model's exact solution by ${found.mean.toFixed(2)} mm on average, at most ${found.usual.toFixed(2)} mm in nine of ten plans as far away, ${found.largest.toFixed(2)} mm in the worst; errors against real faces are millimetres (an estimate from exact solutions of ${count} other plans${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
-      if (failed) box.textContent += ` ${failed} more could not be solved.`;
+      const corrected = leftOut.length ? _` and ${leftOut.length} left out of the correction one by one` : "";
+      box.textContent = _`The face differs from this model's exact solution by ${found.mean.toFixed(2)} mm on average, at most ${found.usual.toFixed(2)} mm in nine of ten plans as far away, ${found.largest.toFixed(2)} mm in the worst; errors against real faces are millimetres (an estimate from exact solutions of ${count} other plans${corrected}; this plan is ${distance.toFixed(1)} mm from the case's own, where contact was solved).`;
+      if (failed) box.textContent += _` ${failed} more could not be solved.`;
       warned = found.usual > WARNED_ERROR;
     }
     if (this.solver.state) box.textContent += ` ${this.solver.state}`;
@@ -318,15 +318,15 @@ class App {
     const box = document.getElementById("teeth-state");
     const { occlusion, occlusion_absent: absent } = this.page;
     if (!occlusion) {
-      box.textContent = `The teeth are not checked: ${absent}`;
+      box.textContent = _`The teeth are not checked: ${absent}`;
       return;
     }
     this.depthBefore ??= this.face.toothDepth(null);
     const depth = this.face.toothDepth(this.motions);
     const warned = depth > TEETH_TOLERANCE && depth > this.depthBefore + TEETH_TOLERANCE;
     box.textContent = warned
-      ? `Tooth rows overlap by ${depth.toFixed(1)} mm (before: ${this.depthBefore.toFixed(1)} mm).`
-      : "Tooth rows do not overlap more than before.";
+      ? _`Tooth rows overlap by ${depth.toFixed(1)} mm (before: ${this.depthBefore.toFixed(1)} mm).`
+      : _`Tooth rows do not overlap more than before.`;
     box.classList.toggle("warning", warned);
   }
 
@@ -334,7 +334,7 @@ class App {
     const { variants, active } = this.plans.now;
     const { page, face } = this;
     if (!page.has_profile) {
-      this.profileNote.textContent = `No profile: ${page.profile_absent}`;
+      this.profileNote.textContent = _`No profile: ${page.profile_absent}`;
       return;
     }
     const lines = [{ points: face.profile(face.before), colour: "#7a8591", thick: 2, dash: [5, 4] }];
@@ -352,7 +352,7 @@ class App {
     lines.push({ points: face.profile(this.after), colour: variantColour(active), thick: 2.5 });
     drawProfile(this.profile, lines);
     this.photo.show([{ ...lines[0], colour: "#1d2530" }, lines.at(-1)]);
-    this.profileNote.textContent = `Dashed: before. ${variants.map((v, i) => `${i === active ? "Thick" : "Thin"}: ${v.name}`).join("; ")}.`;
+    this.profileNote.textContent = _`Dashed: before. ${variants.map((v, i) => `${i === active ? "Thick" : "Thin"}: ${v.name}`).join("; ")}.`;
   }
 
   savePicture() {
@@ -368,7 +368,7 @@ class App {
     pen.drawImage(drawing.canvas, 0, 0);
     pen.fillStyle = "#1d2530";
     pen.font = "16px system-ui, sans-serif";
-    pen.fillText(`${page.case}, variant ${this.plans.active.name}, model ${page.model}: predicted face. Not a medical device.`, 10, drawing.height + 26, picture.width - 20);
+    pen.fillText(_`${page.case}, variant ${this.plans.active.name}, model ${page.model}: predicted face. Not a medical device.`, 10, drawing.height + 26, picture.width - 20);
     picture.toBlob((blob) => save(`${fileName(page.case)}-${fileName(this.plans.active.name)}.png`, blob, "image/png"));
   }
 }

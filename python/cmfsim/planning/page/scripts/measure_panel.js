@@ -1,6 +1,6 @@
 // The measures of face and occlusion before, under the case's plan, and under the variant that is shown.
 
-import { element, shown, signed } from "./elements.js";
+import { _, element, shown, signed } from "./elements.js";
 
 export class MeasurePanel {
   constructor(app) {
@@ -8,9 +8,9 @@ export class MeasurePanel {
     this.body = element("tbody");
     const heads = ["", "before", "case's plan", "now", "change"];
     this.root = element("div", {},
-      element("h2", { textContent: "Measures of face and occlusion" }),
+      element("h2", { textContent: _`Measures of face and occlusion` }),
       element("div", { className: "wide" }, element("table", { id: "measures" },
-        element("caption", { textContent: "Change: now minus before; mm and degrees." }),
+        element("caption", { textContent: _`Change: now minus before; mm and degrees.` }),
         element("thead", {}, element("tr", {}, ...heads.map((h) => element("th", { scope: "col", textContent: h })))),
         this.body)),
       ...app.page.measure_notes.map((text) => element("p", { className: "note", textContent: text })));

@@ -1,6 +1,6 @@
 // The distance between two points that are clicked on.
 
-import { element, signed } from "./elements.js";
+import { _, element, signed } from "./elements.js";
 import { seenPoint } from "./picking.js";
 
 // A surface fainter than this is not clicked on.
@@ -46,8 +46,8 @@ export class Ruler {
   show() {
     const [a, b] = this.places();
     this.note.textContent = !this.box.checked ? "" : b
-      ? `${Math.hypot(...a.map((v, k) => v - b[k])).toFixed(1)} mm between the points (left ${signed(b[0] - a[0])}, forwards ${signed(a[1] - b[1])}, up ${signed(b[2] - a[2])})`
-      : `Click on ${a ? "the second" : "a first"} point of skin or bone.`;
+      ? _`${Math.hypot(...a.map((v, k) => v - b[k])).toFixed(1)} mm between the points (left ${signed(b[0] - a[0])}, forwards ${signed(a[1] - b[1])}, up ${signed(b[2] - a[2])})`
+      : _`Click on ${a ? _`the second` : "a first"} point of skin or bone.`;
   }
 
   draw(pen, camera, width, height) {

@@ -1,6 +1,6 @@
 // The mirror image of the face, and how far its middle is off the plane of symmetry.
 
-import { element } from "./elements.js";
+import { _, element } from "./elements.js";
 
 const IMAGE_COLOUR = [0.25, 0.5, 0.95], IMAGE_OPACITY = 0.45;
 const product3 = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
@@ -21,7 +21,7 @@ export class Mirror {
     Object.assign(this, { plane, places });
     this.box = element("input", { type: "checkbox", id: "show-mirror", onchange: () => { this.show(); app.redraw(); } });
     this.note = element("div", { className: "note", role: "status" });
-    if (this.plane) document.getElementById("controls").append(element("label", {}, this.box, "Mirror image"), this.note);
+    if (this.plane) document.getElementById("controls").append(element("label", {}, this.box, _`Mirror image`), this.note);
   }
 
   /** The mirror image of a surface, to be drawn with the others. */
@@ -35,8 +35,8 @@ export class Mirror {
     const middle = Object.entries(this.places()).filter(([name]) => !/_[LR]$/.test(name));
     const texts = middle.map(([name, place]) => {
       const off = leftOf(this.plane, place);
-      return `${name.replaceAll("_", " ")} ${Math.abs(off).toFixed(1)} mm${Math.abs(off) < 0.05 ? "" : off > 0 ? " left" : " right"}`;
+      return _`${name.replaceAll("_", " ")} ${Math.abs(off).toFixed(1)} mm${Math.abs(off) < 0.05 ? "" : off > 0 ? " left" : " right"}`;
     });
-    this.note.textContent = `Blue: mirror image at the plane between the corners of the eyes. Skin in the middle of the face: ${texts.join(", ")}.`;
+    this.note.textContent = _`Blue: mirror image at the plane between the corners of the eyes. Skin in the middle of the face: ${texts.join(", ")}.`;
   }
 }

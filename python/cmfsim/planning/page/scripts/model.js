@@ -1,5 +1,6 @@
 // The patient of the page: bones, skin and sites under any plan; no document, no drawing.
 
+import { _ } from "./elements.js";
 import { Band } from "./band.js";
 import { Carrier } from "./carrier.js";
 import { measure } from "./measures.js";
@@ -73,7 +74,7 @@ export class PatientFace {
   /** Takes an exact solution: the displacements of all nodes under the motions, mm. */
   takeExact(motions, shift, figures) {
     if (shift.length !== this.shift.length || !shift.every(Number.isFinite)) {
-      throw new Error("the solution does not belong to this page");
+      throw new Error(_`the solution does not belong to this page`);
     }
     this.exact = { motions, shift, figures };
     this.last = null;

@@ -1,7 +1,7 @@
 // The controls of one segment: where it is measured, about what it turns, and its six numbers.
 
 import { NUMBERS, clinicalNumbers, withNumber } from "./clinical.js";
-import { button, element, numberField, signed, table, typedNumber } from "./elements.js";
+import { _, button, element, numberField, signed, table, typedNumber } from "./elements.js";
 import { LIMITS, beyondLimits } from "./plans.js";
 import { STAYS, moved, product } from "./rigid.js";
 
@@ -35,19 +35,19 @@ export class PlanPanel {
     const rows = NUMBERS.flatMap((entry) => this.row(entry));
     this.table = element("div");
     this.root.append(
-      element("h2", { textContent: "Plan" }),
-      element("div", { className: "row", role: "tablist", "aria-label": "Segment" }, ...this.tabs),
-      element("div", { className: "row" }, element("label", { for: "measured-at", textContent: "Measured at" }), this.measured),
-      element("div", { className: "row" }, element("label", { for: "turns-about", textContent: "Turns about" }), this.about),
+      element("h2", { textContent: _`Plan` }),
+      element("div", { className: "row", role: "tablist", "aria-label": _`Segment` }, ...this.tabs),
+      element("div", { className: "row" }, element("label", { for: "measured-at", textContent: _`Measured at` }), this.measured),
+      element("div", { className: "row" }, element("label", { for: "turns-about", textContent: _`Turns about` }), this.about),
       element("div", { className: "numbers" }, ...rows),
       element("div", { className: "row" },
-        this.undo = button("Undo", () => this.app.undo(), { title: "Ctrl+Z" }),
-        this.redo = button("Redo", () => this.app.redo(), { title: "Ctrl+Y" }),
-        button("Reset segment to the case's plan", () => this.set(page.segments[this.segment].reference)),
-        button("No movement", () => this.set(STAYS))),
+        this.undo = button(_`Undo`, () => this.app.undo(), { title: _`Ctrl+Z` }),
+        this.redo = button(_`Redo`, () => this.app.redo(), { title: _`Ctrl+Y` }),
+        button(_`Reset segment to the case's plan`, () => this.set(page.segments[this.segment].reference)),
+        button(_`No movement`, () => this.set(STAYS))),
       this.bite = element("p", { className: "state", id: "target-bite", role: "status" }),
       ...((page.target_bite?.lower ?? null) === null ? []
-        : [button("Move the lower jaw into the target bite", () => this.intoBite(), { id: "into-bite" })]),
+        : [button(_`Move the lower jaw into the target bite`, () => this.intoBite(), { id: "into-bite" })]),
       this.table,
     );
     this.fill();
@@ -64,7 +64,7 @@ export class PlanPanel {
     const motion = this.intoTarget;
     const why = beyondLimits(motion, this.app.plans.active.motions[lower], this.app.page.segments[lower].points[0].place, NUMBERS);
     if (why) {
-      this.app.report(`${why}. The plan was not changed.`);
+      this.app.report(_`${why}. The plan was not changed.`);
       return;
     }
     this.app.preview({ segment: lower, motion });
@@ -78,14 +78,14 @@ export class PlanPanel {
     const now = bite.lower === null ? STAYS : this.app.motions[bite.lower];
     const there = this.intoTarget;
     const off = Math.max(...bite.places.map((p) => Math.hypot(...moved(there, p).map((v, i) => v - moved(now, p)[i]))));
-    this.bite.textContent = `The lower teeth are ${off.toFixed(1)} mm off the target bite of the scans.`;
+    this.bite.textContent = _`The lower teeth are ${off.toFixed(1)} mm off the target bite of the scans.`;
   }
 
   row({ key, label, unit, low, high }) {
     const limit = LIMITS[unit];
     const id = `number-${key}`;
     const field = numberField({
-      id, title: `${-limit} to ${limit} ${unit}; the arrow keys change it by ${STEP}`,
+      id, title: _`${-limit} to ${limit} ${unit}; the arrow keys change it by ${STEP}`,
       onkeydown: (e) => this.stepped(key, e),
       oninput: () => { this.typing = key; },
       onchange: (e) => this.typed(key, e.target),
@@ -133,7 +133,7 @@ export class PlanPanel {
     this.typing = null;
     const value = typedNumber(input.value);
     if (!Number.isFinite(value)) {
-      this.app.report("Type a number, such as 2.5 or 2,5; the plan was not changed.");
+      this.app.report(_`Type a number, such as 2.5 or 2,5; the plan was not changed.`);
       this.app.changed();
       return;
     }
@@ -157,7 +157,7 @@ export class PlanPanel {
     const motion = withNumber(was, this.place, this.turnsAbout, key, value);
     const why = beyondLimits(motion, was, this.place, NUMBERS);
     if (why) {
-      this.app.report(`${why}. ${keep ? "The plan was not changed." : ""}`);
+      this.app.report(`${why}. ${keep ? _`The plan was not changed.` : ""}`);
       // A field must not show what the plan does not have.
       if (keep) this.app.changed();
       return;
@@ -189,7 +189,7 @@ export class PlanPanel {
       return [label, signed(-(to[1] - place[1])), signed(to[2] - place[2]), signed(to[0] - place[0])];
     });
     this.table.replaceChildren(table(
-      `${this.app.page.segments[this.segment].label}: movement at each point, mm`,
+      _`${this.app.page.segments[this.segment].label}: movement at each point, mm`,
       ["", "forwards", "up", "left"], rows));
   }
 }

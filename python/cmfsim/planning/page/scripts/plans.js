@@ -1,5 +1,6 @@
 // The variants of a plan, with undo and redo.
 
+import { _ } from "./elements.js";
 import { clinicalNumbers } from "./clinical.js";
 import { History } from "./history.js";
 
@@ -51,7 +52,7 @@ export class Plans extends History {
   freeName() {
     const used = new Set(this.now.variants.map((v) => v.name));
     const letter = [...LETTERS].find((l) => !used.has(l));
-    return letter ?? `Variant ${this.now.variants.length + 1}`;
+    return letter ?? _`Variant ${this.now.variants.length + 1}`;
   }
 }
 
@@ -60,10 +61,10 @@ export function beyondLimits(motion, was, point, numbers) {
   const values = clinicalNumbers(motion, point);
   const earlier = clinicalNumbers(was, point);
   for (const { key, label, unit } of numbers) {
-    if (!Number.isFinite(values[key])) return `${label} is not a number`;
+    if (!Number.isFinite(values[key])) return _`${label} is not a number`;
     const most = Math.max(LIMITS[unit], Math.abs(earlier[key])) + 1e-6;
     if (Math.abs(values[key]) > most) {
-      return `${label} would be ${values[key].toFixed(1)} ${unit}: at most ${LIMITS[unit]} ${unit} are allowed`;
+      return _`${label} would be ${values[key].toFixed(1)} ${unit}: at most ${LIMITS[unit]} ${unit} are allowed`;
     }
   }
   return "";

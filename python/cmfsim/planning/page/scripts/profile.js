@@ -2,7 +2,7 @@
 // profile, placed by landmarks that a person clicks on.
 
 import { DISTINCT } from "./colours.js";
-import { button, element } from "./elements.js";
+import { _, button, element } from "./elements.js";
 import { fileName, save } from "./exporting.js";
 
 const MARGIN = 10;
@@ -86,14 +86,14 @@ export class ProfilePhoto {
     const known = new Set(app.page.skin_sites.map(({ name }) => name));
     this.sites = SITES.filter((name) => known.has(name));
     this.file = element("input", { type: "file", accept: "image/jpeg,image/png", id: "photo-file", onchange: (e) => this.load(e.target) });
-    this.canvas = element("canvas", { className: "photo", role: "img", "aria-label": "Photograph of the profile", hidden: true, onclick: (e) => this.click(e) });
+    this.canvas = element("canvas", { className: "photo", role: "img", "aria-label": _`Photograph of the profile`, hidden: true, onclick: (e) => this.click(e) });
     this.note = element("p", { className: "note", role: "status", id: "photo-note" });
     this.tools = element("div", { className: "row", hidden: true },
-      button("Skip this point", () => this.take(null), { id: "photo-skip" }),
-      button("Start again", () => this.restart(), { id: "photo-again" }),
-      button("Save the photo (PNG)", () => this.savePicture(), { id: "photo-save" }));
+      button(_`Skip this point`, () => this.take(null), { id: "photo-skip" }),
+      button(_`Start again`, () => this.restart(), { id: "photo-again" }),
+      button(_`Save the photo (PNG)`, () => this.savePicture(), { id: "photo-save" }));
     this.root = element("div", {},
-      element("div", { className: "row" }, element("label", { for: "photo-file", textContent: "Photo of the profile" }), this.file),
+      element("div", { className: "row" }, element("label", { for: "photo-file", textContent: _`Photo of the profile` }), this.file),
       this.canvas, this.note, this.tools);
   }
 
@@ -108,7 +108,7 @@ export class ProfilePhoto {
       this.canvas.hidden = this.tools.hidden = false;
       this.restart();
     } catch {
-      this.app.report(`${file.name}: is no JPEG or PNG that the browser can read. No photo was loaded.`);
+      this.app.report(_`${file.name}: is no JPEG or PNG that the browser can read. No photo was loaded.`);
     }
     input.value = "";
   }
@@ -134,12 +134,12 @@ export class ProfilePhoto {
   placed() {
     const places = this.app.face.sitePlaces(null);
     const used = this.sites.filter((_, i) => this.points[i]);
-    if (used.length < LEAST) return { why: `${LEAST - used.length} more needed.` };
+    if (used.length < LEAST) return { why: _`${LEAST - used.length} more needed.` };
     const [best, other] = fitted(used.map((name) => places[name].slice(1)), this.points.filter(Boolean));
     if (!(best.error <= MOST_ERROR)) {
-      return { why: `The points do not fit this face: they are ${best.error.toFixed(1)} mm off, at most ${MOST_ERROR} mm are allowed. Check the order, and that the photo is a profile of this patient.` };
+      return { why: _`The points do not fit this face: they are ${best.error.toFixed(1)} mm off, at most ${MOST_ERROR} mm are allowed. Check the order, and that the photo is a profile of this patient.` };
     }
-    if (best.error > CLEARER * other.error) return { why: "The points do not show to which side the face looks: click on the tip of the nose as well." };
+    if (best.error > CLEARER * other.error) return { why: _`The points do not show to which side the face looks: click on the tip of the nose as well.` };
     return best;
   }
 
@@ -160,18 +160,18 @@ export class ProfilePhoto {
       pen.stroke();
     });
     const next = sites[points.length];
-    const state = this.fit.place ? `Dashed: before; solid: variant ${this.app.plans.active.name}. The points fit to ${this.fit.error.toFixed(1)} mm (root mean square).` : this.fit.why;
-    this.note.textContent = `${next ? `Click on ${next.replaceAll("_", " ")} in the photo. ` : ""}${state}`;
+    const state = this.fit.place ? _`Dashed: before; solid: variant ${this.app.plans.active.name}. The points fit to ${this.fit.error.toFixed(1)} mm (root mean square).` : this.fit.why;
+    this.note.textContent = _`${next ? _`Click on ${next.replaceAll("_", " ")} in the photo. ` : ""}${state}`;
   }
 
   savePicture() {
     const { app, canvas, fit } = this;
     if (!fit?.place) {
-      app.report(`The photo has no profiles yet. ${fit?.why ?? ""}`);
+      app.report(_`The photo has no profiles yet. ${fit?.why ?? ""}`);
       return;
     }
     const pen = canvas.getContext("2d"), size = Math.max(12, canvas.width / 60);
-    const text = `${app.page.case}, variant ${app.exporting.stem.split("-").at(-1)}: dashed before, solid predicted. Not a medical device.`;
+    const text = _`${app.page.case}, variant ${app.exporting.stem.split("-").at(-1)}: dashed before, solid predicted. Not a medical device.`;
     pen.fillStyle = "#ffffffcc";
     pen.fillRect(0, canvas.height - 2 * size, canvas.width, 2 * size);
     Object.assign(pen, { fillStyle: "#1d2530", font: `${size}px system-ui, sans-serif` });

@@ -1,6 +1,6 @@
 // Pulling a point of the skin: in the picture, or by the movement that it should make.
 
-import { button, element, numberField, signed, typedNumber } from "./elements.js";
+import { _, button, element, numberField, signed, typedNumber } from "./elements.js";
 import { seenPoint } from "./picking.js";
 import { Pull, PulledPoint } from "./pulling.js";
 import { STAYS } from "./rigid.js";
@@ -8,9 +8,9 @@ import { STAYS } from "./rigid.js";
 const MOST_WISH = 30;
 // The movement of a point from where it was before the operation, with a surgeon's signs.
 const WISHES = [
-  { key: "forwards", label: "Forwards, mm", axis: 1, sign: -1 },
-  { key: "up", label: "Up, mm", axis: 2, sign: 1 },
-  { key: "left", label: "To the left, mm", axis: 0, sign: 1 },
+  { key: "forwards", label: _`Forwards, mm`, axis: 1, sign: -1 },
+  { key: "up", label: _`Up, mm`, axis: 2, sign: 1 },
+  { key: "left", label: _`To the left, mm`, axis: 0, sign: 1 },
 ];
 const PICKED = "picked";
 
@@ -31,20 +31,20 @@ export class PullPanel {
     })]));
     this.state = element("p", { className: "note", id: "pull-state", role: "status" });
     this.root = element("div", {},
-      element("h2", { textContent: "Pull the skin" }),
-      element("p", { className: "note", textContent: "The selected segments follow, with the smallest change of the plan. To pull in the picture, switch on “Pull the skin” below it and drag a point of the face. To type a movement, choose a point here." }),
-      element("div", { className: "row", role: "group", "aria-label": "Segments that follow" },
+      element("h2", { textContent: _`Pull the skin` }),
+      element("p", { className: "note", textContent: _`The selected segments follow, with the smallest change of the plan. To pull in the picture, switch on “Pull the skin” below it and drag a point of the face. To type a movement, choose a point here.` }),
+      element("div", { className: "row", role: "group", "aria-label": _`Segments that follow` },
         ...app.page.segments.map((s, i) => element("label", {}, this.follows[i], ` ${s.label}`))),
-      element("div", { className: "row" }, element("label", { for: "pull-point", textContent: "Point" }), this.choice),
+      element("div", { className: "row" }, element("label", { for: "pull-point", textContent: _`Point` }), this.choice),
       element("div", { className: "row" }, ...WISHES.map(({ key, label }) => element("label", {}, `${label} `, this.fields[key]))),
-      element("div", { className: "row" }, button("Pull", () => this.typed(), { id: "pull-typed" })),
+      element("div", { className: "row" }, button(_`Pull`, () => this.typed(), { id: "pull-typed" })),
       this.state);
     this.fill();
   }
 
   fill() {
     const names = this.app.page.skin_sites.map(({ name }, i) => [String(i), name.replaceAll("_", " ")]);
-    if (this.vertex !== undefined) names.push([PICKED, "the point picked in the picture"]);
+    if (this.vertex !== undefined) names.push([PICKED, _`the point picked in the picture`]);
     this.choice.replaceChildren(...names.map(([value, textContent]) => element("option", { value, textContent })));
   }
 
@@ -72,12 +72,12 @@ export class PullPanel {
   begin() {
     const { app } = this;
     if (!this.following.length) {
-      app.report("No segment follows: select one under “Pull the skin”.");
+      app.report(_`No segment follows: select one under “Pull the skin”.`);
       return null;
     }
     const pull = new Pull(this.point, app.page.segments, app.motions, this.following);
     if (pull.moves) return pull;
-    app.report("The selected segments do not move this point: choose another point or other segments.");
+    app.report(_`The selected segments do not move this point: choose another point or other segments.`);
     return null;
   }
 
@@ -126,7 +126,7 @@ export class PullPanel {
     for (const { key, axis, sign } of WISHES) {
       const value = typedNumber(this.fields[key].value);
       if (!Number.isFinite(value) || Math.abs(value) > MOST_WISH) {
-        this.app.report(`Type three numbers of at most ${MOST_WISH} mm; the plan was not changed.`);
+        this.app.report(_`Type three numbers of at most ${MOST_WISH} mm; the plan was not changed.`);
         return;
       }
       wish[axis] = sign * value;
@@ -151,8 +151,8 @@ export class PullPanel {
     });
     const moved = WISHES.map(({ key }, i) => `${signed(numbers[i])} ${key}`).join(", ");
     const away = this.goal && Math.hypot(...place.map((v, k) => v - this.goal[k]));
-    this.state.textContent = `The point moves by ${moved} (mm).` +
-      (away === null || away === undefined || away < 0.1 ? "" : ` It is still ${away.toFixed(1)} mm from the position to which it was pulled.`);
+    this.state.textContent = _`The point moves by ${moved} (mm).` +
+      (away === null || away === undefined || away < 0.1 ? "" : _` It is still ${away.toFixed(1)} mm from the position to which it was pulled.`);
   }
 
   /** Marks the point, and the way to its goal, in the picture. */

@@ -1,5 +1,7 @@
 // Exact solutions from the program that served this page, where one did.
 
+import { _ } from "./elements.js";
+
 // A plan is sent when nothing has changed for so long, ms.
 const PAUSE = 250;
 
@@ -28,7 +30,7 @@ export class ExactSolver {
     this.running = true;
     const { motions } = this.app.plans.active;
     this.failed = null;
-    this.show("Solving this plan exactly …");
+    this.show(_`Solving this plan exactly …`);
     try {
       const answer = await fetch("solve", {
         method: "POST",
@@ -41,7 +43,7 @@ export class ExactSolver {
       this.show("");
     } catch (error) {
       this.failed = motions;
-      this.show(`Not solved exactly: ${error.message || "the program that served this page has ended"}.`);
+      this.show(_`Not solved exactly: ${error.message || _`the program that served this page has ended`}.`);
     }
     this.running = false;
     this.app.changed();

@@ -1,5 +1,7 @@
 // The numbers of the page: one block of bytes, gzip in base64, with a table of its arrays.
 
+import { _ } from "./elements.js";
+
 const TYPES = { float32: Float32Array, uint32: Uint32Array, float16: Uint16Array };
 
 /** The arrays of the page by name, each {values, shape}; half precision becomes single. */
@@ -25,7 +27,7 @@ export async function start(App) {
     globalThis.cmfsimPage = new App(page, arrays);
   } catch (error) {
     const box = document.getElementById("failure");
-    box.textContent = `The picture cannot be shown: ${error.message}`;
+    box.textContent = _`The picture cannot be shown: ${error.message}`;
     box.hidden = false;
     throw error;
   }

@@ -1,7 +1,7 @@
 // Named variants of the plan, and what differs between them.
 
 import { NUMBERS, clinicalNumbers } from "./clinical.js";
-import { button, element, shown, signed, table } from "./elements.js";
+import { _, button, element, shown, signed, table } from "./elements.js";
 import { STAYS } from "./rigid.js";
 
 const MOST_NAME = 40;
@@ -9,21 +9,21 @@ const MOST_NAME = 40;
 export class VariantPanel {
   constructor(app) {
     this.app = app;
-    this.tabs = element("div", { className: "row", role: "group", "aria-label": "Variants" });
+    this.tabs = element("div", { className: "row", role: "group", "aria-label": _`Variants` });
     this.name = element("input", {
       type: "text", id: "variant-name", maxLength: MOST_NAME,
       onchange: (e) => this.rename(e.target.value.trim()),
     });
     this.differences = element("div", { id: "differences" });
     this.root = element("div", {},
-      element("h2", { textContent: "Variants" }), this.tabs,
+      element("h2", { textContent: _`Variants` }), this.tabs,
       element("div", { className: "row" },
-        element("label", { for: "variant-name", textContent: "Name" }), this.name,
-        button("Copy to a new variant", () => this.add(app.plans.active.motions)),
-        button("New from the case's plan", () => this.add(app.plans.reference)),
-        button("New without movement", () => this.add(app.plans.reference.map(() => STAYS))),
-        this.removal = button("Remove", () => { app.plans.remove(); app.changed(); }),
-        button("Reset all", () => app.reset(), { title: "Keep only the case's plan; undo restores the variants" })),
+        element("label", { for: "variant-name", textContent: _`Name` }), this.name,
+        button(_`Copy to a new variant`, () => this.add(app.plans.active.motions)),
+        button(_`New from the case's plan`, () => this.add(app.plans.reference)),
+        button(_`New without movement`, () => this.add(app.plans.reference.map(() => STAYS))),
+        this.removal = button(_`Remove`, () => { app.plans.remove(); app.changed(); }),
+        button(_`Reset all`, () => app.reset(), { title: _`Keep only the case's plan; undo restores the variants` })),
       this.differences);
   }
 
@@ -34,7 +34,7 @@ export class VariantPanel {
 
   rename(name) {
     const taken = this.app.plans.now.variants.some((v, i) => v.name === name && i !== this.app.plans.now.active);
-    if (!name || taken) this.app.report(name ? `Another variant is called ${name}.` : "A variant needs a name.");
+    if (!name || taken) this.app.report(name ? _`Another variant is called ${name}.` : _`A variant needs a name.`);
     else this.app.plans.rename(name);
     this.app.changed();
   }
@@ -70,7 +70,7 @@ export class VariantPanel {
       const numbers = measured.map((m) => m[i]);
       rows.push([`${label}, ${unit}`, ...numbers.map((n) => shown(n)), spread(numbers)]);
     });
-    return table("Movement of each segment at its first point, and measures of the face", ["", ...variants.map((v) => v.name), "differ by"], rows);
+    return table(_`Movement of each segment at its first point, and measures of the face`, ["", ...variants.map((v) => v.name), _`differ by`], rows);
   }
 }
 

@@ -2,7 +2,7 @@
 
 import { VIEWS } from "./camera.js";
 import { MAP_COLOURS } from "./colours.js";
-import { button, element } from "./elements.js";
+import { _, button, element } from "./elements.js";
 
 /** Turns the camera to a standard view by its number. */
 export function look(app, index) {
@@ -13,8 +13,8 @@ export function look(app, index) {
 /** Buttons of the standard views, the last of which shows the whole. */
 export function addViews(app, whole) {
   document.getElementById("views").append(
-    ...VIEWS.map((view, i) => button(view.name, () => look(app, i), { title: `key ${i + 1}` })),
-    button(whole, () => { app.camera.recentre(); app.redraw(); }, { title: "key 0" }));
+    ...VIEWS.map((view, i) => button(view.name, () => look(app, i), { title: _`key ${i + 1}` })),
+    button(whole, () => { app.camera.recentre(); app.redraw(); }, { title: _`key 0` }));
 }
 
 /** A slider from 0 to 1 with its label. */
@@ -23,7 +23,7 @@ export const slider = (id, label, value, onchange) => element("label", {}, label
 }));
 
 /** What can be switched on, by key. */
-const BOXES = { side: "Side by side", map: "Colour by movement", band: "Colour by uncertainty", handles: "Handles", pull: "Pull the skin" };
+const BOXES = { side: _`Side by side`, map: _`Colour by movement`, band: _`Colour by uncertainty`, handles: _`Handles`, pull: _`Pull the skin` };
 
 // Opacity of skin through which bones are seen.
 const SEEN_THROUGH = 0.55;
@@ -35,7 +35,7 @@ export class ViewPanel {
     // Where bones are planned they are seen at once.
     const skin = boxes.includes("handles") ? SEEN_THROUGH : 1;
     this.values = { skin, bones: 1, share: 1, side: false, map: false, band: false, handles: true, pull: false };
-    addViews(app, "Whole face");
+    addViews(app, _`Whole face`);
     const share = (key, label) => slider(`show-${key}`, label, this.values[key], (value) => this.set(key, value));
     const box = (key) => element("label", {}, element("input", {
       type: "checkbox", checked: this.values[key], id: `show-${key}`,
@@ -64,7 +64,7 @@ export class ViewPanel {
     bar.style.background = `linear-gradient(to right, ${MAP_COLOURS.join(",")})`;
     const ends = [0, most / 2, most].map((v) => element("span", { textContent: v.toFixed(1) }));
     this.legend.replaceChildren(
-      element("div", { textContent: map ? "Movement of the skin, mm" : "Half the width of the band, mm (0: none is available)" }), bar,
+      element("div", { textContent: map ? _`Movement of the skin, mm` : _`Half the width of the band, mm (0: none is available)` }), bar,
       element("div", { className: "ends" }, ...ends));
   }
 }
