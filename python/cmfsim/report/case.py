@@ -264,7 +264,7 @@ def motion_blocks(prediction: Values) -> list[Note | Table]:
         else:
             rows.append((name, "surface", "", "", "", f"mean {number(motion['mean'])} mm"))
         if "bending" in motion:
-            bent.append(f"{name} ({number(motion['bending'])} mm rms)")
+            bent.append(f"{name} ({number(motion['bending'])} mm RMS)")
     table = Table(
         ("segment", "L", "P", "S", "turn, °", "axis (L, P, S)"),
         tuple(rows),
@@ -432,8 +432,8 @@ def _model_section(predictions: Sequence[Values], shown: Values) -> Section:
         "unknowns",
         "residual",
         "error, mm (estimated)",
-        "contact its.",
-        "gap, mm",
+        "contact iterations",
+        "largest gap, mm",
     )
     solved_table = Table(columns, tuple(rows), "How the equations were solved.")
     segments = tuple(

@@ -17,7 +17,7 @@ TITLES: Mapping[str, str] = {
 WAYS = ("forwards", "up", "left")
 NORMS = (
     "Norms are means ± standard deviations of small groups of adults or adolescents without "
-    "deformity; they are no aim of an operation. Legan and Burstone's nasolabial angle has its own "
+    "deformity; they are not targets of surgery. Legan and Burstone's nasolabial angle has its own "
     "point on the columella. Without teeth or porion among the landmarks, occlusal and Frankfort "
     "planes are estimated. S, Po, Gn and the tips of roots are not found automatically: add them "
     "to the file of skull landmarks under these names."
@@ -61,14 +61,12 @@ def _contact_notes(found: Values) -> list[Note]:
         return []  # of an earlier version
     if "absent" in contacts:
         return [Note(f"Contacts of the teeth are not available: {contacts['absent']}.")]
-    overlap = contacts["greatest_overlap_mm"]
+    overlap, count = contacts["greatest_overlap_mm"], contacts["n_contacts"]
+    text = f"at least {_text(contacts['least_gap_mm'])} mm lie between them"
     if overlap > 0.0:
-        text = f"they overlap by {_text(overlap)} mm at most"
-    else:
-        text = f"they are {_text(contacts['least_gap_mm'])} mm apart at least"
-    count = contacts["n_contacts"]
-    places = "no place" if not count else "1 place" if count == 1 else f"{count} places"
-    return [Note(f"As planned, the tooth rows touch at {places}; {text}.")]
+        text = f"they overlap by at most {_text(overlap)} mm"
+    touch = f"touch at {count} place{'s' if count > 1 else ''}" if count else "do not touch"
+    return [Note(f"As planned, the tooth rows {touch}; {text}.")]
 
 
 def measure_rows(found: Values, kind: str) -> list[tuple[str, ...]]:

@@ -13,7 +13,9 @@ def number(value: object, digits: int = 2) -> str:
     """A number as a table shows it; a dash where there is none."""
     if value is None:
         return NOTHING
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, int | float):
         return str(value)
     if isinstance(value, int):
         return f"{value:,}".replace(",", "\u202f")
