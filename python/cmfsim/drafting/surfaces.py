@@ -207,7 +207,7 @@ def _choose_bones(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None
             _ask_which(anatomy, f"bones.{part}", named)
     for find in unnamed:
         key = safe_key(find.label.rpartition("/")[2].rpartition(": ")[2].partition(".")[0])
-        text = f"{_said(find)}: which bone is it?"
+        text = f"{find.label} ({_shape(find)}): which bone is it?"
         known = ", ".join(("cranium", *MOVING))
         choices = (
             (find, "if it is a bone of the case: rename the key, too,"),
@@ -450,7 +450,3 @@ def _shape(find: SurfaceFind, unit: str = "") -> str:
     count = len(find.surface.triangles)
     unit = unit or ("mm" if find.is_made else "in its own unit")
     return f"{size} {unit}, {count} triangles, {closed}"
-
-
-def _said(find: SurfaceFind) -> str:
-    return f"{find.label} ({_shape(find)})"

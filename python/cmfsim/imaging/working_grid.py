@@ -105,7 +105,8 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     _check_size(image, spacing)
     scale = calibration(image.values, options.rescale)
     findings = [*scale.findings, *_spacing_findings(spacing)]
-    factors = _factors(spacing, options.working_spacing)
+    x, y, z = (max(1, int(options.working_spacing / s + 1e-6)) for s in spacing)
+    factors = (x, y, z)
     values = image.values
     if values.dtype.kind == "b" or values.dtype == np.float16:
         values = values.astype(np.float32)
@@ -205,11 +206,6 @@ def _cut_off(values: NDArray[Any], scale: Calibration) -> NDArray[Any]:
         return values
     found: NDArray[Any] = np.minimum(values, values.dtype.type(top))
     return found
-
-
-def _factors(spacing: NDArray[np.float64], working: float) -> tuple[int, int, int]:
-    x, y, z = (max(1, int(working / s + 1e-6)) for s in spacing)
-    return x, y, z
 
 
 def _target(

@@ -276,14 +276,10 @@ def _add_muscles(plotter: Any, muscles: Musculature, colours: Mapping[str, str])
     """The actor of all muscles, added to a view: one surface with the colour of each."""
     joined = joined_surface([muscle.surface for muscle in muscles])
     shape = polydata(joined.vertices, joined.triangles)
-    own = [_rgb(colours[without_side(muscle.name)]) for muscle in muscles]
+    own = [[*bytes.fromhex(colours[without_side(muscle.name)][1:])] for muscle in muscles]
     counts = [len(muscle.surface.vertices) for muscle in muscles]
     shape.point_data["colour"] = np.repeat(np.array(own, dtype=np.uint8), counts, axis=0)
     return plotter.add_mesh(shape, scalars="colour", rgb=True, smooth_shading=True, ambient=0.15)
-
-
-def _rgb(colour: str) -> list[int]:
-    return [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
 
 
 def _lines(muscle: MuscleSurface, length: float) -> tuple[Floats, Floats, str]:

@@ -443,7 +443,9 @@ def _following(
     kind, name = key
     site = (found.skull if kind == "skull" else found.skin).get(name)
     if site is None:
-        return ProposedSite(mean, error, _unsure(error), "filled") if error <= MOST_ERROR else None
+        few = "the sites that were placed are too few or too far away"
+        doubt = "" if error <= GOOD_ERROR else few
+        return ProposedSite(mean, error, doubt, "filled") if error <= MOST_ERROR else None
     if not site.doubt:
         return ProposedSite(mean, min(error, site.error), "", "moved")
     if share <= CLEARED_SHARE and error <= GOOD_ERROR:
@@ -455,11 +457,6 @@ def _as_found(found: ProposedLandmarks, key: SiteKey, site: ProposedSite) -> Pro
     """The site as it was proposed, if it was."""
     kind, name = key
     return (found.skull if kind == "skull" else found.skin).get(name, site)
-
-
-def _unsure(error: float) -> str:
-    """The doubt about a site that was filled in."""
-    return "" if error <= GOOD_ERROR else "the sites that were placed are too few or too far away"
 
 
 def _on_surface(site: ProposedSite, surfaces: list[Surface] | None) -> ProposedSite | None:

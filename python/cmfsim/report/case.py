@@ -99,16 +99,17 @@ def case_document(
     _check_together(predictions, evaluation)
     pictures = pictures or {}
     models = ", ".join(entry["model"] for entry in predictions)
+    files = tuple(entry["inputs"].items())
     appendix = [
         Section("Motions", tuple(motion_blocks(entry))),
         *_muscle_section(entry, predictions, pictures),
         _model_section(predictions, entry),
         _time_section(predictions),
-        _input_section(entry),
+        Section("Inputs", (Table(("file", "SHA-256"), files, "Input files.", numeric=False),)),
     ]
-    appended = translated("Appendix:")
+    appended, note = translated("Appendix:"), entry.get("note")
     sections = [
-        *_note_section(entry),
+        *([Section("About this case", (Note(note, "warning"),))] if note else []),
         _plan_section(entry, pictures),
         _prediction_section(predictions, entry, pictures, view),
         *clinical_sections(entry, _picture("contacts", pictures)),
@@ -215,12 +216,6 @@ def _alerts(findings: Sequence[Finding], left_out: str) -> list[Alert]:
             Alert("note", f"{counted(notes)}, listed in full below under Findings", lines)
         )
     return alerts
-
-
-def _note_section(prediction: Values) -> list[Section]:
-    """The section with the case's own note."""
-    note = prediction.get("note")
-    return [Section("About this case", (Note(note, "warning"),))] if note else []
 
 
 def _prediction_section(
@@ -487,11 +482,6 @@ def _sentence(finding: Finding, *, with_what: bool = True) -> str:
 def _placed(finding: Finding) -> str:
     what = translated(finding.what)
     return f"{what} ({finding.where})" if finding.where else what
-
-
-def _input_section(prediction: Values) -> Section:
-    rows = tuple(prediction["inputs"].items())
-    return Section("Inputs", (Table(("file", "SHA-256"), rows, "Input files.", numeric=False),))
 
 
 def _picture(name: str, pictures: Mapping[str, bytes]) -> list[Figure]:

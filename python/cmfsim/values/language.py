@@ -79,15 +79,15 @@ def translated(text: str) -> str:
     if text in known:
         return known[text]
     templates = _templates()
-    for message, parts in (*templates.get(text[:KEY], ()), *templates[""]):
-        values = _values(parts, text)
-        if values is not None and _fits(parts, values):
-            return _filled(known[message], values)
+    fitting = (
+        (message, values)
+        for message, parts in (*templates.get(text[:KEY], ()), *templates[""])
+        if (values := _values(parts, text)) is not None and _fits(parts, values)
+    )
+    message, values = next(fitting, ("", []))
+    if message:
+        return VALUE.sub(lambda match: translated(values[int(match[1])]), known[message])
     return _joined(text, JOINTS[:SENTENCES]) or _core(text) or _joined(text, JOINTS) or text
-
-
-def _filled(message: str, values: list[str]) -> str:
-    return VALUE.sub(lambda match: translated(values[int(match[1])]), message)
 
 
 def _joined(text: str, joints: Sequence[re.Pattern[str]]) -> str:

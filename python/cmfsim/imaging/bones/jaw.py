@@ -186,13 +186,9 @@ def part_jaws(
         return Jaws(None, None, None, (_not_parted(reason),))
     # Pieces that the flood left to the skull, but that only the mandible holds, are the mandible's.
     rest = bone.mask[box] & ~mandible[box]
-    mandible[box] |= reached(rest & ~_largest_piece(rest), grown(mandible[box]))
+    if rest.any():
+        mandible[box] |= reached(rest & ~largest(rest), grown(mandible[box]))
     return Jaws(_side(mandible, bone.mask), mandible, height, tuple(findings))
-
-
-def _largest_piece(mask: Mask) -> Mask:
-    """The largest piece of a mask; nothing of an empty one."""
-    return largest(mask) if mask.any() else mask
 
 
 def _side(mandible: Mask, bone: Mask) -> Volume:
