@@ -36,8 +36,7 @@ impl FrozenContact {
         let rows = ConditionRows::new(rows, &vec![0.0; rows.len()], springs);
         let unstable: Vec<Spring> = springs.iter().filter(|s| s.stiffness < 0.0).copied().collect();
         let n = rows.rows.len();
-        let axes = unstable.iter().map(|s| (s.node, s.axis));
-        let all: Vec<_> = rows.rows.iter().map(|r| (r.node, r.normal)).chain(axes).collect();
+        let all = rows.directions(&unstable);
         let mut softness = rows.softness.clone();
         softness.resize(all.len(), 0.0);
         let whole = tail.normal_flexibility(&all, &softness);

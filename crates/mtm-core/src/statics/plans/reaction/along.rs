@@ -25,8 +25,7 @@ impl Along {
         unstable: &[Spring],
         memory: Vec<f32>,
     ) -> Self {
-        let rows_of = rows.rows.iter().map(|r| (r.node, r.normal));
-        let directions: Vec<_> = rows_of.chain(unstable.iter().map(|s| (s.node, s.axis))).collect();
+        let directions = rows.directions(unstable);
         let mut order: Vec<usize> = (0..directions.len()).collect();
         order.sort_by_key(|&i| directions[i].0);
         let sorted: Vec<(usize, [f64; 3])> = order.iter().map(|&i| directions[i]).collect();

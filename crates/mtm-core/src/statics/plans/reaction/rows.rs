@@ -36,6 +36,12 @@ impl ConditionRows {
         Self { rows, goals, softness, keys }
     }
 
+    /// Node and unit vector of each row, and after them those of the `springs` that have no row.
+    pub fn directions(&self, springs: &[Spring]) -> Vec<(usize, [f64; 3])> {
+        let rows = self.rows.iter().map(|r| (r.node, r.normal));
+        rows.chain(springs.iter().map(|s| (s.node, s.axis))).collect()
+    }
+
     /// Displacements that contact forces have to add to `free`, mm.
     pub fn missing(&self, free: &[[f64; 3]]) -> Vec<f64> {
         self.rows.iter().zip(&self.goals).map(|(r, g)| g - dot(r.normal, free[r.node])).collect()
@@ -57,8 +63,7 @@ impl ConditionRows {
 
     /// Nᵀ S⁻¹ N with the softness.
     pub(super) fn flexibility(&self, tail: &TailFlexibility) -> DenseSymmetric {
-        let directions: Vec<_> = self.rows.iter().map(|r| (r.node, r.normal)).collect();
-        tail.normal_flexibility(&directions, &self.softness)
+        tail.normal_flexibility(&self.directions(&[]), &self.softness)
     }
 
     /// The factor of the flexibility.
