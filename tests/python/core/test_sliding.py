@@ -302,16 +302,21 @@ def test_a_contact_that_cannot_settle_ends_with_an_error():
 
 @pytest.mark.parametrize("method", ["pcg", "cholesky"])
 def test_a_contact_that_stops_near_a_solution_is_a_result(method):
-    """One step too few leaves a gap that no face shows: the result states it."""
+    """One or two steps too few leave a gap that no face shows: the result states it."""
     _, _, tensors, boundary, _ = shell_on_sphere(1, 2, 3)
     plan = {
         "shell": cmfsim.rigid_motion((0, 0, 0), 20.0, (0, 0, 1)),
         "ball": cmfsim.rigid_motion((0.5, 0, 0)),
     }
     whole = cmfsim.StaticSolver(tensors, boundary, method).solve(plan)
-    most = whole.contact_iterations - 1
-    found = cmfsim.StaticSolver(tensors, boundary, method, contact_iterations=most).solve(plan)
-    assert not found.contact_converged
+
+    def stopped(most):
+        return cmfsim.StaticSolver(tensors, boundary, method, contact_iterations=most).solve(plan)
+
+    # The last step allowed is solved accurately, and may end in balance by itself.
+    last = whole.contact_iterations - 1
+    ends = ((most, stopped(most)) for most in (last, last - 1))
+    most, found = next((most, end) for most, end in ends if not end.contact_converged)
     assert found.contact_iterations == most
     assert 0.0 < found.contact_gap < 1e-3
     assert np.abs(found.displacements - whole.displacements).max() < 1e-3

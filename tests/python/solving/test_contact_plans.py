@@ -46,6 +46,17 @@ def test_random_plans_converge_in_few_steps(scene, plans):
     assert max(tally.gaps) <= scene.options.contact_tolerance
 
 
+def test_the_error_is_no_more_than_stated(scene, solver, plans):
+    """What steps leave out of contact forces adds up over nodes, whose own imbalance is small."""
+    options = replace(scene.options, contact_tolerance=1e-9)
+    exact = cmfsim.scene_solver(replace(scene, options=options))
+    for plan in plans:
+        found, best = solver.solve(plan), exact.solve(plan)
+        away = np.linalg.norm(found.displacements - best.displacements, axis=1)
+        assert best.error_estimate <= 0.01 * found.error_estimate
+        assert away.max() <= found.error_estimate + best.error_estimate
+
+
 def test_the_face_is_a_continuous_function_of_the_plan(model, solver, plans):
     """0.01 mm more motion moves no point of the skin by more than 0.05 mm."""
     skin = model.skin_nodes

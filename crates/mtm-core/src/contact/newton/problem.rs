@@ -12,9 +12,10 @@ use crate::vector::{Vec3, add, dot, norm, scaled, sub};
 /// Maximum number of nodes listed in an error.
 const NAMED_NODES: usize = 10;
 /// Share of a node's own stiffness below which a step ignores the change of direction of its contact force;
-/// second, the same for a plan operator.
+/// second, the same for a step that may be the last, and for a plan operator: what is ignored there delays the
+/// end, and stays as an error that the imbalance of single nodes does not show.
 const SPRING_SHARE: f64 = 1e-2;
-const FROZEN_SPRING_SHARE: f64 = 1e-3;
+const FINE_SPRING_SHARE: f64 = 1e-3;
 /// Limits of the relative accuracy of a step, which is what the last step left open, over the spacing of the
 /// surfaces: the next conditions differ by about as much.
 const ROUGH_SHARE: f64 = 0.1;
@@ -120,7 +121,8 @@ impl ContactProblem<'_> {
             .iter()
             .map(|r| dot(r.normal, sub(r.point, self.sliding.positions[r.node])))
             .collect();
-        let mut springs = self.springs(state, active, SPRING_SHARE);
+        let least = if share == 0.0 { FINE_SPRING_SHARE } else { SPRING_SHARE };
+        let mut springs = self.springs(state, active, least);
         if reach == 0.0 {
             springs.retain(|s| s.stiffness > 0.0);
         }
@@ -282,7 +284,7 @@ impl ContactProblem<'_> {
             }
         }
         let rows = self.rows(&state, active);
-        let springs = self.springs(&state, active, FROZEN_SPRING_SHARE);
+        let springs = self.springs(&state, active, FINE_SPRING_SHARE);
         Ok(ContactResult {
             nodes: self.sliding.nodes.iter().map(|n| n.node).collect(),
             points: closest.iter().map(|(found, _)| found.point).collect(),
