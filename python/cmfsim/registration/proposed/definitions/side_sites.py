@@ -81,9 +81,8 @@ def find_orbit(view: SideView) -> Orbit | None:
     xs = np.quantile(across, [0.02, 0.98])
     zs = np.quantile(height, [0.02, 0.98])
     middle = float(xs.mean()) + LATERAL_RIM
-    near = np.abs(across - middle) < 3.0
-    out = middle + view.side * view.middle
-    return Orbit(out, float(zs.mean()), float(height[near].min()), float(height[near].max()))
+    near = height[np.abs(across - middle) < 3.0]
+    return Orbit(middle + view.side * view.middle, float(zs.mean()), near.min(), near.max())
 
 
 # The bulge of the forehead is where its profile lies farthest in front of a chord of this length
