@@ -18,6 +18,7 @@ from cmfsim.meshing.lips import LipSeam
 from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
+from cmfsim.planning.face_measures.cephalometry import head_axes
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -30,6 +31,9 @@ from cmfsim.values.patient_model import LiftedTissue, PatientModel
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
+
+# A head that lies further turned is reported, degrees: the sine of 15° is a quarter.
+TURNED = 15.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,6 +211,36 @@ def jaws(
             motion = bones.motions.get(segment.name, np.eye(4))
             parts.append(BonePart(segment.name, jaw, where, segment.surface, motion))
     return [found for found in check_jaws(parts, landmarks) if found.code not in seen]
+
+
+def turned_head(case: Case, landmarks: Mapping[str, Floats]) -> list[Finding]:
+    """A finding for each typed translation if the head lies turned in its files.
+
+    landmarks: Of the skull; with fewer than three of the cranium, a turn cannot be seen.
+    """
+    forwards, up = head_axes(landmarks)
+    axes = np.stack([np.cross(up, forwards), -forwards, up])
+    angle = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(axes) - 1.0), -1.0, 1.0))))
+    found = []
+    for name, motion in case.plan.items():
+        if angle <= TURNED or not motion.typed or motion.matrix is None:
+            continue
+        centre = np.zeros(3) if motion.centre is None else motion.centre
+        shift = carried(motion.matrix, centre[None])[0] - centre
+        if (length := float(np.linalg.norm(shift))) < SMALL:
+            continue
+        own = shift @ axes
+        what = (
+            f"the head is turned by {angle:.0f}° against the axes of its files, along which {name} "
+            f"moves {length:.1f} mm: it ends {np.linalg.norm(own - shift):.1f} mm beside where the "
+            "same numbers along the head's own axes would take it"
+        )
+        signs = [-1.0, -1.0, 1.0] if motion.frame == "RAS" else [1.0, 1.0, 1.0]
+        numbers = ", ".join(f"{number:.2f}" for number in own * signs)
+        fix = f"if forwards and up are meant as the head has them: translation = [{numbers}]"
+        where = case.where(f"plan.{name}")
+        found.append(Finding("plan-head-turned", what, where=where, fix=fix))
+    return found
 
 
 def given_plan(patient: PatientModel) -> PatientModel:

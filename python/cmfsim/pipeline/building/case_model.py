@@ -34,6 +34,7 @@ from cmfsim.pipeline.building.case_checks import (
     jaws,
     misplaced,
     plan_sizes,
+    turned_head,
 )
 from cmfsim.pipeline.building.inputs import (
     case_key,
@@ -362,6 +363,7 @@ def _note_plan(
             stages.drop({"moved-scaled"}, case.where(f"plan.{name}"))
     stages.add(bones.findings)
     stages.add(plan_sizes(case, bones, stages.findings))
+    stages.add(turned_head(case, skull))
     stages.add(jaws(bones, skull, case, stages.findings))
 
 
