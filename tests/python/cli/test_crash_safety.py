@@ -148,7 +148,7 @@ def no_pictures(tmp_path_factory, monkeypatch):
 
 def command(case, words, **options):
     """A command in a process of its own."""
-    line = [sys.executable, "-m", "cmfsim.cli", *words, str(case), "-q", "--no-doctor"]
+    line = [sys.executable, "-m", "cmfsim", *words, str(case), "-q", "--no-doctor"]
     return subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **options)
 
 

@@ -136,10 +136,10 @@ def test_physics_found_wrong_by_the_core_exits_with_2(saved, capsys):
 
 
 def test_the_program_runs_as_a_module(saved):
-    """`python -m cmfsim.cli --version` and help in a process of its own."""
+    """`python -m cmfsim --version` and help in a process of its own."""
     for words, expected in ((["--version"], cmfsim.__version__), (["--help"], "solve")):
         done = subprocess.run(
-            [sys.executable, "-m", "cmfsim.cli", *words],
+            [sys.executable, "-m", "cmfsim", *words],
             check=True,
             capture_output=True,
             text=True,
