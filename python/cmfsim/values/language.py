@@ -13,6 +13,7 @@ import gettext
 import logging
 import os
 import re
+import struct
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from importlib.resources import files
@@ -49,8 +50,13 @@ def catalogue() -> Mapping[str, str]:
             text = "there is no catalogue of CMFSIM_LANGUAGE=%s in %s: texts are English"
             _log.warning(text, named, folder)
         return {}
-    with open(place, "rb") as file:  # noqa: PTH123 (the name that gettext found)
-        found: Mapping[str, str] = vars(gettext.GNUTranslations(file))["_catalog"]
+    found: Mapping[str, str]
+    try:
+        with open(place, "rb") as file:  # noqa: PTH123 (the name that gettext found)
+            found = vars(gettext.GNUTranslations(file))["_catalog"]
+    except (OSError, struct.error, ValueError, LookupError, AttributeError) as error:
+        _log.warning("%s: is no catalogue of GNU gettext (%s): texts are English", place, error)
+        return {}
     return found
 
 

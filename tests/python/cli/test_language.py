@@ -129,6 +129,19 @@ def test_an_absent_language_is_reported(monkeypatch, tmp_path, caplog):
     assert "CMFSIM_LANGUAGE=tlh" in caplog.text
 
 
+@pytest.mark.parametrize("data", [b"", b"junk", b"\xde\x12\x04\x95" + bytes([1, 0, 0, 0, 9])])
+def test_a_damaged_catalogue_is_reported_and_texts_are_english(monkeypatch, tmp_path, caplog, data):
+    place = tmp_path / "tlh" / "LC_MESSAGES" / "cmfsim.mo"
+    place.parent.mkdir(parents=True)
+    place.write_bytes(data)
+    monkeypatch.setenv("CMFSIM_LOCALE", str(tmp_path))
+    monkeypatch.setenv("CMFSIM_LANGUAGE", "tlh")
+    language.catalogue.cache_clear()
+    assert language.catalogue() == {}
+    language.catalogue.cache_clear()
+    assert "is no catalogue of GNU gettext" in caplog.text
+
+
 @pytest.mark.usefixtures("bracketed")
 def test_predict_prints_and_reports_in_the_language_and_writes_english(tmp_path, capfd):
     case = write_demo_case(tmp_path / "case", edge_length=COARSE_EDGE).case.file
