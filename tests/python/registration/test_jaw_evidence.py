@@ -98,6 +98,20 @@ def test_a_lower_jaw_that_lost_its_teeth_has_doubtful_sites():
         assert "apart at the incisors" in found.skull[name].doubt, name
 
 
+@pytest.mark.parametrize(("side", "name"), [(1.0, "left"), (-1.0, "right")])
+def test_a_jaw_that_lost_a_side_has_doubtful_sites(side, name):
+    """As after a resection: gonion and molars there were 10 mm off, and none of them doubtful."""
+
+    def resected(points):
+        beyond = np.clip(side * points[:, 0] - 15.0, 0.0, None)
+        return points - side * 0.98 * beyond[:, None] * [1.0, 0.0, 0.0]
+
+    found = proposed(resected)
+    assert f"of the mandible lie on the {name} side of the head" in found.doubtful_jaw
+    doubtful = {n for n, site in found.skull.items() if site.doubt}
+    assert {n for n in found.skull if n.startswith(BACK)} <= doubtful
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [
