@@ -198,7 +198,7 @@ def test_surfaces_of_repeated_vertices_are_welded(tmp_path):
         ("cmfsim-scene", "other", "format is 'other'"),
         ('"tissue.vtu"', '"../tissue.vtu"', "in the same folder or below"),
         ('"tissue.vtu"', '"/etc/passwd"', "in the same folder or below"),
-        ('"floor.ply"', '"scene.toml"', "cannot be read as a mesh"),
+        ('"floor.ply"', '"scene.toml"', "files of .toml are not supported"),
         ("poisson = 0.4", "", "lacks 'poisson'"),
         ("poisson = 0.4", "poisson = 0.4\nyoung = 1.0", "remove one"),
         ("poisson = 0.4", "poison = 0.4", "unknown key 'poison'"),
