@@ -18,7 +18,7 @@ from cmfsim.meshing.lips import LipSeam
 from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
-from cmfsim.planning.face_measures.cephalometry import head_axes
+from cmfsim.planning.face_measures.occlusion import bite_frame
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -218,12 +218,14 @@ def turned_head(case: Case, landmarks: Mapping[str, Floats]) -> list[Finding]:
 
     landmarks: Of the skull; with fewer than three of the cranium, a turn cannot be seen.
     """
-    forwards, up = head_axes(landmarks)
-    axes = np.stack([np.cross(up, forwards), -forwards, up])
+    frame = bite_frame(landmarks)
+    axes = np.stack([frame.left, -frame.forwards, frame.up])
     angle = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(axes) - 1.0), -1.0, 1.0))))
+    if angle <= TURNED:
+        return []
     found = []
     for name, motion in case.plan.items():
-        if angle <= TURNED or not motion.typed or motion.matrix is None:
+        if not motion.typed or motion.matrix is None:
             continue
         centre = np.zeros(3) if motion.centre is None else motion.centre
         shift = carried(motion.matrix, centre[None])[0] - centre
@@ -237,7 +239,10 @@ def turned_head(case: Case, landmarks: Mapping[str, Floats]) -> list[Finding]:
         )
         signs = [-1.0, -1.0, 1.0] if motion.frame == "RAS" else [1.0, 1.0, 1.0]
         numbers = ", ".join(f"{number:.2f}" for number in own * signs)
-        fix = f"if forwards and up are meant as the head has them: translation = [{numbers}]"
+        fix = (
+            f"if forwards and up are meant as the head has them: translation = [{numbers}]; "
+            "nothing to do if the plan was made with the head as it lies"
+        )
         where = case.where(f"plan.{name}")
         found.append(Finding("plan-head-turned", what, where=where, fix=fix))
     return found
