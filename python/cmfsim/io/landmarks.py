@@ -26,7 +26,7 @@ from cmfsim.io.slicer.markups import (
     write_markups,
 )
 from cmfsim.values.checks import AnyPath, Floats, check_one_of
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, log_warnings
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS, label_key, named_site
 
 # What each format means where it does not say: Slicer's markups schema, and its fiducial reader.
@@ -104,9 +104,7 @@ def read_landmarks(path: AnyPath, *, frame: str | None = None) -> dict[str, Floa
     (3,)
     """
     found = _read(path, frame)
-    for finding in found.findings:
-        if finding.severity == "warning":
-            logging.getLogger(__name__).warning("%s: %s", finding.where, finding.what)
+    log_warnings(logging.getLogger(__name__), found.findings)
     return dict(found.points)
 
 

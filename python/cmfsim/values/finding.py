@@ -1,5 +1,6 @@
 """Findings: what a person should know before trusting a case, alone or many of a kind on a line."""
 
+import logging
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
@@ -165,6 +166,13 @@ def grouped(findings: Iterable[Finding]) -> list[FindingGroup]:
         kinds.setdefault((finding.severity, finding.code), []).append(finding)
     groups = [FindingGroup(tuple(found)) for found in kinds.values()]
     return sorted(groups, key=lambda group: SEVERITIES.index(group.severity))
+
+
+def log_warnings(log: logging.Logger, findings: Iterable[Finding]) -> None:
+    """Logs the warnings among findings, for callers who are not given these."""
+    for finding in findings:
+        if finding.severity == "warning":
+            log.warning("%s: %s", finding.where, finding.what)
 
 
 def counted(findings: Iterable[Finding]) -> str:

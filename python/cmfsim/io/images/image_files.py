@@ -21,7 +21,7 @@ from cmfsim.io.images.nifti import GZIP, is_nifti, read_nifti
 from cmfsim.io.images.nrrd import is_meta, read_meta, read_nrrd
 from cmfsim.processes.worker import Answer
 from cmfsim.values.checks import AnyPath
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, log_warnings
 from cmfsim.values.image_data import ImageData
 
 _log = logging.getLogger(__name__)
@@ -146,9 +146,7 @@ def read_image(path: AnyPath, *, series: str | None = None) -> ImageData:
 
 def logged(read: ImageFile) -> ImageData:
     """The image, with its warnings in the log, for callers who are not given the findings."""
-    for finding in read.findings:
-        if finding.severity == "warning":
-            _log.warning("%s: %s", finding.where, finding.what)
+    log_warnings(_log, read.findings)
     return read.image
 
 
