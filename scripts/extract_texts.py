@@ -63,9 +63,7 @@ def found_texts() -> Iterator[Found]:
                 text, values, _ = _template_literal(source, match.end())
                 yield text, values, f"{name}:{source.count(chr(10), 0, match.start()) + 1}"
         else:
-            plain = re.sub(
-                r"<(style|title)>.*?</\1>|\{%.*?%\}|\{\{.*?\}\}", "", source, flags=re.DOTALL
-            )
+            plain = FILLED.sub("", source)
             yield from ((m[1].strip(), [], name) for m in TAGGED.finditer(plain))
 
 

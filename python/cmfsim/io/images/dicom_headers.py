@@ -305,13 +305,14 @@ def _header(
         message = "it has no pixels, or does not state their rows and columns"
         raise ValueError(message)
     if elements.pixels not in {None, UNDEFINED}:
-        needed = stated = elements.pixels or 0
+        needed = elements.pixels or 0
+        there = min(elements.left, needed)
         if "bits" in tags:
             # Readers give zeros for pixels that are not there.
             each = int(tags["rows"]) * int(tags["columns"]) * int(tags.get("samples", 1))
             needed = each * (int(tags["bits"]) // 8) * header.count
-        if min(elements.left, stated) < needed:
-            message = f"{min(elements.left, stated)} of {needed} bytes of pixels"
+        if there < needed:
+            message = f"{there} of {needed} bytes of pixels"
             raise ValueError(message)
     return header
 
