@@ -156,6 +156,6 @@ def _print_landmarks(muscles: MorphedMusculature) -> None:
     if left_out is None:
         return
     median = float(np.median(left_out.distances))
-    print_text(f"predicted from the others, each is off by {median:.1f} mm off (median); worst:")
+    print_text(f"predicted from the others, each is off by {median:.1f} mm (median); worst:")
     for line in left_out.table().splitlines()[: 1 + WORST_SHOWN]:
         print_text(f"  {escaped(line)}")
