@@ -30,8 +30,9 @@ from cmfsim.values.progress import Progress
 # Skin or bone that meets a border of the image over less than this is not cut off, mm².
 CUT_SKIN = 150.0
 CUT_BONE = 60.0
-# Width of the ring inside the border of a round field of view that is searched for tissue, mm.
-FIELD_RING = 3.0
+# Width of the layer inside the border of the field of view that is searched for tissue, mm, and the
+# cosine beyond which such a border lies above, below or behind the head.
+FIELD_RING, STEEP = 3.0, 0.7
 # Face, jaws and spine lie farther than this from the brain's cavity, the vault does not, mm.
 VAULT = 15.0
 # The middle of face, jaws and spine lies some 40 mm in front of the brain's and 80 mm below it: it
@@ -136,7 +137,8 @@ def segmented(
         (first, second), (weak, seen) = head.noticed, noticed.result()
         findings = (*first, *weak, *second, *seen, *jaws)
     air = None if hollow is None else work.image(hollow)
-    return Anatomy(work.image(skin.level), bones, air, teeth, findings), head
+    levels = work.image(skin.level), bones, air, teeth
+    return Anatomy(*levels, findings, shown=work.shown), head
 
 
 def _opened(
@@ -215,7 +217,7 @@ def _checked(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
 def view_findings(work: Working, skin: Skin, bone: Bone) -> tuple[Finding, ...]:
     """Findings on cut-off parts and on the head's direction."""
     wrong = _direction(work, bone)
-    return (*wrong, *([] if wrong else [*_cut_off(work, skin, bone), *_round(work, skin)]))
+    return (*wrong, *([] if wrong else [*_cut_off(work, skin, bone), *_beyond(work, skin, bone)]))
 
 
 def _direction(work: Working, bone: Bone) -> tuple[Finding, ...]:
@@ -273,33 +275,44 @@ def _cut_off(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     return findings
 
 
-def _round(work: Working, skin: Skin) -> list[Finding]:
-    """A finding where a round field of view ends inside the head."""
-    if work.field is None:
+def _beyond(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
+    """Findings where padding begins inside the head: in front or at the sides, above or below."""
+    if work.shown is None:
         return []
-    axes = (
-        o + s * np.arange(n)
-        for o, s, n in zip(work.origin, work.spacing, skin.mask.shape, strict=True)
+    inside = np.argwhere(skin.mask)
+    depths = work.shown.depths(work.origin + work.spacing * inside)
+    wall = np.argmin(depths, axis=1)
+    at_end = np.take_along_axis(depths, wall[:, None], axis=1)[:, 0] < FIELD_RING
+    inside, normals = inside[at_end], work.shown.normals[wall[at_end]]
+    is_bone = bone.solid[tuple(inside.T)]
+    middle = np.average(np.arange(skin.mask.shape[1]), weights=skin.mask.sum(axis=(0, 2)))
+    in_front = inside[:, 1] < middle - 25.0 / work.spacing[1]
+    below, above = normals[:, 2] < -STEEP, normals[:, 2] > STEEP
+    beside = ~below & ~above & (normals[:, 1] < STEEP)
+
+    def area(found: Mask) -> float:
+        return float(np.count_nonzero(found) * np.prod(work.spacing)) / FIELD_RING
+
+    findings = []
+    if (meeting := area(beside)) > CUT_SKIN:
+        what = f"skin or tissue meets its border over {meeting / 100.0:.0f} cm²"
+        findings.append(_padded(f"the head extends beyond the field of view: {what}"))
+    if (meeting := area(below & is_bone & in_front)) > CUT_BONE:
+        findings.append(_padded(f"chin cut off: bone of the jaw meets it over {meeting:.0f} mm²"))
+    if (meeting := area(above & is_bone)) > CUT_BONE:
+        findings.append(_top(bone, meeting))
+    return findings
+
+
+def _padded(what: str) -> Finding:
+    return Finding(
+        "ct-cut-off",
+        what,
+        severity="warning",
+        where="border of the field of view",
+        why="the surface is closed there, and values near the border are too high",
+        fix="plan and evaluate only well inside the field, or use a scan of the whole head",
     )
-    x, y = (a - m for a, m in zip(axes, work.field.middle, strict=False))
-    away = np.hypot(x[:, None] / work.field.radii[0], y[None] / work.field.radii[1])
-    # The share of the ring just inside the field that is head.
-    inward = (1.0 - away) * float(work.field.radii.min())
-    ring = (inward > 0.0) & (inward < FIELD_RING)
-    area = float(np.count_nonzero(skin.mask[ring])) * float(np.prod(work.spacing)) / FIELD_RING
-    if area < CUT_SKIN:
-        return []
-    return [
-        Finding(
-            "ct-cut-off",
-            f"the head extends beyond the round field of view, {2.0 * work.field.radii.min():.0f} "
-            f"mm across: skin or tissue meets its border over {area / 100.0:.0f} cm²",
-            severity="warning",
-            where="border of the field of view",
-            why="the surface is closed there, and values near the border are too high",
-            fix="plan and evaluate only well inside the field, or use a scan of the whole head",
-        )
-    ]
 
 
 def _top(bone: Bone, area: float) -> Finding:

@@ -5,7 +5,6 @@ the same bytes, and element-wise work runs straight through memory.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from cmfsim import _core
 from cmfsim.errors import ImageError, third_party
+from cmfsim.values.shown_region import ShownRegion
 
 Mask = NDArray[np.bool_]
 Volume = NDArray[np.float32]
@@ -297,58 +297,72 @@ def resampled_to(
     return fine
 
 
-# Slices in which the field is looked for.
-SLICES = 5
-# Less of a slice than this is no padding: the corners of a square beside its circle are 0.21 of it.
+# Less of an image than this is no padding, and less of what it shows has the padding's value by
+# chance.
 LEAST_PADDING = 0.03
-# Padding begins, and the image ends, within this of the circle, voxels.
+# Voxels that are looked at to tell padding from air.
+SAMPLES = 200_000
+# What an image shows has the padding's value neither farther from its border than this nor in the
+# layer as wide behind, voxels: air would lie there beside a head.
 RIM = 2.0
+# Planes of its border are turned so far from one another at least; one that needs more of them than
+# boxes and cylinders have is a head in even air.
+LEAST_TURN, MOST_PLANES = np.deg2rad(4.0), 200
 
 
-@dataclass(frozen=True)
-class RoundField:
-    """A cylinder along z.
+def shown_region(values: NDArray[Any]) -> ShownRegion | None:
+    """The part of an image that padding of one value surrounds, in voxels; None without padding.
 
-    middle: (2,), of its axis along x and y, voxels (or mm).
-    radii: (2,). Its half widths along x and y, voxels (or mm).
+    Scanners pad a round field of view, and programs an image that they turn, shear or widen. Every
+    such part is convex, and its voxels differ from the padding also along its border.
     """
-
-    middle: NDArray[np.float64]
-    radii: NDArray[np.float64]
-
-    def scaled(self, spacing: NDArray[np.float64], origin: NDArray[np.float64]) -> "RoundField":
-        """The same in mm."""
-        return RoundField(origin + spacing * self.middle, spacing * self.radii)
-
-    def inside(self, shape: tuple[int, ...], margin: float = 0.0) -> Mask:
-        """Which columns (x, y) of the image lie inside, farther than a margin (voxels)."""
-        x, y = (np.arange(n) - m for n, m in zip(shape[:2], self.middle, strict=True))
-        a, b = np.maximum(self.radii - margin, 1e-9)
-        found: Mask = (x[:, None] / a) ** 2 + (y[None] / b) ** 2 < 1.0
-        return found
-
-
-def round_field(values: NDArray[Any]) -> RoundField | None:
-    """The round field of view; None where the image has another shape.
-
-    All four corners of a slice have the same value then, which nearly nothing has inside a circle,
-    and everything outside of it. A field that the borders of the image cut straight is not found.
-    """
-    layers = np.unique(np.linspace(0, values.shape[2] - 1, SLICES + 2).astype(int)[1:-1])
-    corners = values[[0, 0, -1, -1], [0, -1, 0, -1]][:, layers]
-    value = corners.flat[0]
-    if not (corners == value).all():
+    corners = values[tuple(np.ix_(*[[0, -1]] * 3))].ravel()
+    value = max(corners, key=lambda corner: np.count_nonzero(corners == corner))
+    step = max(1, int(np.cbrt(values.size / SAMPLES)))
+    padded = values[::step, ::step, ::step] == value
+    if not LEAST_PADDING <= padded.mean() <= 1.0 - LEAST_PADDING:
         return None
-    shown = (values[:, :, layers] != value).any(axis=2)
-    if not LEAST_PADDING <= 1.0 - shown.mean() <= 1.0 - LEAST_PADDING:
+    ends = np.unique(
+        np.vstack([_line_ends(values, value, axis, step) for axis in range(3)]), axis=0
+    )
+    if np.linalg.matrix_rank(ends - ends[0]) < 3:
         return None
-    ends = [np.flatnonzero(shown.any(axis=1 - axis))[[0, -1]] for axis in (0, 1)]
-    middle = np.array([0.5 * (a + b) for a, b in ends])
-    radii = np.array([0.5 * (b - a) + 0.5 for a, b in ends])
-    field = RoundField(middle, radii)
-    within = field.inside(shown.shape, RIM)
-    beyond = ~field.inside(shown.shape, -RIM)
-    every = (values[:, :, layers] != value)[within].mean()
-    if shown[beyond].any() or every < 1.0 - LEAST_PADDING:
-        return None
-    return field
+    hull = third_party("scipy.spatial", "images are segmented", "imaging", ImageError)
+    hull = hull.ConvexHull(ends)
+    corners = ends[hull.simplices]
+    sizes = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    facing = hull.equations[np.argsort(-sizes, kind="stable"), :3]
+    kept: list[NDArray[np.float64]] = []
+    while len(facing):
+        if len(kept) == MOST_PLANES:
+            return None
+        kept.append(facing[0])
+        facing = facing[facing @ facing[0] < np.cos(LEAST_TURN)]
+    normals = np.array(kept)
+    region = ShownRegion(normals, np.max(ends[hull.vertices] @ normals.T, axis=0))
+    places = step * np.argwhere(np.ones(padded.shape, dtype=bool)).astype(np.float64)
+    depth = region.depth(places).reshape(padded.shape)
+    odd = max(padded[depth > RIM].mean(), padded[(depth > RIM) & (depth < 2.0 * RIM)].mean())
+    return region if odd < LEAST_PADDING else None
+
+
+def _line_ends(values: NDArray[Any], value: Any, axis: int, step: int) -> NDArray[np.float64]:
+    """The first and the last voxel (n, 3) that is not padding of some lines along an axis."""
+    shown = np.moveaxis(values, axis, 0)[:, ::step, ::step] != value
+    across = np.argwhere(shown.any(axis=0))
+    lines = shown[:, across[:, 0], across[:, 1]]
+    ends = (lines.argmax(axis=0), len(lines) - 1 - lines[::-1].argmax(axis=0))
+    places = (step * across).astype(np.float64)
+    return np.vstack([np.insert(places, axis, end, axis=1) for end in ends])
+
+
+def padding(values: NDArray[Any], region: ShownRegion) -> Mask:
+    """The voxels of what surrounds a region: of its value, and joined to the image's border."""
+    outside = np.argwhere(np.ones((2, 2, 2))) * (np.array(values.shape) - 1)
+    corner = tuple(outside[np.argmin(region.depth(outside.astype(np.float64)))])
+    mask = values == values[corner]
+    border = np.ones(mask.shape, dtype=bool)
+    border[1:-1, 1:-1, 1:-1] = False
+    return reached(mask, border)

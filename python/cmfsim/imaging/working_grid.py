@@ -11,24 +11,25 @@ from cmfsim.errors import ImageInputError
 from cmfsim.imaging.intensities.intensity import (
     AIR,
     Calibration,
-    calibration,
+    calibration_within,
     check_is_ct,
     saturation_of,
 )
 from cmfsim.imaging.morphology import (
     Block,
     Mask,
-    RoundField,
     Volume,
     binned,
     label,
     opened,
+    padding,
     resampled_to,
-    round_field,
+    shown_region,
 )
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.shown_region import ShownRegion
 
 # Voxel size at which shapes as large as a couch are told apart, mm.
 COARSE = 2.5
@@ -63,7 +64,7 @@ class Working:
     native: (3,), mm. Voxel size of the image.
     saturation: HU. The value at which the image's brightest voxels were cut off; infinite where
         they were not.
-    field: mm. The round field of view; None where the image shows a box.
+    shown: mm. What padding surrounds; None where there is none.
     """
 
     hu: Volume
@@ -72,7 +73,7 @@ class Working:
     border: NDArray[np.bool_]
     native: NDArray[np.float64]
     saturation: float = np.inf
-    field: RoundField | None = None
+    shown: ShownRegion | None = None
 
     def part(self, box: Block) -> "Working":
         """A block of this grid."""
@@ -85,7 +86,7 @@ class Working:
             self.border & np.array([starts == 0, ends]),
             self.native,
             self.saturation,
-            self.field,
+            self.shown,
         )
 
     def image(self, values: NDArray[np.float32]) -> ImageData:
@@ -103,7 +104,8 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     """
     spacing = image.spacing
     _check_size(image, spacing)
-    scale = calibration(image.values, options.rescale)
+    shown = shown_region(image.values)
+    scale = calibration_within(image.values, shown, options.rescale)
     findings = [*scale.findings, *_spacing_findings(spacing)]
     x, y, z = (max(1, int(options.working_spacing / s + 1e-6)) for s in spacing)
     factors = (x, y, z)
@@ -111,10 +113,9 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     if values.dtype.kind == "b" or values.dtype == np.float16:
         values = values.astype(np.float32)
     values = _cut_off(values, scale)
-    field = round_field(image.values)
-    if field is not None:
-        values = values.copy()
-        values[~field.inside(values.shape)] = values.dtype.type((AIR - scale.offset) / scale.slope)
+    if shown is not None:
+        air = values.dtype.type((AIR - scale.offset) / scale.slope)
+        values = np.where(padding(image.values, shown), air, values)
     values, bins, shift = binned(values, factors, spacing)
     low, high = _head_box(values, bins, scale)
     border = np.array([low == 0, high == np.array(values.shape)])
@@ -132,9 +133,9 @@ def working_grid(image: ImageData, options: SegmentOptions) -> tuple[Working, tu
     findings.extend(more)
     origin = image.origin + shift + low * bins
     saturation = saturation_of(image.values, float(np.prod(spacing)), scale)
-    if field is not None:
-        field = field.scaled(spacing[:2], image.origin[:2])
-    return Working(hu, target, origin, border, spacing, saturation, field), tuple(findings)
+    if shown is not None:
+        shown = shown.scaled(spacing, image.origin)
+    return Working(hu, target, origin, border, spacing, saturation, shown), tuple(findings)
 
 
 def _on_target(

@@ -223,7 +223,7 @@ def unproposed_head(anatomy: Anatomy, why: str) -> ProposedHead:
 
 def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:
     bones, skin = head_surfaces(anatomy)
-    found = propose_landmarks(bones, skin, templates=heads)
+    found = landmarks_from(bones, skin, [average_head(), *heads], anatomy.shown)
     if not anatomy.surfaces:
         # The voxels of an image blur what the definitions read.
         blur = VOXEL_ERROR * float(anatomy.skin.spacing.max())

@@ -24,6 +24,7 @@ from cmfsim.values.checks import (
 )
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.shown_region import ShownRegion
 from cmfsim.values.surface_data import SurfaceData
 
 
@@ -46,6 +47,8 @@ class Anatomy(Frozen):
     findings : tuple of Finding
     surfaces : mapping of str to SurfaceData
         The surfaces that levels were made from ("skin" and bones), where surfaces were given.
+    shown : ShownRegion or None
+        What padding surrounds in the image, mm; None where there is none.
     """
 
     skin: ImageData
@@ -54,6 +57,7 @@ class Anatomy(Frozen):
     teeth: ImageData | None = None
     findings: tuple[Finding, ...] = ()
     surfaces: Mapping[str, SurfaceData] = field(default_factory=dict)
+    shown: ShownRegion | None = None
 
     __repr__ = brief
 

@@ -9,11 +9,12 @@ from cmfsim.errors import third_party
 from cmfsim.imaging.bones.bone import Bone
 from cmfsim.imaging.morphology import Block, Mask, Volume, ndimage
 from cmfsim.imaging.skins.skin import Skin
-from cmfsim.imaging.working_grid import Working
+from cmfsim.imaging.working_grid import MARGIN, Working
 from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead, fit_head
 from cmfsim.registration.proposed.shape_model.model import MANDIBLE, SKIN
-from cmfsim.registration.proposed.shape_model.samples import Cylinder, HeadSamples
+from cmfsim.registration.proposed.shape_model.samples import HeadSamples
 from cmfsim.values.checks import Floats
+from cmfsim.values.shown_region import ShownRegion, box_region
 
 # Points of bone and of skin that the model is fitted to, and the grid they are taken from, mm.
 BONE_POINTS, SKIN_POINTS, STEP = 3000, 2500, 2.0
@@ -50,11 +51,11 @@ def fitted_to(
     last = work.origin + work.spacing * (np.array(work.hu.shape) - 1.0)
     low = np.where(work.border[0], work.origin, -np.inf)
     high = np.where(work.border[1], last, np.inf)
-    field = None
-    if work.field is not None:
-        x, y = work.field.middle
-        field = Cylinder(float(x), float(y), float(work.field.radii.mean()))
-    head = fit_head(HeadSamples(*on_bone, *on_skin, low, high, field).without_ends())
+    shown = box_region(low, high)
+    if work.shown is not None:
+        near = work.shown.depths(on_skin[0]).min(axis=0) < MARGIN
+        shown = shown.and_behind(ShownRegion(work.shown.normals[near], work.shown.places[near]))
+    head = fit_head(HeadSamples(*on_bone, *on_skin, shown).without_ends())
     known = {("skull", name): place for name, place in (clicks or {}).items()}
     known = {site: place for site, place in known.items() if site in head.sites}
     return head.conditioned(known, CLICK) if known else head

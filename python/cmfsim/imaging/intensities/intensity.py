@@ -16,9 +16,10 @@ from cmfsim.imaging.morphology import (
     filled,
     largest,
     opened,
-    round_field,
+    shown_region,
 )
 from cmfsim.values.finding import Finding
+from cmfsim.values.shown_region import ShownRegion
 
 # Bone is brighter than this above soft tissue, HU.
 BRIGHT = 250.0
@@ -101,9 +102,16 @@ class Calibration:
 
 
 def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None) -> Calibration:
+    """The calibration of an image, padding left out, as `calibration_within` gives it."""
+    return calibration_within(values, shown_region(values), stated)
+
+
+def calibration_within(
+    values: NDArray[Any], shown: ShownRegion | None, stated: tuple[float, float] | None
+) -> Calibration:
     """The calibration of an image: as stated, or judged by its histogram.
 
-    What lies outside a round field of view does not count.
+    Padding does not count.
 
     Errors
     ------
@@ -111,7 +119,7 @@ def calibration(values: NDArray[Any], stated: tuple[float, float] | None = None)
         (also `ValueError`) One value throughout, no air and soft tissue to be told, or the spread
         of an MR image; no air where a stated scale puts it.
     """
-    sample = _means(values)
+    sample = _means(values, shown)
     low, high = np.percentile(sample, (0.05, 99.95))
     if not high > low:
         raise ImageInputError(
@@ -161,8 +169,8 @@ def _judged(sample: NDArray[np.float64]) -> Calibration:
     return replace(result, findings=(*result.findings, *unusual), has_air=has_air)
 
 
-def _means(values: NDArray[Any]) -> NDArray[np.float64]:
-    """The means of blocks throughout an image, or its voxels where it is thinner than a block."""
+def _means(values: NDArray[Any], shown: ShownRegion | None) -> NDArray[np.float64]:
+    """The means of blocks throughout what an image shows, or of voxels where it is thinner."""
     edges = [min(BLOCK, n) for n in values.shape]
     step = max(1, int(np.cbrt(values.size / SAMPLE)))
     starts = [range(0, n - e + 1, step) for n, e in zip(values.shape, edges, strict=True)]
@@ -173,9 +181,9 @@ def _means(values: NDArray[Any]) -> NDArray[np.float64]:
             for first, n, e in zip(shift, values.shape, edges, strict=True)
         )
         total += values[tuple(places)]
-    field = round_field(values)
-    if field is not None:
-        total = total[field.inside(values.shape, 2.0 * BLOCK)[np.ix_(starts[0], starts[1])]]
+    if shown is not None:
+        blocks = np.stack(np.meshgrid(*starts, indexing="ij"), axis=-1).reshape(-1, 3)
+        total = total.ravel()[shown.depth(blocks.astype(np.float64)) > 2.0 * BLOCK]
     means: NDArray[np.float64] = total.ravel() / np.prod(edges)
     return means
 
@@ -183,7 +191,7 @@ def _means(values: NDArray[Any]) -> NDArray[np.float64]:
 def _stated(sample: NDArray[np.float64], slope: float, intercept: float) -> Calibration:
     """A scale that the case states, where it puts the darkest voxels near air."""
     hu = slope * sample + intercept
-    # Padding outside a round field of view lies below air.
+    # Padding lies below air.
     air = float(np.median(hu[hu <= np.percentile(hu, 10.0)]))
     if air > AIR + STATED_TOLERANCE or float(hu.max()) < SOFT:
         raise ImageInputError(

@@ -38,6 +38,7 @@ from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES, SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, ProposedSite
+from cmfsim.values.shown_region import ShownRegion
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
 # Deviations from which a site is doubtful, and from which it says nothing: of normal errors along
@@ -152,7 +153,10 @@ def _surface_place(found: SitesOfKind, name: str, place: Floats, size: float) ->
 
 
 def landmarks_from(
-    bones: Mapping[str, SurfaceData], skin: SurfaceData | None, templates: Sequence[TemplateHead]
+    bones: Mapping[str, SurfaceData],
+    skin: SurfaceData | None,
+    templates: Sequence[TemplateHead],
+    shown: ShownRegion | None = None,
 ) -> ProposedLandmarks:
     """The landmarks of a head, each where its definition holds, with what is doubtful about it.
 
@@ -169,6 +173,8 @@ def landmarks_from(
         Without it no landmark of the skin is found.
     templates : sequence of TemplateHead
         The first is the average head, in its own frame; at least one.
+    shown : ShownRegion, optional
+        What padding surrounds in the image of the head.
 
     Raises
     ------
@@ -185,7 +191,7 @@ def landmarks_from(
     # Points on all surfaces are drawn while the pose is found.
     with ThreadPoolExecutor(1) as beside:
         drawn = beside.submit(parts.draw)
-        fitted = _fitted(parts)
+        fitted = _fitted(parts, shown)
         pose = refined_pose(fitted.pose, parts.upper, average.bones["cranium"])
         drawn.result()
     pose, found = _best_sites(parts, (pose, fitted.pose), average, fitted)
@@ -197,7 +203,7 @@ def landmarks_from(
     placed = _on_surface(skull, pose, surface)
     by_skin = {} if skin is None else dict.fromkeys((False, True), _searched(skin))
     on_skin = _on_surface(found.skin, pose, by_skin)
-    cuts = cut_planes([*([] if skin is None else [skin]), parts.upper])
+    cuts = cut_planes([*([] if skin is None else [skin]), parts.upper], shown)
     gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None)
     evidence = JawEvidence("", ())
     if parts.lower is not None:
@@ -244,10 +250,10 @@ def _surfaces(bones: Mapping[str, SurfaceData], skin: SurfaceData | None = None)
     return HeadSurfaces(joined_surface(upper), joined_surface(lower) if lower else None, skin)
 
 
-def _fitted(parts: HeadSurfaces) -> FittedHead:
+def _fitted(parts: HeadSurfaces, shown: ShownRegion | None = None) -> FittedHead:
     """The model of shape in all bone, divided or not, and the skin."""
     bones = [parts.upper, *([] if parts.lower is None else [parts.lower])]
-    return fit_head(samples_of(joined_surface(bones), parts.skin))
+    return fit_head(samples_of(joined_surface(bones), parts.skin, shown))
 
 
 def _likeness(

@@ -113,7 +113,7 @@ def _starts(model: HeadModel, samples: HeadSamples, upright: Floats) -> Iterator
     points = samples.skin if len(samples.skin) else samples.bone
     own = model.points[(model.parts == SKIN) == bool(len(samples.skin))]
     front, top = np.quantile(own[:, 1], 0.02), own[:, 2].max()
-    above = MISSING_ABOVE if np.isfinite(samples.high[2]) else MISSING_ABOVE[:1]
+    above = MISSING_ABOVE if samples.ends_above else MISSING_ABOVE[:1]
     for nod, lean, turn in product(np.radians(TURNS), repeat=3):
         rotation = rotation_of(np.array([nod, 0.0, 0.0])) @ rotation_of(np.array([0.0, lean, 0.0]))
         rotation = rotation @ rotation_of(np.array([0.0, 0.0, turn])) @ upright
