@@ -26,9 +26,13 @@ def anatomy(head):
 
 
 def model_of(folder, head, anatomy, change):
-    """The model of the case, with its text changed; the head is known and not read."""
+    """The model of the case, with its text changed; the head is known and not read.
+
+    Tets of 10 mm: lips that press on each other take as many solves as facets.
+    """
     path = phantom_case.surface_case(folder, head, anatomy)
-    path.write_text(change(path.read_text(encoding="utf-8")), encoding="utf-8")
+    text = path.read_text(encoding="utf-8").replace("edge_length = 7.0", "edge_length = 10.0")
+    path.write_text(change(text), encoding="utf-8")
     return cmfsim.build_model(cmfsim.Case.load(path), anatomy=anatomy, check=False)
 
 
@@ -43,21 +47,10 @@ def model(head, anatomy, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def coarse(head, anatomy, tmp_path_factory):
-    """The same with larger tets: lips that press on each other take as many solves as facets."""
-
-    def change(text):
-        return text.replace("edge_length = 7.0", "edge_length = 10.0") + LIPS
-
-    return model_of(tmp_path_factory.mktemp("coarse"), head, anatomy, change)
-
-
-@pytest.fixture(scope="module")
 def lower_jaw(head, anatomy, tmp_path_factory):
     """Only the mandible is operated: the upper teeth are the cranium's, which stays."""
 
     def change(text):
-        text = text.replace("edge_length = 7.0", "edge_length = 10.0")
         text = text.replace('[[osteotomies]]\nprocedure = "le_fort_1"\n', "")
         return text.replace("[plan.maxilla]\ntranslation = [0, -4, 0]\n", "") + LIPS
 
@@ -169,17 +162,17 @@ def test_a_prediction_without_contact_warns_that_lips_may_pass_through_each_othe
     assert "lips-contact" not in codes["whole"]
 
 
-def test_lips_press_on_each_other_and_do_not_pass(coarse):
+def test_lips_press_on_each_other_and_do_not_pass(model):
     """From the case file to equilibrium: what was separated touches, pushes and never pulls."""
-    result = cmfsim.predict_patient(coarse, "H+S").result
+    result = cmfsim.predict_patient(model, "H+S").result
     touching = result.summary["touching"]
     assert touching["pressed"] > 10
     assert touching["penetration"] < 0.2
     without = cmfsim.solve_scene(
-        dataclasses.replace(cmfsim.model_scene(coarse, "H+S"), touching=(), obstacles=())
+        dataclasses.replace(cmfsim.model_scene(model, "H+S"), touching=(), obstacles=())
     )
     moved = np.linalg.norm(result.displacements - without.displacements, axis=1)
-    lips = np.concatenate([region.nodes for region in coarse.lips.values()])
+    lips = np.concatenate([region.nodes for region in model.lips.values()])
     assert moved[lips].max() > 0.5
     assert np.median(moved) < 0.05 * moved[lips].max()
 
@@ -250,21 +243,21 @@ def test_nothing_moves_when_nothing_moves(model):
     assert touching["penetration"] < 1e-9
 
 
-def test_lips_do_not_enter_each_other_when_the_mandible_rises(coarse):
+def test_lips_do_not_enter_each_other_when_the_mandible_rises(model):
     """By 4 mm, which closes the gap of 3 mm between the lips; without contact they pass through."""
     plan = {"mandible_body": cmfsim.rigid_motion(translation=(0.0, 0.0, 4.0))}
-    result = solved(coarse, plan)
+    result = solved(model, plan)
     touching = result.summary["touching"]
     # Coarse lips may end with a node that meets two facets by turns: the result then warns.
     warned = [f["code"] for f in result.summary.get("findings", [])]
     assert touching["converged"] or "contact-stopped" in warned
     assert touching["pressed"] > 5
     assert touching["penetration"] < 0.1
-    free = dataclasses.replace(coarse.scene, touching=(), obstacles=())
-    assert _deepest(coarse, result) < 0.1
-    through = solved(dataclasses.replace(coarse, scene=free), plan)
+    free = dataclasses.replace(model.scene, touching=(), obstacles=())
+    assert _deepest(model, result) < 0.1
+    through = solved(dataclasses.replace(model, scene=free), plan)
     assert "touching" not in through.summary
-    assert _deepest(coarse, through) > 0.25
+    assert _deepest(model, through) > 0.25
 
 
 def _deepest(model, result):
