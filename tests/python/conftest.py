@@ -107,8 +107,8 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="module", autouse=True)
 def _remembered(request, tmp_path_factory):
-    """Equal heads are read and searched once in a run, but where the tests are about that."""
-    if request.path.parent.name in ("registration", "building", "surfaces", "meshing"):
+    """Equal heads are drawn, read and searched once in a run, but where tests are about that."""
+    if request.path.parent.name in ("registration", "building", "surfaces", "meshing", "phantom"):
         yield
         return
     # It loads NumPy, whose threads are set above.

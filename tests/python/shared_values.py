@@ -22,6 +22,7 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.lab.virtual.demo import write_demo_case
+from cmfsim.phantom.model import PhantomHead
 from cmfsim.pipeline import proposing
 from cmfsim.pipeline.building import inputs
 from cmfsim.pipeline.building.stages import BuildOptions
@@ -98,9 +99,10 @@ def phantom_model(temporary: pytest.TempPathFactory) -> cmfsim.PatientModel:
 
 
 def remember(patch: pytest.MonkeyPatch, temporary: pytest.TempPathFactory) -> None:
-    """Has slow steps of reading a head be made once in a run for equal arguments, as plain values.
+    """Has slow steps of drawing and reading a head be made once in a run for equal arguments.
 
-    Four seconds for surfaces of a head and their levels, seven for the landmarks found on them.
+    They give plain values. Two seconds for a head that is drawn, four for surfaces of a head and
+    their levels, seven for the landmarks found on them.
     """
     for module, name in (
         (inputs, "repair_surface"),
@@ -108,6 +110,13 @@ def remember(patch: pytest.MonkeyPatch, temporary: pytest.TempPathFactory) -> No
         (proposing, "landmarks_from"),
     ):
         patch.setattr(module, name, _remembered(getattr(module, name), temporary))
+    levels = PhantomHead._levels
+
+    def drawn_as(parameters: cmfsim.HeadParameters, *given: Any) -> Any:
+        return levels(cmfsim.make_head(parameters), *given)
+
+    drawn = _remembered(drawn_as, temporary)
+    patch.setattr(PhantomHead, "_levels", lambda head, *given: drawn(head.parameters, *given))
 
 
 def _remembered(step: Callable[..., Any], temporary: pytest.TempPathFactory) -> Callable[..., Any]:
