@@ -86,3 +86,22 @@ def test_a_shell_on_the_cheek_is_reported_though_its_air_is_narrow(head, long_ne
     inner = (x > 12.0) & (y < -62.0) & (z > -71.0) & (z < -29.0)
     values[part & gap & inner] = AIR
     assert attachments(long_neck.with_values(values), head)
+
+
+def test_pads_of_a_clamp_as_dense_as_bone_are_reported_and_no_bone(head):
+    """10 mm of hard plastic against either cheek: thick, and each the mirror image of the other."""
+    x, y, z = head.image.axes()
+    values = np.array(head.image.values)
+    larger = ((x / 68.0) ** 2 + ((y + 45.0) / 58.0) ** 2 + ((z + 45.0) / 78.0) ** 2) < 1.0
+    near = (np.abs(x) > 44.0) & (np.abs(y + 45.0) < 25.0) & (np.abs(z + 50.0) < 25.0)
+    values[larger & near & (values < -500.0)] = 450.0
+    plain, found = (
+        cmfsim.segment_head(image, landmarks=head.landmarks)
+        for image in (head.image, head.image.with_values(values))
+    )
+    codes = [finding.code for finding in found.findings]
+    assert codes.count("skin-attachment") == 2
+    for name, bone in plain.bones.items():
+        assert np.count_nonzero(found.bones[name].values > 0.0) == pytest.approx(
+            np.count_nonzero(bone.values > 0.0), rel=0.01
+        )

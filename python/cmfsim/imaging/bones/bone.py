@@ -25,6 +25,7 @@ from cmfsim.imaging.morphology import (
     label,
     ndimage,
     resampled_to,
+    shrunk,
     watershed,
 )
 from cmfsim.imaging.options import SegmentOptions
@@ -71,6 +72,7 @@ class Bone:
         `at_half_height`.
     mask: (nx, ny, nz) bool. Bone and the hollows in it.
     solid: (nx, ny, nz) bool. Bone alone.
+    bare: (nx, ny, nz) bool. Pieces as dense as bone that are none: no tissue covers them.
     cavity: (nx, ny, nz) bool or None, where the brain is; None where no skull encloses it in the
         image.
     """
@@ -79,6 +81,7 @@ class Bone:
     surface: Volume
     mask: Mask
     solid: Mask
+    bare: Mask
     cavity: Mask | None
     findings: tuple[Finding, ...]
 
@@ -92,11 +95,12 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
         (also `ValueError`) No bone at this threshold.
     """
     threshold = options.least_bone
-    under = depth(skin.mask, work.spacing, 2.0 * options.least_skin)
+    thin = options.least_skin + float(work.spacing.max())
+    under = depth(skin.mask, work.spacing, max(2.0 * options.least_skin, thin))
     hu = metal.hu
     solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
     solid &= under > options.least_skin
-    solid, findings = _without_islands(solid, work, options)
+    solid, bare, findings = _without_islands(solid, under < thin, work, options)
     with ThreadPoolExecutor(1) as beside:
         walls = beside.submit(_walls, hu, solid, under, work, options)
         cavity = _cranial_cavity(solid, skin, work)
@@ -104,7 +108,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     surface = hu
     if options.bone_threshold is None:
         surface, mask = at_half_height(hu, mask, threshold, BONE_SCALE, work.spacing)
-    return Bone(hu, surface, mask, solid & mask, cavity, tuple(findings))
+    return Bone(hu, surface, mask, solid & mask, bare, cavity, tuple(findings))
 
 
 def bone_level(bone: Bone, options: SegmentOptions) -> Volume:
@@ -113,8 +117,9 @@ def bone_level(bone: Bone, options: SegmentOptions) -> Volume:
 
 
 def _without_islands(
-    solid: Mask, work: Working, options: SegmentOptions
-) -> tuple[Mask, list[Finding]]:
+    solid: Mask, outermost: Mask, work: Working, options: SegmentOptions
+) -> tuple[Mask, Mask, list[Finding]]:
+    """Bone without small pieces and bare ones, and the bare ones."""
     labels, sizes = label(solid, corners=True)
     if len(sizes) == 1:
         raise ImageInputError(
@@ -124,7 +129,15 @@ def _without_islands(
     volumes = sizes * float(np.prod(work.spacing))
     kept = volumes > min(options.island, float(volumes.max()) - 1e-9)
     dropped = float(volumes[~kept].sum())
-    kept_mask = chosen(kept, labels)
+    # Plastic on the face has air over most of its surface, bone has not: unless none has any tissue
+    # over it, as in a dry skull.
+    rim = solid & ~shrunk(solid)
+    surface, open_to_air = (
+        np.bincount(labels[part], minlength=len(sizes)) for part in (rim, rim & outermost)
+    )
+    is_bare = kept & (2 * open_to_air > surface)
+    is_bare &= not is_bare[np.argmax(sizes)]
+    kept_mask, bare = chosen(kept & ~is_bare, labels), chosen(is_bare, labels)
     findings = []
     if dropped > options.island:
         findings.append(
@@ -135,7 +148,7 @@ def _without_islands(
                 where="bone",
             )
         )
-    return kept_mask, findings
+    return kept_mask, bare, findings
 
 
 def _cranial_cavity(solid: Mask, skin: Skin, work: Working) -> Mask | None:

@@ -146,7 +146,10 @@ def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
     """What protrudes, and is one-sided, has the density of plastic, or reaches too far."""
     spacing = head.spacing
     hu = coarse_of(work.hu, work.spacing, STEP)[0]
-    own = coarse_of(bone.solid.astype(np.float32), work.spacing, STEP)[0] > 0.25
+    own, bare = (
+        coarse_of(part.astype(np.float32), work.spacing, STEP)[0] > 0.25
+        for part in (bone.solid, bone.bare)
+    )
     behind = _behind(box_of(head.mask)[1])
     around = depth(head.mask, spacing)
     out = head.mask & ~head.core
@@ -154,6 +157,8 @@ def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
     far = reached(out & (head.away > STANDING_OUT), head.away > FARTHEST)
     dense = out & (hu > PLASTIC) & (around < WIDEST)
     dense &= depth(np.asfortranarray(own), spacing) < -OWN_BONE
+    # What is too thick to stand out.
+    dense[:, :behind] |= bare[:, :behind]
     mirrored = _mirrored(around, spacing, behind, out)
     alone = reached(out & (mirrored < -NEARLY_ONE_SIDED), mirrored < -ONE_SIDED)
     found: Mask = dense | alone | far
