@@ -56,6 +56,21 @@ def test_nothing_speaks_against_the_jaw_of_a_sound_head():
     assert not any(site.doubt for site in found.skull.values())
 
 
+def test_what_is_found_from_a_doubtful_chin_is_doubtful_and_no_surer():
+    """A spur of 16 mm on the chin, as plastic that was taken for bone makes it."""
+    head = average_head()
+    jaw, place = head.bones["mandible"], head.skull["pogonion"]
+    points = np.array(jaw.vertices, dtype=float)
+    near = np.exp(-0.5 * (((points - place) / [15.0, 12.0, 6.0]) ** 2).sum(axis=1))
+    spur = dataclasses.replace(jaw, vertices=points - 16.0 * near[:, None] * [0.0, 1.0, 0.0])
+    found = cmfsim.propose_landmarks({**head.bones, "mandible": spur}, head.skin)
+    chin = found.skull["pogonion"]
+    assert chin.doubt
+    for site in (found.skull["supramentale"], found.skin["pogonion"]):
+        assert "found from pogonion" in site.doubt
+        assert site.error >= chin.error
+
+
 def test_a_mouth_open_by_28_degrees_has_a_jaw_with_its_sites():
     turn = rotation_of(np.radians([28.0, 0.0, 0.0]))
     found = proposed(lambda points: (points - HINGE) @ turn.T + HINGE)

@@ -36,9 +36,25 @@ TO_FOLD, TO_CHIN = 18.0, 27.0
 STRANGE, IMPOSSIBLE = 9.5, 15.0
 
 
-# Sites of the skin that are found from those of the skull, and are gone with any of them.
-SUPPORT: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
+# Sites of the skull that others are found from: those of the skin are gone with any of them, and
+# all are doubtful with any.
+SUPPORT: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType({
+    "skull": {
+        "supraglabella": ("glabella",),
+        "mid_philtrum": ("supradentale",),
+        "supramentale": ("pogonion",),
+        **{
+            f"{site}_{letter}": (f"{of}_{letter}",)
+            for site, of in (
+                ("frontal_eminence", "supraorbital"),
+                ("inferior_malar", "suborbital"),
+                ("lateral_orbit", "suborbital"),
+                ("zygomatic_arch", "supraglenoid"),
+            )
+            for letter in "LR"
+        },
+    },
+    "skin": {
         "pogonion": ("pogonion",),
         "nasion": ("nasion",),
         **{
@@ -46,8 +62,8 @@ SUPPORT: Mapping[str, tuple[str, ...]] = MappingProxyType(
             for corner in ("endo", "exo")
             for letter in "LR"
         },
-    }
-)
+    },
+})  # fmt: skip
 # Those that are looked for between nose and chin: they are wrong where the chin is.
 ABOVE_CHIN = ("subnasale", "labiale_superius", "labiale_inferius", "alare", "cheilion")
 
@@ -100,7 +116,7 @@ def missing_sites(
             lost[name] = "the skin around it was not recognised"
         elif (cut := _cut_at(skin[name], cuts, AT_CUT)) is not None:
             lost[name] = f"{IMAGE_ENDS} ({cut.name} border)"
-        elif (support := next((n for n in SUPPORT.get(name, ()) if n in gone), None)) is not None:
+        elif support := next((n for n in SUPPORT["skin"].get(name, ()) if n in gone), ""):
             lost[name] = gone[support]
         elif name.startswith(ABOVE_CHIN) and off["skull"].get("pogonion", 0.0) > IMPOSSIBLE:
             lost[name] = gone["pogonion"]
@@ -162,6 +178,20 @@ def judged(
             error = max(error, 0.5 * pose.size * odd[name])
         sites[name] = ProposedSite(point, error, "; ".join(doubts))
     return sites
+
+
+def with_doubts_of_support(
+    kind: str, sites: Mapping[str, ProposedSite], skull: Mapping[str, ProposedSite]
+) -> dict[str, ProposedSite]:
+    """The sites, doubtful and no surer where one of the skull is doubtful that they rest on."""
+    result = dict(sites)
+    for name, support in SUPPORT[kind].items():
+        of = next((n for n in support if n in skull and skull[n].doubt), "")
+        if of and name in sites:
+            site = sites[name]
+            doubt = site.doubt or f"it is found from {of} (skull), which is doubtful"
+            result[name] = ProposedSite(site.point, max(site.error, skull[of].error), doubt)
+    return result
 
 
 def _unevenness(own: Mapping[str, Floats]) -> dict[str, float]:

@@ -23,7 +23,13 @@ from cmfsim.registration.proposed.jaw_evidence import (
     separation_points,
     weakened,
 )
-from cmfsim.registration.proposed.judgement import IMAGE_ENDS, IMPOSSIBLE, judged, missing_sites
+from cmfsim.registration.proposed.judgement import (
+    IMAGE_ENDS,
+    IMPOSSIBLE,
+    judged,
+    missing_sites,
+    with_doubts_of_support,
+)
 from cmfsim.registration.proposed.pose import (
     Pose,
     distance_from,
@@ -226,8 +232,8 @@ def landmarks_from(
     all_skull |= weakened(added, evidence, pose.size)
     all_skin, missing_skin = with_model(of_skin, likely, fitted, pose.size)
     return ProposedLandmarks(
-        all_skull,
-        all_skin,
+        with_doubts_of_support("skull", all_skull, all_skull),
+        with_doubts_of_support("skin", all_skin, all_skull),
         missing_skull,
         missing_skin,
         evidence.impossible,
