@@ -11,6 +11,8 @@ from benches.scenes import ct_variants as variants
 from cmfsim.pipeline import proposing
 from cmfsim.pipeline.building.inputs import read_anatomy
 from cmfsim.pipeline.proposing import BY_SHAPE, proposed_head
+from cmfsim.registration.proposed.definitions.depth_maps import STEP, DepthMap
+from cmfsim.registration.proposed.definitions.side_sites import _ridge
 from cmfsim.registration.proposed.shape_model.model import HINGE
 from cmfsim.registration.proposed.shape_model.state import rotation_of
 from cmfsim.registration.proposed.template_head import average_head
@@ -54,6 +56,15 @@ def test_nothing_speaks_against_the_jaw_of_a_sound_head():
     assert not found.impossible_jaw
     assert not found.doubtful_jaw
     assert not any(site.doubt for site in found.skull.values())
+
+
+@pytest.mark.parametrize(("top", "expected"), [(8.0, 8.0), (60.0, 12.0)])
+def test_a_ridge_is_looked_for_beyond_its_window_but_not_without_end(top, expected):
+    """10 mm of the condyle lack: the place expected from its top lies so far below the ridge."""
+    low, heights = -30.0, np.arange(-30.0, 70.0, STEP)
+    outer = DepthMap(np.array([-10.0, low]), np.tile(-65.0 + np.abs(heights - top), (30, 1)))
+    found = _ridge(outer, 0.0, -2.0, 5.0)
+    assert abs(found[2] - expected) <= STEP
 
 
 def test_what_is_found_from_a_doubtful_chin_is_doubtful_and_no_surer():

@@ -175,14 +175,22 @@ OVER_CONDYLE, BEFORE_ROOT, BELOW_ROOT = 6.0, 19.5, 1.5
 ROOT_REACH, ARCH_REACH = 5.0, 7.0
 # How much farther out a ridge must be for each mm that it lies off the expected height.
 RIDGE_PULL = 0.15
+# How often it is looked for farther on: up to 10 mm of the condyle may have been cut off with the
+# cranium, and the place expected from its top is as much too low.
+WINDOWS = 3
 
 
 def _ridge(outer: DepthMap, y: float, z: float, reach: float) -> Floats | None:
     """The outermost point over height near a place, (3,) with x positive."""
-    v, w, depth = outer.window((y - 1.0, y + 1.0), (z - reach, z + reach))
-    if not len(depth):
-        return None
-    best = int(np.argmin(depth + RIDGE_PULL * np.abs(w - z)))
+    for _ in range(WINDOWS):
+        v, w, depth = outer.window((y - 1.0, y + 1.0), (z - reach, z + reach))
+        if not len(depth):
+            return None
+        best = int(np.argmin(depth + RIDGE_PULL * np.abs(w - z)))
+        # What rises up to the border of the window is no ridge: that is farther on.
+        if abs(w[best] - z) < reach - STEP:
+            break
+        z = float(w[best])
     return np.array([-depth[best], v[best], w[best]])
 
 
