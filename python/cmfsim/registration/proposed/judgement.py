@@ -36,32 +36,19 @@ TO_FOLD, TO_CHIN = 18.0, 27.0
 STRANGE, IMPOSSIBLE = 9.5, 15.0
 
 
-# Sites of the skull that others are found from: those of the skin are gone with any of them, and
-# all are doubtful with any.
+# Sites of the skull, on the same side, that others are found from: those of the skin are gone with
+# any of them, and all are doubtful with any.
 SUPPORT: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "skull": {
-        "supraglabella": ("glabella",),
-        "mid_philtrum": ("supradentale",),
-        "supramentale": ("pogonion",),
-        **{
-            f"{site}_{letter}": (f"{of}_{letter}",)
-            for site, of in (
-                ("frontal_eminence", "supraorbital"),
-                ("inferior_malar", "suborbital"),
-                ("lateral_orbit", "suborbital"),
-                ("zygomatic_arch", "supraglenoid"),
-            )
-            for letter in "LR"
-        },
+        "supraglabella": ("glabella",), "mid_philtrum": ("supradentale",),
+        "supramentale": ("pogonion",), "frontal_eminence": ("supraorbital",),
+        "inferior_malar": ("suborbital",), "lateral_orbit": ("suborbital",),
+        "zygomatic_arch": ("supraglenoid",),
     },
     "skin": {
-        "pogonion": ("pogonion",),
-        "nasion": ("nasion",),
-        **{
-            f"{corner}canthion_{letter}": (f"supraorbital_{letter}", f"suborbital_{letter}")
-            for corner in ("endo", "exo")
-            for letter in "LR"
-        },
+        "pogonion": ("pogonion",), "nasion": ("nasion",),
+        "exocanthion": ("supraorbital", "suborbital"),
+        "endocanthion": ("supraorbital", "suborbital"),
     },
 })  # fmt: skip
 # Those that are looked for between nose and chin: they are wrong where the chin is.
@@ -116,7 +103,7 @@ def missing_sites(
             lost[name] = "the skin around it was not recognised"
         elif (cut := _cut_at(skin[name], cuts, AT_CUT)) is not None:
             lost[name] = f"{IMAGE_ENDS} ({cut.name} border)"
-        elif support := next((n for n in SUPPORT["skin"].get(name, ()) if n in gone), ""):
+        elif support := next((n for n in _support("skin", name) if n in gone), ""):
             lost[name] = gone[support]
         elif name.startswith(ABOVE_CHIN) and off["skull"].get("pogonion", 0.0) > IMPOSSIBLE:
             lost[name] = gone["pogonion"]
@@ -185,13 +172,17 @@ def with_doubts_of_support(
 ) -> dict[str, ProposedSite]:
     """The sites, doubtful and no surer where one of the skull is doubtful that they rest on."""
     result = dict(sites)
-    for name, support in SUPPORT[kind].items():
-        of = next((n for n in support if n in skull and skull[n].doubt), "")
-        if of and name in sites:
-            site = sites[name]
+    for name, site in sites.items():
+        of = next((n for n in _support(kind, name) if n in skull and skull[n].doubt), "")
+        if of:
             doubt = site.doubt or f"it is found from {of} (skull), which is doubtful"
             result[name] = ProposedSite(site.point, max(site.error, skull[of].error), doubt)
     return result
+
+
+def _support(kind: str, name: str) -> list[str]:
+    base = name.removesuffix("_L").removesuffix("_R")
+    return [f"{of}{name.removeprefix(base)}" for of in SUPPORT[kind].get(base, ())]
 
 
 def _unevenness(own: Mapping[str, Floats]) -> dict[str, float]:
