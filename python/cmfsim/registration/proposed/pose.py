@@ -1,6 +1,6 @@
 """The pose of a head: its plane of symmetry, and the frame of an average head."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,9 +97,7 @@ def refined_pose(start: Pose, bones: SurfaceData, average: SurfaceData) -> Pose:
     points, normals = surface_samples(bones, SAMPLES)
     pose = _even(start, bones, (points, normals))
     placed = pose.into(points), normals @ pose.axes.T
-    surface = Surface(average.vertices, average.triangles)
-    first = np.eye(3) / start.size, np.zeros(3)
-    (fine,) = _similarities(placed, surface, [first], FINE_ROUNDS)
+    fine = _similarity(placed, Surface(average.vertices, average.triangles), start.size)
     if fine.is_lost:
         return pose
     scale = float(np.cbrt(np.linalg.det(fine.linear)))
@@ -144,33 +142,18 @@ def _even(start: Pose, bones: SurfaceData, samples: Samples) -> Pose:
 def _mirror_fit(mirrored: Samples, surface: Surface) -> IcpFit:
     """The rigid motion that brings mirrored points back to the surface."""
     return icp(
-        mirrored[0],
-        surface,
-        initial=None,
-        max_distance=None,
-        keep_border=False,
-        trim=MIRROR_TRIM,
-        method="plane",
-        max_iterations=300,
-        tolerance=1e-5,
-        max_angle=np.radians(45.0),
+        mirrored[0], surface, initial=None, max_distance=None, keep_border=False, trim=MIRROR_TRIM,
+        method="plane", max_iterations=300, tolerance=1e-5, max_angle=np.radians(45.0),
         normals=mirrored[1],
-    )
+    )  # fmt: skip
 
 
 # Sites of the cranium that show how it nods, and the distance at which one counts half, mm.
 LEVEL_SITES = (
-    "nasion",
-    "glabella",
-    "rhinion",
-    "mid_philtrum",
-    "supradentale",
-    *(
-        f"{pair}_{letter}"
-        for pair in ("supraorbital", "suborbital", "zygomatic_arch", "supraglenoid")
-        for letter in "LR"
-    ),
-)
+    "nasion", "glabella", "rhinion", "mid_philtrum", "supradentale", "supraorbital_L",
+    "supraorbital_R", "suborbital_L", "suborbital_R", "zygomatic_arch_L", "zygomatic_arch_R",
+    "supraglenoid_L", "supraglenoid_R",
+)  # fmt: skip
 LEVEL_DISTANCE, LEVEL_ROUNDS, LEAST_LEVEL_SITES = 5.0, 20, 6
 # A levelling that turns the head by more, degrees, or moves or scales it by more (mm, share) rests
 # on sites that were found wrongly.
@@ -225,10 +208,7 @@ def _planar_fit(source: Floats, target: Floats, weight: Floats) -> tuple[Floats,
 
 def distance_from(points: Floats, normals: Floats, template: SurfaceData) -> float:
     """How far points of a head lie from a template's bone after the best small similarity, mm."""
-    surface = Surface(template.vertices, template.triangles)
-    start = np.eye(3), np.zeros(3)
-    (fit,) = _similarities((points, normals), surface, [start], FINE_ROUNDS)
-    return fit.distance
+    return _similarity((points, normals), Surface(template.vertices, template.triangles)).distance
 
 
 @dataclass
@@ -266,27 +246,16 @@ class _Similarity:
         self.linear, self.offset = step @ self.linear, step @ self.offset + move
 
 
-def _similarities(
-    samples: Samples, surface: Surface, starts: Iterable[tuple[Floats, Floats]], rounds: int
-) -> list[_Similarity]:
-    """The similarities in the plane x = 0 that fit best, from each of several starts.
-
-    In each round the points of all of them are looked up at once.
-    """
-    fits = [_Similarity(linear, offset) for linear, offset in starts]
+def _similarity(samples: Samples, surface: Surface, size: float = 1.0) -> _Similarity:
+    """The similarity in the plane x = 0 that fits a head of some size best."""
+    fit = _Similarity(np.eye(3) / size, np.zeros(3))
     face_normals = _face_normals(surface)
-    points = samples[0]
-    for _ in range(rounds):
-        going = [fit for fit in fits if not fit.is_lost]
-        if not going:
+    for _ in range(FINE_ROUNDS):
+        near, _, hit = surface.closest(samples[0] @ fit.linear.T + fit.offset)
+        fit.step(samples, near, face_normals[hit])
+        if fit.is_lost:
             break
-        moved = [points @ fit.linear.T + fit.offset for fit in going]
-        near, _, triangles = surface.closest(np.concatenate(moved))
-        for fit, places, hit in zip(
-            going, np.split(near, len(going)), np.split(triangles, len(going)), strict=True
-        ):
-            fit.step(samples, places, face_normals[hit])
-    return fits
+    return fit
 
 
 def _face_normals(surface: Surface) -> Floats:
