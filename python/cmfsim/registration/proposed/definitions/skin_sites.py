@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from cmfsim.errors import third_party
 from cmfsim.registration.proposed.definitions.depth_maps import STEP, DepthMap
 from cmfsim.registration.proposed.definitions.profile import local_midline, smoothed
 from cmfsim.values.checks import Floats
@@ -110,7 +111,9 @@ def _lips(front: DepthMap, lean: float, ends: tuple[float, float], found: Sites)
     a, b = inside[0], inside[-1]
     chord = line[a] + (line[b] - line[a]) * (z[inside] - z[a]) / (z[b] - z[a])
     out = chord - line[inside]
-    peaks = _peaks(out)
+    signal = third_party("scipy.signal", "landmarks are proposed", "imaging")
+    # The local maxima that rise from both sides by a lip's least height.
+    peaks = signal.find_peaks(out, prominence=LEAST_LIP)[0].tolist()
     if len(peaks) < 2:
         return
     # The two that stand out most, from above.
@@ -120,29 +123,6 @@ def _lips(front: DepthMap, lean: float, ends: tuple[float, float], found: Sites)
         at = inside[k] + round(beyond / STEP)
         if np.isfinite(line[at]):
             found[name] = np.array([lean, line[at], z[at]])
-
-
-def _peaks(values: Floats) -> list[int]:
-    """The local maxima that rise from both sides by a lip's least height."""
-    peaks: list[int] = []
-    for k in range(1, len(values) - 1):
-        if values[k] < values[k - 1] or values[k] <= values[k + 1]:
-            continue
-        before = values[k] - values[: k + 1][_last_higher(values, k) :].min()
-        after = values[k] - values[k : _next_higher(values, k)].min()
-        if min(before, after) >= LEAST_LIP:
-            peaks.append(k)
-    return peaks
-
-
-def _last_higher(values: Floats, k: int) -> int:
-    higher = np.flatnonzero(values[:k] > values[k])
-    return int(higher[-1]) + 1 if len(higher) else 0
-
-
-def _next_higher(values: Floats, k: int) -> int:
-    higher = np.flatnonzero(values[k:] > values[k])
-    return k + int(higher[0]) if len(higher) else len(values)
 
 
 def _wings(front: DepthMap, tip: Floats, base: float, found: Sites) -> None:
