@@ -220,10 +220,11 @@ def duplicate_triangles(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     """The triangles that have the corners of an earlier one, in any order."""
     if not len(triangles):
         return np.zeros(0, dtype=np.int64)
-    _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
-    again = np.ones(len(triangles), dtype=bool)
-    again[first] = False
-    return np.flatnonzero(again)
+    rows = np.sort(triangles, axis=1)
+    order = np.lexsort(rows.T)
+    one, other = rows[order[:-1]].T, rows[order[1:]].T
+    again = (one[0] == other[0]) & (one[1] == other[1]) & (one[2] == other[2])
+    return np.sort(order[1:][again])
 
 
 def border_loops(vertices: Floats, edges: Edges) -> tuple[BorderLoop, ...]:

@@ -23,6 +23,8 @@ CHUNK = 100_000
 MAX_CANDIDATES = 400_000_000
 # Largest number of cells along an axis: three fit one 63-bit key.
 MAX_CELLS = 2**20
+# The bits of three axes.
+ALL_AXES = 0b111
 
 
 def crossing_pairs(vertices: Floats, triangles: Integers) -> Integers | None:
@@ -34,54 +36,52 @@ def crossing_pairs(vertices: Floats, triangles: Integers) -> Integers | None:
     """
     if len(triangles) < 2:
         return np.zeros((0, 2), dtype=np.int64)
-    corners = vertices[triangles]
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    grid = _Grid(low, high)
+    # Axis by axis, as NumPy reduces an axis of three many times slower than it compares rows.
+    a, b, c = (np.ascontiguousarray(vertices.T)[:, corner] for corner in triangles.T)
+    grid = _Grid(np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c))
     if grid.n_candidates > MAX_CANDIDATES:
         return None
-    found = [pairs[_cross(corners, triangles, pairs)] for pairs in grid.candidates(low, high)]
+    corners = vertices[triangles]
+    found = [pairs[_cross(corners, triangles, pairs)] for pairs in grid.candidates()]
     pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *found])
     pairs = np.sort(pairs, axis=1)
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
 class _Grid:
-    """The triangles in each cell, sorted by cell."""
+    """The triangles in each cell, sorted by cell; low, high: (3, t), the ends of their boxes."""
 
     def __init__(self, low: Floats, high: Floats) -> None:
-        origin, end = low.min(axis=0), high.max(axis=0)
-        extents = high - low
+        origin, extents = low.min(axis=1)[:, None], high - low
         # About the mean size: smaller cells have fewer candidates, but more cells a triangle.
-        cell = CELL * float(extents.max(axis=1).mean())
-        cell = max(cell, float((end - origin).max()) / (MAX_CELLS - 1), np.finfo(float).tiny)
+        cell = CELL * float(extents.max(axis=0).mean())
+        cell = max(cell, float((high - origin).max()) / (MAX_CELLS - 1), np.finfo(float).tiny)
         while True:
             first = ((low - origin) / cell).astype(np.int64)
-            last = ((high - origin) / cell).astype(np.int64)
-            spans = last - first + 1
-            counts = spans.prod(axis=1)
-            if counts.sum() <= CELLS_PER_TRIANGLE * len(low):
+            spans = ((high - origin) / cell).astype(np.int64) - first + 1
+            counts = spans.prod(axis=0)
+            if counts.sum() <= CELLS_PER_TRIANGLE * low.shape[1]:
                 break
             cell *= 2.0
-        self._first = first
-        owner = np.repeat(np.arange(len(low)), counts)
+        owner = np.repeat(np.arange(low.shape[1]), counts)
         step = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-        span = spans[owner]
-        offset = np.stack(
-            [step % span[:, 0], step // span[:, 0] % span[:, 1], step // (span[:, 0] * span[:, 1])],
-            axis=1,
-        )
-        place = first[owner] + offset
-        key = (place[:, 0] * MAX_CELLS + place[:, 1]) * MAX_CELLS + place[:, 2]
+        wide, high_up, _ = spans[:, owner]
+        offset = (step % wide, step // wide % high_up, step // (wide * high_up))
+        x, y, z = (own[owner] + more for own, more in zip(first, offset, strict=True))
+        key = (x * MAX_CELLS + y) * MAX_CELLS + z
         order = np.argsort(key, kind="stable")
-        self._owner, self._place, key = owner[order], place[order], key[order]
-        starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-        sizes = np.diff(np.concatenate([starts, [len(key)]]))
-        ends = np.repeat(starts + sizes, sizes)
+        key, self._low, self._high, self._owner = key[order], low, high, owner[order]
+        # A bit for each axis along which the cell is the first of its triangle.
+        starts = [(more == 0).astype(np.uint8) << axis for axis, more in enumerate(offset)]
+        self._starts = (starts[0] | starts[1] | starts[2])[order]
+        begins = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+        sizes = np.diff(np.concatenate([begins, [len(key)]]))
+        ends = np.repeat(begins + sizes, sizes)
         # Each entry is paired with those after it in its cell.
         self._partners = ends - np.arange(len(key)) - 1
         self.n_candidates = int(self._partners.sum())
 
-    def candidates(self, low: Floats, high: Floats) -> Iterator[Integers]:
+    def candidates(self) -> Iterator[Integers]:
         """Pairs whose boxes overlap, each once, in chunks."""
         bounds = np.cumsum(self._partners)
         begin = 0
@@ -92,39 +92,47 @@ class _Grid:
             one = np.repeat(np.arange(begin, end), counts)
             shift = np.arange(len(one)) - np.repeat(np.cumsum(counts) - counts, counts)
             other = one + shift + 1
-            place = self._place[one]
-            a, b = self._owner[one], self._owner[other]
-            # A pair that shares several cells counts in the first of them only.
-            mine = (place == np.maximum(self._first[a], self._first[b])).all(axis=1)
-            a, b = a[mine], b[mine]
-            overlap = ((low[a] <= high[b]) & (low[b] <= high[a])).all(axis=1)
-            yield np.stack([a[overlap], b[overlap]], axis=1)
+            # A pair that shares several cells counts in the first of them only: along each axis,
+            # the first of one triangle or of the other.
+            mine = (self._starts[one] | self._starts[other]) == ALL_AXES
+            a, b = self._owner[one[mine]], self._owner[other[mine]]
+            for low, high in zip(self._low, self._high, strict=True):
+                overlap = (low[a] <= high[b]) & (low[b] <= high[a])
+                a, b = a[overlap], b[overlap]
+            yield np.stack([a, b], axis=1)
             begin = end
 
 
 def _cross(corners: Floats, triangles: Integers, pairs: Integers) -> NDArray[np.bool_]:
     """Whether each pair cuts through: an edge of one passes through the inside of the other."""
     crosses = np.zeros(len(pairs), dtype=bool)
-    shared = (triangles[pairs[:, 0]][:, :, None] == triangles[pairs[:, 1]][:, None, :]).any(axis=2)
+    mine, others = triangles[pairs[:, 0]].T, triangles[pairs[:, 1]].T
+    one, two, three = (_is_one_of(corner, others) for corner in mine)
     # Two neighbours by an edge cannot cut through each other; they can only lie on each other.
-    rest = np.flatnonzero(shared.sum(axis=1) < 2)
-    for one, other in ((0, 1), (1, 0)):
-        a, b = pairs[rest, one], pairs[rest, other]
+    rest = np.flatnonzero(~(one & two | two & three | three & one))
+    for sides in ((0, 1), (1, 0)):
+        a, b = pairs[rest][:, sides].T
         heights = _heights(corners[b], corners[a])
-        spread = (heights.max(axis=1) > 0.0) & (heights.min(axis=1) < 0.0)
+        above, below = (heights > 0.0).T, (heights < 0.0).T
+        spread = (above[0] | above[1] | above[2]) & (below[0] | below[1] | below[2])
         rest, a, b, heights = rest[spread], a[spread], b[spread], heights[spread]
         hit = np.zeros(len(rest), dtype=bool)
         for i in range(3):
             j = (i + 1) % 3
             p, q = corners[a, i], corners[a, j]
-            common = (
-                (triangles[a, i][:, None] == triangles[b])
-                | (triangles[a, j][:, None] == triangles[b])
-            ).any(axis=1)
+            corners_b = triangles[b].T
+            common = _is_one_of(triangles[a, i], corners_b) | _is_one_of(triangles[a, j], corners_b)
             between = (heights[:, i] * heights[:, j] < 0.0) & ~common
             hit |= between & _passes(p, q, corners[b])
         crosses[rest[hit]] = True
     return crosses
+
+
+def _is_one_of(corner: Integers, corners: Integers) -> NDArray[np.bool_]:
+    """Whether vertices (k,) are among the corners of triangles, (3, k)."""
+    a, b, c = corners
+    found: NDArray[np.bool_] = (corner == a) | (corner == b) | (corner == c)
+    return found
 
 
 def _heights(triangle: Floats, points: Floats) -> Floats:

@@ -40,12 +40,11 @@ def edges_of(triangles: Integers) -> Edges:
         none = np.zeros((0, 2), dtype=np.int64)
         single = np.zeros(0, dtype=np.int64)
         return Edges(none, single, none, np.zeros(0, dtype=bool), none, single)
-    directed = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    owner = np.repeat(np.arange(len(triangles)), 3)
-    low, high = directed.min(axis=1), directed.max(axis=1)
+    start, end = triangles.reshape(-1), triangles[:, [1, 2, 0]].reshape(-1)
+    low, high = np.minimum(start, end), np.maximum(start, end)
     key = low * (int(high.max()) + 1) + high
     order = np.argsort(key, kind="stable")
-    key, directed, owner = key[order], directed[order], owner[order]
+    key, directed, owner = key[order], np.stack([start, end], axis=1)[order], order // 3
     first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
     counts = np.diff(np.concatenate([first, [len(key)]]))
     two = first[counts == 2]
