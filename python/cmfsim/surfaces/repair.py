@@ -241,14 +241,14 @@ def _near_pairs(vertices: Floats, distance: float) -> Integers:
     grids.
     """
     pairs = [np.zeros((0, 2), dtype=np.int64)]
-    low = vertices.min(axis=0)
+    places = (vertices - vertices.min(axis=0)).T / (2.0 * distance)
     for corner in range(8):
-        shift = np.array([0.5 * ((corner >> axis) & 1) for axis in range(3)])
-        cells = np.floor((vertices - low) / (2.0 * distance) + shift)
-        order = np.lexsort(cells.T)
+        x, y, z = (np.floor(v + 0.5 * ((corner >> axis) & 1)) for axis, v in enumerate(places))
+        order = np.lexsort((x, y, z))
         one, other = order[:-1], order[1:]
-        near = (cells[one] == cells[other]).all(axis=1)
-        near &= np.linalg.norm(vertices[one] - vertices[other], axis=1) <= distance
+        near = (x[one] == x[other]) & (y[one] == y[other]) & (z[one] == z[other])
+        one, other = one[near], other[near]
+        near = np.linalg.norm(vertices[one] - vertices[other], axis=1) <= distance
         pairs.append(np.stack([one[near], other[near]], axis=1))
     return np.concatenate(pairs)
 
