@@ -23,8 +23,6 @@ CHUNK = 100_000
 MAX_CANDIDATES = 400_000_000
 # Largest number of cells along an axis: three fit one 63-bit key.
 MAX_CELLS = 2**20
-# The bits of three axes.
-ALL_AXES = 0b111
 
 
 def crossing_pairs(vertices: Floats, triangles: Integers) -> Integers | None:
@@ -71,9 +69,9 @@ class _Grid:
         key = (x * MAX_CELLS + y) * MAX_CELLS + z
         order = np.argsort(key, kind="stable")
         key, self._low, self._high, self._owner = key[order], low, high, owner[order]
-        # A bit for each axis along which the cell is the first of its triangle.
-        starts = [(more == 0).astype(np.uint8) << axis for axis, more in enumerate(offset)]
-        self._starts = (starts[0] | starts[1] | starts[2])[order]
+        # A bit for each axis along which the cell is not the first of its triangle.
+        later = [(more > 0).astype(np.uint8) << axis for axis, more in enumerate(offset)]
+        self._later = (later[0] | later[1] | later[2])[order]
         begins = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
         sizes = np.diff(np.concatenate([begins, [len(key)]]))
         ends = np.repeat(begins + sizes, sizes)
@@ -94,7 +92,7 @@ class _Grid:
             other = one + shift + 1
             # A pair that shares several cells counts in the first of them only: along each axis,
             # the first of one triangle or of the other.
-            mine = (self._starts[one] | self._starts[other]) == ALL_AXES
+            mine = (self._later[one] & self._later[other]) == 0
             a, b = self._owner[one[mine]], self._owner[other[mine]]
             for low, high in zip(self._low, self._high, strict=True):
                 overlap = (low[a] <= high[b]) & (low[b] <= high[a])
