@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim import _core
-from cmfsim._core import Surface
 from cmfsim.errors import MeshInputError
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats, as_number, as_point, as_positive
@@ -64,8 +63,8 @@ def signed_level(surface: SurfaceData, grid: ImageData) -> ImageData:
     nx, ny, nz = grid.values.shape
     sx, sy, sz = (float(s) for s in spacing)
     ox, oy, oz = (float(o) for o in grid.lowest)
-    core = Surface(surface.vertices, surface.triangles)
-    values = _core.signed_distance_image(core, (nx, ny, nz), (sx, sy, sz), (ox, oy, oz), band=band)
+    box = (nx, ny, nz), (sx, sy, sz), (ox, oy, oz)
+    values = _core.signed_distance_image(surface.searched, *box, band=band)
     return grid.with_values(values / np.float32(band))
 
 

@@ -204,10 +204,10 @@ def landmarks_from(
     likeness = [_likeness(template, parts.upper, pose, templates) for template in templates]
     found = _corrected(found, templates, likeness)
     skull = {name: p for name, p in found.skull.items() if not name.startswith("_")}
-    upper = _searched(parts.upper)
-    surface = {False: upper, True: _searched(parts.lower) if parts.lower else upper}
+    upper = parts.upper.searched
+    surface = {False: upper, True: parts.lower.searched if parts.lower else upper}
     placed = _on_surface(skull, pose, surface)
-    by_skin = {} if skin is None else dict.fromkeys((False, True), _searched(skin))
+    by_skin = {} if skin is None else dict.fromkeys((False, True), skin.searched)
     on_skin = _on_surface(found.skin, pose, by_skin)
     cuts = cut_planes([*([] if skin is None else [skin]), parts.upper], shown)
     gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None)
@@ -240,10 +240,6 @@ def landmarks_from(
         evidence.reason,
         {} if evidence.is_only_open else separation_points(sites, pose, average.skull),
     )
-
-
-def _searched(surface: SurfaceData) -> Surface:
-    return Surface(surface.vertices, surface.triangles)
 
 
 def _surfaces(bones: Mapping[str, SurfaceData], skin: SurfaceData | None = None) -> HeadSurfaces:
