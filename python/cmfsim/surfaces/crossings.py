@@ -129,8 +129,7 @@ def _cross(corners: Floats, triangles: Integers, pairs: Integers) -> NDArray[np.
 def _is_one_of(corner: Integers, corners: Integers) -> NDArray[np.bool_]:
     """Whether vertices (k,) are among the corners of triangles, (3, k)."""
     a, b, c = corners
-    found: NDArray[np.bool_] = (corner == a) | (corner == b) | (corner == c)
-    return found
+    return np.asarray((corner == a) | (corner == b) | (corner == c), dtype=np.bool_)
 
 
 def _heights(triangle: Floats, points: Floats) -> Floats:
