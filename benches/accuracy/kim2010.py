@@ -20,7 +20,7 @@ NAME = "benches/accuracy/kim2010.py"
 TRIALS = 3
 # What a virtual patient's case states of its muscles, and what it states with those of the paper.
 DEFAULT_MUSCLES = "\n[muscles]\n"
-PAPER_MUSCLES = '\n[muscles]\npreset = "kim2010"\nfit = false\nblur = 0\n'
+PAPER_MUSCLES = '\n[muscles]\npreset = "kim2010"\nblur = 0\n'
 CASE_FILE, PAPER_FILE = "case.toml", "paper.toml"
 # Pixels of a page's column.
 WIDTH = 1000

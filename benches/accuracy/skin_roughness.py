@@ -33,7 +33,7 @@ LEAST = 12
 SETTINGS: Mapping[str, cmfsim.CaseMuscles] = {
     "default": cmfsim.CaseMuscles(),
     "default, sharp": cmfsim.CaseMuscles(blur=0.0),
-    "kim2010, fitted": cmfsim.CaseMuscles(preset="kim2010", blur=0.0, fit=True),
+    "kim2010": cmfsim.CaseMuscles(preset="kim2010", blur=0.0),
 }
 Floats = NDArray[np.float64]
 

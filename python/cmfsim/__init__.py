@@ -12,7 +12,7 @@ landmarks   read_landmarks, propose_landmarks, match_landmarks, icp, register_vo
 osteotomies place_procedure, free_cut, cut_bones, segments_from_surfaces
 plans       planned_motion, clinical_motion, rigid_motion, read_transform, achieved_plan
 mesh        tissue_level, mesh_from_level, from_meshio, classify_nodes, segment_data
-muscles     MuscleTemplate, fit_muscles, equivalent_material, TissueModuli
+muscles     MuscleTemplate, equivalent_material, TissueModuli
 mechanics   Scene, solve_scene, TetMesh, Tissue, MassTensors, Boundary, StaticSolver
 trust       predict_with_band, calibrate, sensitivity, expected_error
 outcome     compare_skins, compare_models, run_study, run_variants, wilcoxon_test

@@ -156,9 +156,6 @@ from cmfsim.meshing.node_kinds import segment_data as segment_data
 from cmfsim.muscles.equivalent import Mixture as Mixture
 from cmfsim.muscles.equivalent import MuscleVolume as MuscleVolume
 from cmfsim.muscles.equivalent import equivalent_material as equivalent_material
-from cmfsim.muscles.fitting import FittedMuscle as FittedMuscle
-from cmfsim.muscles.fitting import MuscleFit as MuscleFit
-from cmfsim.muscles.fitting import fit_muscles as fit_muscles
 from cmfsim.muscles.template import MorphedMusculature as MorphedMusculature
 from cmfsim.muscles.template import MuscleTemplate as MuscleTemplate
 from cmfsim.muscles.template import check_template as check_template

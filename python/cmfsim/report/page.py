@@ -43,7 +43,6 @@ MESH: Labels = {
 MUSCLES: Labels = {
     "template": ("template", 1),
     "smoothing": ("smoothing of the spline", 1.0),
-    "fit": ("moved into the tissue", 1),
     "blur": ("blur of the shares of muscle, mm", 1.0),
     "preset": ("constants of fat and muscle", 1),
     "mixing": ("quantity mixed in a tet", 1),

@@ -404,8 +404,6 @@ class CaseMuscles:
     seed : int
     moduli : TissueModuli
         Of muscles, instead of the preset's; those of fat come from the case.
-    fit : bool
-        Whether muscles are moved out of bone, air and skin once landmarks have placed them.
     blur : float, mm
         Standard deviation of the blur of the shares of muscle, in which they fade into fat; 0 takes
         them as sampled, so that the tissue changes from tet to tet.
@@ -424,7 +422,6 @@ class CaseMuscles:
     samples: int = stated(64, "", *SAMPLES)
     seed: int = stated(0, "", 0, 2**63 - 1)
     moduli: TissueModuli = field(default_factory=TissueModuli)
-    fit: bool = stated(default=False)
     blur: float = stated(4.0, "mm", 0.0, MOST_BLUR)
 
 

@@ -16,7 +16,6 @@ from cmfsim.values.language import translated
 TITLES: Mapping[str, str] = {
     "muscle-does-not-fit": "{n} muscles partly outside the tissue",
     "muscle-missed": "{n} muscles contain no sample of the tissue and do not affect it",
-    "muscle-volume-changed": "{n} muscles changed in volume as they were moved into the tissue",
     "muscle-sheet": "{n} muscles are sheets, whose outline hardly determines their fibre direction",
     "landmark-far": "{n} landmarks are far from their surface",
     "surface-open": "{n} surfaces are open",

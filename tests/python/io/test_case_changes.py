@@ -46,12 +46,12 @@ def test_tables_are_merged_and_other_values_replaced(tmp_path):
     found = changed(
         tmp_path,
         "[variants.a]\n"
-        "muscles.fit = false\n"
+        "muscles.blur = 0\n"
         'osteotomies = [{procedure = "genioplasty"}]\n'
         '[variants.a.node_kinds]\ncontact_surface = "bone"\n',
     )
     assert found.muscles.samples == 8
-    assert found.muscles.fit is False
+    assert found.muscles.blur == 0.0
     assert dict(found.node_kinds) == {"contact_surface": "bone"}
     assert [cut.procedure for cut in found.osteotomies] == ["genioplasty"]
     given = cmfsim.Case.load(tmp_path / "P1")
@@ -77,8 +77,8 @@ def test_a_key_can_be_removed(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[variants.a]\nmuscles.fitt = false\n", r"variants.toml:2: muscles.fitt .*mean 'fit'"),
-        ("[variants.a.muscls]\nfit = false\n", r"variants.toml:1: muscls .*mean 'muscles'"),
+        ("[variants.a]\nmuscles.blurr = 0\n", r"variants.toml:2: muscles.blurr .*mean 'blur'"),
+        ("[variants.a.muscls]\nblur = 0\n", r"variants.toml:1: muscls .*mean 'muscles'"),
         ("\n[variants.a]\nmuscles.young_along = 0\n", r"variants.toml:3: muscles.young_along is 0"),
         ("[variants.a]\ntissue = {poisson = 0.6}\n", r"variants.toml:2: tissue.poisson is 0.6"),
         # What the case file itself states is its own fault, whatever else is changed.
@@ -91,7 +91,7 @@ def test_a_fault_of_a_change_has_its_place_in_the_file_of_variants(tmp_path, tex
 
 
 def test_a_fault_of_the_case_keeps_its_own_place(tmp_path):
-    changes = cmfsim.CaseChanges({"muscles": {"fit": False}})
+    changes = cmfsim.CaseChanges({"muscles": {"blur": 0.0}})
     path = case_file(tmp_path)
     path.write_text(CASE.replace("samples = 8", "samples = 0"), encoding="utf-8")
     with pytest.raises(cmfsim.CaseError, match=r"^case.toml:10: muscles.samples is 0"):
@@ -99,8 +99,8 @@ def test_a_fault_of_the_case_keeps_its_own_place(tmp_path):
 
 
 def test_findings_name_the_file_in_which_a_key_stands(tmp_path):
-    found = changed(tmp_path, "\n[variants.a]\nmuscles.fit = false\n")
-    assert found.where("muscles.fit") == "variants.toml:3 muscles.fit"
+    found = changed(tmp_path, "\n[variants.a]\nmuscles.blur = 0\n")
+    assert found.where("muscles.blur") == "variants.toml:3 muscles.blur"
     assert found.where("muscles.samples") == "case.toml:10 muscles.samples"
     # A list is replaced as a whole: the lines of its old entries are gone.
     found = changed(tmp_path, '[variants.a]\nosteotomies = [{procedure = "bsso"}]\n')
@@ -112,14 +112,14 @@ def test_findings_name_the_file_in_which_a_key_stands(tmp_path):
     [
         ("", "names no variant"),
         ("[variants.a]\n", r"variants.toml:1: variants.a changes nothing"),
-        ("[variants.as-given]\nmuscles.fit = false\n", r"variants.toml:1: .*is always there"),
-        ('[variants."a b"]\nmuscles.fit = false\n', r"variants.toml:1: .*is no name"),
+        ("[variants.as-given]\nmuscles.blur = 0\n", r"variants.toml:1: .*is always there"),
+        ('[variants."a b"]\nmuscles.blur = 0\n', r"variants.toml:1: .*is no name"),
         ('[variants.a]\noutput.folder = "b"\n', r"variants.toml:2: .*cannot change it"),
         (
             'models = ["M"]\n[variants.a]\nmodels = ["H"]\nmesh.refine = true\n',
             r"variants.toml:3: .*list of M is",
         ),
-        ("[variant.a]\nmuscles.fit = false\n", r"variants.toml:1: variant .*mean 'variants'"),
+        ("[variant.a]\nmuscles.blur = 0\n", r"variants.toml:1: variant .*mean 'variants'"),
     ],
 )
 def test_faults_of_a_file_of_variants_are_named_with_their_line(tmp_path, text, message):
@@ -128,7 +128,7 @@ def test_faults_of_a_file_of_variants_are_named_with_their_line(tmp_path, text, 
 
 
 def test_a_variant_has_the_models_of_its_cohort_unless_it_names_some(tmp_path):
-    text = 'description = "why"\n[variants.a]\nmodels = ["M+S"]\nmuscles.fit = false\n'
+    text = 'description = "why"\n[variants.a]\nmodels = ["M+S"]\nmuscles.blur = 0\n'
     found = variants(tmp_path, text + "[variants.b]\ntissue = {young = 1.0, poisson = 0.2}\n")
     assert {name: v.models for name, v in found.variants.items()} == {
         "as-given": ("H", "M+S"),
@@ -136,14 +136,14 @@ def test_a_variant_has_the_models_of_its_cohort_unless_it_names_some(tmp_path):
         "b": ("H", "M+S"),
     }
     assert found.description == "why"
-    assert found.variants["a"].words == "muscles.fit = false"
+    assert found.variants["a"].words == "muscles.blur = 0"
     assert found.variants["b"].words == "tissue.young = 1.0, tissue.poisson = 0.2"
 
 
 def test_changes_survive_the_way_to_another_process(tmp_path):
-    text = '[variants.a]\nwithout = ["tissue.preset"]\nmuscles.fitt = false\n'
+    text = '[variants.a]\nwithout = ["tissue.preset"]\nmuscles.blurr = 0\n'
     changes = variants(tmp_path, text).variants["a"].changes
     again = cmfsim.CaseChanges.from_json(changes.as_json())
     assert again == changes
-    with pytest.raises(cmfsim.CaseError, match=re.escape("variants.toml:3: muscles.fitt")):
+    with pytest.raises(cmfsim.CaseError, match=re.escape("variants.toml:3: muscles.blurr")):
         cmfsim.Case.load(case_file(tmp_path / "P1"), changes=again)

@@ -53,8 +53,10 @@ def test_muscles_of_a_case(tmp_path):
     assert case(tmp_path, "").muscles is None
     found = case(tmp_path, "[muscles]\n").muscles
     assert (found.template, found.samples, found.mixing) == ("default", 64, "moduli")
-    assert (found.preset, found.fit, found.blur) == ("passive", False, 4.0)
+    assert (found.preset, found.blur) == ("passive", 4.0)
     assert case(tmp_path, "[muscles]\nblur = 0\n").muscles.blur == 0.0
+    with pytest.raises(cmfsim.CaseError, match=r":\d+: muscles.fit was removed.*delete it"):
+        case(tmp_path, "[muscles]\nfit = false\n")
     found = case(tmp_path, '[muscles]\ntemplate = "atlas"\nsamples = 8\nseed = 3\n').muscles
     assert found.template == tmp_path / "atlas"
     assert (found.samples, found.seed) == (8, 3)

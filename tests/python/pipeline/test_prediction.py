@@ -332,22 +332,3 @@ def test_what_the_solution_notices_is_a_finding_of_the_prediction(predictions, m
     assert listed.count("3 of 9 tets are inverted") == 1
     for finding in made.patient.findings:
         assert listed.count(escape(finding.what)) == 1
-
-
-def test_muscles_are_fitted_if_the_case_asks_for_it(predictions):
-    patient = predictions["M"].patient
-    fitted = cmfsim.with_muscles(patient, cmfsim.CaseMuscles(samples=16, fit=True))
-    stated = fitted.summary["muscle_fit"]
-    assert stated["used"]
-    assert stated["outside_after"] < stated["outside_before"]
-    assert fitted.muscles.is_fitted
-    assert "fitting the muscles" in fitted.summary["timings"]
-    # As the case of the module has them.
-    bare = patient
-    assert bare.summary["muscle_fit"] is None
-    assert not bare.muscles.is_fitted
-    # The synthetic head is the template's kin: muscles lie nearly right as they are.
-    apart = np.asarray(fitted.muscles["masseter_L"].surface.vertices) - np.asarray(
-        bare.muscles["masseter_L"].surface.vertices
-    )
-    assert 0.0 < np.linalg.norm(apart, axis=1).max() < 3.0

@@ -207,7 +207,7 @@ def coarse_case(tmp_path_factory):
     phantom_case.surface_case(folder, head, head.anatomy(4.0))
     path = folder / "case.toml"
     text = path.read_text("utf-8").replace("edge_length = 7.0", "edge_length = 14.0")
-    after = "\n[muscles]\nsamples = 8\nfit = false\n\n"
+    after = "\n[muscles]\nsamples = 8\n\n"
     after += '[postoperative]\nskin = "skin.ply"\nverified = true\n'
     path.write_text(text + after, encoding="utf-8")
     (folder / "head").mkdir()

@@ -198,6 +198,8 @@ def tissue_of(table: Table) -> TissueData | None:
 
 def muscles_of(table: Table, folder: Path) -> case_parts.CaseMuscles:
     """A template's name is that of one in the package; a path leads to a folder."""
+    if "fit" in table:
+        table.fail("fit", "was removed, because it made faces worse (docs/moduli.md): delete it")
     template: Path | str = table.text("template", str(case_parts.CaseMuscles().template))
     if template != case_parts.CaseMuscles().template:
         template = table.path("template", folder)

@@ -48,7 +48,7 @@ class CaseChanges:
     Examples
     --------
     >>> import cmfsim
-    >>> changes = cmfsim.CaseChanges({"muscles": {"fit": False}})
+    >>> changes = cmfsim.CaseChanges({"muscles": {"blur": 0.0}})
     >>> case = cmfsim.Case.load("case.toml", changes=changes)
     """
 

@@ -193,8 +193,6 @@ class MorphedMusculature(Musculature):
     folds : mapping of str to int
         Vertices of each muscle at which the map turns space inside out; muscles without such
         vertices are omitted.
-    is_fitted : bool
-        Whether `fit_muscles` moved the muscles into the tissue after that.
 
     Examples
     --------
@@ -213,7 +211,6 @@ class MorphedMusculature(Musculature):
     leave_one_out: LandmarkAgreement | None
     missing: tuple[str, ...]
     folds: Mapping[str, int]
-    is_fitted: bool = False
 
     def save(
         self,
@@ -239,8 +236,6 @@ class MorphedMusculature(Musculature):
     def as_template(self, *, name: str | None = None) -> TemplateData:
         """The muscles, the skull and the landmarks of the patient as a template."""
         source = f"the template {self.template.name} morphed to {len(self.landmarks)} landmarks"
-        if self.is_fitted:
-            source += " and moved into the tissue"
         if self.template.source:
             source += f"; {self.template.source}"
         return TemplateData(

@@ -217,7 +217,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
         # A case without muscles loads nothing of them.
         from cmfsim.pipeline.building.tissue.muscles import NoMuscles, placed_muscles, with_muscles  # noqa: PLC0415
 
-        placing = beside.submit(placed_muscles, case.muscles, head.skull, head.anatomy)
+        placing = beside.submit(placed_muscles, case.muscles, head.skull)
 
         def show(bones: PlannedBones) -> None:
             if placing.done():

@@ -12,10 +12,8 @@ from cmfsim.muscles.equivalent import (
     equivalent_material,
     prepared_muscles,
 )
-from cmfsim.muscles.fitting import MuscleFit, fit_muscles
 from cmfsim.muscles.template import MuscleTemplate
 from cmfsim.muscles.template.muscle_template import MorphedMusculature, too_few, without_lost
-from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -27,13 +25,11 @@ from cmfsim.values.patient_model import PatientModel
 class PlacedMuscles:
     """A template's muscles in a head.
 
-    muscles: Where they are used: fitted, if that helps.
-    prepared: The same muscles with what a mesh is sampled by.
+    prepared: Its muscles muscles with what a mesh is sampled by.
     seconds: Of each step.
     """
 
     muscles: MorphedMusculature
-    fit: MuscleFit | None
     prepared: PreparedMuscles
     seconds: Mapping[str, float]
 
@@ -45,9 +41,7 @@ class NoMuscles:
     findings: tuple[Finding, ...]
 
 
-def placed_muscles(
-    given: CaseMuscles, skull: Mapping[str, Floats], anatomy: Anatomy
-) -> PlacedMuscles | NoMuscles:
+def placed_muscles(given: CaseMuscles, skull: Mapping[str, Floats]) -> PlacedMuscles | NoMuscles:
     """The muscles of a case in a head, from its skull landmarks.
 
     Those that the landmarks do not place are left out with a finding.
@@ -64,16 +58,10 @@ def placed_muscles(
     if not muscles.muscles:
         return NoMuscles(muscles.findings)
     seconds = {"placing the muscles": time.perf_counter() - begun}
-    fit = None
-    if given.fit:
-        fit = fit_muscles(muscles, anatomy)
-        seconds["fitting the muscles"] = fit.seconds
-        # A head in which muscles lie right already is left alone.
-        muscles = fit.musculature if fit.helps else muscles
     begun = time.perf_counter()
     prepared = prepared_muscles(muscles)
     seconds["preparing the muscles"] = time.perf_counter() - begun
-    return PlacedMuscles(muscles, fit, prepared, seconds)
+    return PlacedMuscles(muscles, prepared, seconds)
 
 
 def with_muscles(
@@ -114,15 +102,14 @@ def with_muscles(
     """
     begun = time.perf_counter()
     skull = patient.landmarks.get("skull", {}) if landmarks is None else landmarks
-    found = placed_muscles(given, skull, patient.anatomy) if placed is None else placed()
+    found = placed_muscles(given, skull) if placed is None else placed()
     if isinstance(found, NoMuscles):
         findings = tuple(dict.fromkeys([*patient.findings, *found.findings]))
         summary = {**patient.summary, "findings": [asdict(finding) for finding in findings]}
         return replace(patient, findings=findings, summary=summary)
-    muscles, fit, timings = found.muscles, found.fit, dict(found.seconds)
+    muscles, timings = found.muscles, dict(found.seconds)
     if placed is not None:
-        step = "placing" if fit is None else "fitting"
-        timings = {f"{step} the muscles": time.perf_counter() - begun}
+        timings = {"placing the muscles": time.perf_counter() - begun}
     begun = time.perf_counter()
     scene = patient.scene
     mesh = TetMesh(scene.nodes, scene.tets) if mesh is None else mesh
@@ -149,7 +136,6 @@ def with_muscles(
         "timings": {**patient.summary.get("timings", {}), **timings},
         "findings": [asdict(finding) for finding in findings],
         "muscles": {**asdict(given), "template": str(given.template), **mixture.summary},
-        "muscle_fit": None if fit is None else {"used": fit.helps, **fit.summary()},
     }
     return replace(
         patient,
