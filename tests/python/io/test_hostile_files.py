@@ -83,7 +83,9 @@ def test_units_of_a_scene_and_of_a_plan_are_not_passed_over(units, match, scene,
     plan.write_text(json.dumps({"units": units, "plan": {"bone": {"translation": [0, 0, 5]}}}))
     refused(lambda: cmfsim.read_plan(plan, given), match)
     plan.write_text(json.dumps({"plan": {"bone": {}}, "unit": "m"}))
-    refused(lambda: cmfsim.read_plan(plan, given), "unknown key 'unit'")
+    refused(
+        lambda: cmfsim.read_plan(plan, given), r"^plan.json: unit is unknown; did you mean 'units'"
+    )
     text = "".join(f"{k} = {v!r}\n" for k, v in units.items()) if isinstance(units, dict) else ""
     if text:
         toml = tmp_path / "scene.toml"

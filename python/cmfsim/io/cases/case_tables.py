@@ -330,7 +330,7 @@ def plan_of(document: Table, folder: Path) -> dict[str, CaseMotion]:
         if "moved" in motion:
             motions[checked_name(table, name, name)] = _moved(document, motion, name, folder)
         else:
-            motions[checked_name(table, name, name)] = _motion(motion, folder)
+            motions[checked_name(table, name, name)] = motion_of(motion, folder)
     return motions
 
 
@@ -348,7 +348,8 @@ def _moved(document: Table, motion: Table, name: str, folder: Path) -> CaseMotio
     return CaseMotion(surface=before, moved_surface=motion.only("moved").path("moved", folder))
 
 
-def _motion(table: Table, folder: Path) -> CaseMotion:
+def motion_of(table: Table, folder: Path) -> CaseMotion:
+    """A motion by numbers, by a matrix, by a file, or by a bone before and after."""
     if "transform" in table:
         return _transform(table.only("transform"), folder)
     if "moved_surface" in table or "surface" in table:

@@ -8,20 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
+from cmfsim.io.cases.case_tables import motion_of, solver_of
+from cmfsim.io.cases.tables import Table, read_tables
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
-from cmfsim.io.files.reading_writing import (
-    beside,
-    check_units,
-    check_version,
-    known_keys,
-    named,
-    read_document,
-    table_of,
-)
+from cmfsim.io.files.reading_writing import known_keys, named, table_of
 from cmfsim.io.meshes.mesh_files import read_mesh, read_tets
 from cmfsim.io.meshes.surfaces import read_moved_surface, read_surface
-from cmfsim.values.checks import AnyPath, as_floats
-from cmfsim.values.motion import rigid_motion
+from cmfsim.values.checks import AnyPath
 from cmfsim.values.node_kinds import NODE_KINDS
 from cmfsim.values.scene import Scene, SegmentData
 from cmfsim.values.solver_options import SolverOptions
@@ -145,21 +138,20 @@ def read_plan(path: AnyPath, scene: Scene) -> dict[str, NDArray[Any] | MovedSurf
     >>> plan = cmfsim.read_plan("whole_plan.toml", scene)
     """
     path = Path(path)
-    with named(path):
-        document = known_keys("plan file", read_document(path), PLAN_KEYS)
-        check_units(document.get("units"))
-        table = table_of(document, "plan")
-        for name in table:
-            if name not in scene.segments:
-                known = ", ".join(repr(s) for s in scene.segments) or "none"
-                raise CaseInputError(f"[plan] names segment {name!r}; segments are: {known}")
-        for name in scene.segments:
-            if name not in table:
-                raise CaseInputError(
-                    f"[plan] lacks segment {name!r}: give it translation = [0, 0, 0] if it does "
-                    "not move"
-                )
-        return {name: _motion(name, table, path.parent) for name in scene.segments}
+    document = read_tables(path, "plan file", json_too=True).only(*PLAN_KEYS)
+    document.units()
+    document.need("plan")
+    table = document.table("plan")
+    for name in table:
+        if name not in scene.segments:
+            known = ", ".join(repr(s) for s in scene.segments) or "none"
+            table.fail(name, f"names segment {name!r}; segments are: {known}")
+    for name in scene.segments:
+        if name not in table:
+            table.fail(
+                None, f"lacks segment {name!r}: give it translation = [0, 0, 0] if it does not move"
+            )
+    return {name: _motion(table.table(name), path.parent) for name in scene.segments}
 
 
 def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray[Any]]) -> Scene:
@@ -276,93 +268,80 @@ def _options(header: Mapping[str, Any]) -> SolverOptions:
 
 
 def _read_toml_scene(path: Path) -> Scene:
+    document = read_tables(path, "scene")
+    document.check_format(SCENE_FORMAT)
+    document.only(*SCENE_KEYS).units()
+    folder = path.parent
+    mesh_path = document.beside("mesh", folder)
     with named(path):
-        document = read_document(path)
-        if document.get("format") != SCENE_FORMAT:
-            raise CaseInputError(f"format is {document.get('format')!r}: {SCENE_FORMAT!r} needed")
-        check_version(document.get("version"))
-        known_keys("scene", document, SCENE_KEYS)
-        check_units(document.get("units"))
-        mesh_path = beside(path.parent, "mesh", document.get("mesh"))
         mesh = read_mesh(mesh_path)
         tets, tet_data = read_tets(mesh, mesh_path)
-        tables = table_of(document, "segments", optional=True)
+        tables, plan = document.table("segments"), document.table("plan")
         kinds = _node_integers(mesh, "kind", len(mesh.points), mesh_path)
-        owners = _node_integers(mesh, "segment", len(mesh.points), mesh_path) if tables else kinds
+        owners = kinds
+        if list(tables):
+            owners = _node_integers(mesh, "segment", len(mesh.points), mesh_path)
         segments = {
-            name: _segment(name, tables, kinds, owners == number, path.parent)
+            name: _segment(tables.table(name), kinds, owners == number, folder)
             for number, name in enumerate(tables)
         }
-        _check_kinds(kinds, owners, len(tables))
-        plans = table_of(document, "plan", optional=True)
-        plan = {name: _motion(name, plans, path.parent) for name in plans}
-        tissue = table_of(document, "tissue")
+        _check_kinds(kinds, owners, len(segments))
         return Scene(
             nodes=mesh.points,
             tets=tets,
-            tissue=_tissue(tissue, tet_data),
+            tissue=_tissue(document.table("tissue"), tet_data),
             segments=segments,
-            plan=plan,
+            plan={name: _motion(plan.table(name), folder) for name in plan},
             fixed=np.flatnonzero(kinds == NODE_KINDS.index("fixed")),
             loads=mesh.point_data.get("load"),
-            options=_options(document),
-            conflicts=document.get("conflicts", "error"),
+            options=solver_of(document.table("solver")),
+            conflicts=document.text("conflicts", "error"),
         )
 
 
-def _tissue(table: Mapping[str, Any], tet_data: Mapping[str, NDArray[Any]]) -> TissueData:
-    wanted = TISSUE_ARRAYS[_tissue_kind(table)]
-    given = known_keys("tissue", table, (*TISSUE_TEXTS, *wanted))
+def _tissue(table: Table, tet_data: Mapping[str, NDArray[Any]]) -> TissueData:
+    wanted = TISSUE_ARRAYS[_tissue_kind(table.values())]
+    given = table.only(*TISSUE_TEXTS, *wanted).values()
     for name, tail in wanted.items():
         if name in tet_data:
             if name in given:
-                raise CaseInputError(
-                    f"tissue {name} is both in the file and in the mesh: remove one"
-                )
+                table.fail(name, "is both in the file and in the mesh: remove one")
             values = tet_data[name]
             # VTK has tensors of 9 components at most, so 6 × 6 travel as 36.
             given[name] = values.reshape(-1, 6, 6) if tail == (6, 6) else values
-    return TissueData(**given)
+    with table.at(None):
+        return TissueData(**given)
 
 
 def _segment(
-    name: str,
-    tables: Mapping[str, Any],
-    kinds: NDArray[np.int64],
-    mine: NDArray[np.bool_],
-    folder: Path,
+    table: Table, kinds: NDArray[np.int64], mine: NDArray[np.bool_], folder: Path
 ) -> SegmentData:
-    table = known_keys(
-        f"segments.{name}", table_of(tables, name), ("contact", "crease_angle", "gap")
-    )
+    table.only("contact", "crease_angle", "gap")
     contact = None
     if "contact" in table:
-        surface_path = beside(folder, f"segments.{name}.contact", table["contact"])
-        contact = read_surface(surface_path, table.get("crease_angle", 60.0))
-    return SegmentData(
-        joined=np.flatnonzero((kinds == NODE_KINDS.index("joined")) & mine),
-        sliding=np.flatnonzero((kinds == NODE_KINDS.index("sliding")) & mine),
-        contact=contact,
-        gap=table.get("gap", 0.0),
-    )
-
-
-def _motion(name: str, plans: Mapping[str, Any], folder: Path) -> NDArray[Any] | MovedSurface:
-    where = f"plan.{name}"
-    table = table_of(plans, name)
-    if "matrix" in table:
-        return as_floats(f"{where}.matrix", known_keys(where, table, ("matrix",))["matrix"])
-    if "moved_surface" in table:
-        files = known_keys(where, table, ("surface", "moved_surface"))
-        return read_moved_surface(
-            beside(folder, f"{where}.surface", files.get("surface")),
-            beside(folder, f"{where}.moved_surface", files["moved_surface"]),
+        angle = table.plain("crease_angle") if "crease_angle" in table else 60.0
+        contact = read_surface(table.beside("contact", folder), angle)
+    with table.at("gap" if "gap" in table else None):
+        return SegmentData(
+            joined=np.flatnonzero((kinds == NODE_KINDS.index("joined")) & mine),
+            sliding=np.flatnonzero((kinds == NODE_KINDS.index("sliding")) & mine),
+            contact=contact,
+            gap=table.plain("gap") if "gap" in table else 0.0,
         )
-    numbers = known_keys(where, table, ("translation", "angle", "axis", "centre"))
-    with np.errstate(over="ignore", invalid="ignore"):
-        matrix = rigid_motion(**numbers)
-    if not np.isfinite(matrix).all():
-        raise CaseInputError(f"{where} has numbers so large that its motion is not finite")
+
+
+def _motion(table: Table, folder: Path) -> NDArray[Any] | MovedSurface:
+    if "moved_surface" in table:
+        # Files come from strangers: those of a case are its owner's.
+        table.only("surface", "moved_surface")
+        return read_moved_surface(
+            *(table.beside(key, folder) for key in ("surface", "moved_surface"))
+        )
+    if "transform" in table:
+        table.fail("transform", "is for a case: write matrix, or translation, angle, axis, centre")
+    matrix = motion_of(table, folder).matrix
+    if matrix is None:
+        table.fail("surface", "lacks moved_surface")
     return matrix
 
 

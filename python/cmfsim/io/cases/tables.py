@@ -82,19 +82,26 @@ def _paths(values: Mapping[str, Any], above: KeyPath) -> Iterator[KeyPath]:
             yield from _paths(value, (*above, key))
 
 
-def read_tables(path: Path) -> "Table":
+def read_tables(path: Path, what: str = "case file", *, json_too: bool = False) -> "Table":
     """The whole of a TOML file as a table.
 
+    what: What the file is, for errors.
+    json_too: Whether the file may be JSON; then an error names its keys, but no line.
     Raises `FileNotFoundError`: The file does not exist.
     Raises `CaseError`: Not TOML, not UTF-8, larger than 1 MiB, a pipe, keys of many parts.
     """
     reading_writing.check_readable(path)
-    if path.suffix != ".toml":
-        raise CaseInputError(f"{path.name}: a case file ends in .toml, not {path.suffix!r}")
+    endings = (".toml", ".json") if json_too else (".toml",)
+    if path.suffix not in endings:
+        allowed = " or ".join(endings)
+        raise CaseInputError(f"{path.name}: a {what} ends in {allowed}, not {path.suffix!r}")
     if path.stat().st_size > MAX_CASE_TEXT:
         raise CaseInputError(
-            f"{path.name}: has {path.stat().st_size} bytes, a case file at most {MAX_CASE_TEXT}"
+            f"{path.name}: has {path.stat().st_size} bytes, a {what} at most {MAX_CASE_TEXT}"
         )
+    if path.suffix == ".json":
+        with reading_writing.named(path):
+            return Table(_json_tables(path), (), path.name, {})
     try:
         with reading_writing.named(path):
             text = reading_writing.utf8_text(path.read_bytes()).replace("\r\n", "\n")
@@ -115,6 +122,17 @@ def read_tables(path: Path) -> "Table":
     lines = toml_lines(text)
     _refuse_undecided(values, lines, text, path.name)
     return Table(values, (), path.name, lines)
+
+
+def _json_tables(path: Path) -> dict[str, Any]:
+    try:
+        values = reading_writing.parsed_json(reading_writing.utf8_text(path.read_bytes()))
+    except (ValueError, RecursionError) as error:
+        raise CaseInputError(f"cannot be read: {error}") from error
+    if not isinstance(values, dict):
+        raise CaseInputError("is not a table of names and values")
+    reading_writing.check_numbers(values)
+    return values
 
 
 def _refuse_undecided(
@@ -218,7 +236,8 @@ class Table:
             theirs, ours = (_known(lines, path) for lines in (changes.lines, self._lines))
             if theirs and theirs >= ours:
                 return f"{changes.file}:{line_of(changes.lines, path)}"
-        return f"{self._file}:{line_of(self._lines, path)}"
+        # JSON has no lines.
+        return f"{self._file}:{line_of(self._lines, path)}" if self._lines else self._file
 
     def changed(self, changes: CaseChanges) -> "Table":
         """The whole file with changes; an error names the file in which its key stands.
@@ -366,6 +385,16 @@ class Table:
                 continue
             self._checked_number(key, entry)
         return value
+
+    def units(self) -> None:
+        """Refuses other units than mm, MPa and N, if the table states any."""
+        with self.at(None):
+            reading_writing.check_units(self._values.get("units"))
+
+    def beside(self, key: str, folder: Path) -> Path:
+        """A path to read that does not lead out of a folder, of a file that is not the user's."""
+        with self.at(key):
+            return reading_writing.beside(folder, "it", self.need(key))
 
     def path(self, key: str, folder: Path) -> Path:
         """A path to read, against a folder unless it is absolute; `~` is the home folder.

@@ -149,7 +149,7 @@ def named(path: Path) -> Iterator[None]:
         raise CaseInputError(f"{path.name}: cannot be read: change its permissions") from error
     except ValueError as error:
         text = str(error)
-        own = text.startswith(f"{path.name}: ")
+        own = text.startswith(f"{path.name}:")
         raise CaseInputError(text if own else f"{path.name}: {text}") from error
 
 
@@ -196,29 +196,6 @@ def is_below(path: Path, folder: Path) -> bool:
     except (OSError, RuntimeError, ValueError):
         # Links that lead round in a circle, a name that no system takes.
         return False
-
-
-def read_document(path: Path) -> dict[str, Any]:
-    """The tables of a `.toml` or `.json` file."""
-    if path.suffix not in {".toml", ".json"}:
-        raise CaseInputError(f"ends in {path.suffix!r}: .toml or .json is needed")
-    check_readable(path)
-    if path.stat().st_size > MAX_TEXT:
-        raise CaseInputError(f"is larger than {MAX_TEXT} bytes")
-    text = utf8_text(path.read_bytes())
-    try:
-        if path.suffix == ".json":
-            document = parsed_json(text)
-        else:
-            check_plain_toml(text)
-            document = toml_module().loads(text.replace("\r\n", "\n"))
-    except (ValueError, RecursionError) as error:
-        hint = toml_hint(text, str(error)) if path.suffix == ".toml" else ""
-        raise CaseInputError(f"cannot be read: {error}{hint}") from error
-    if not isinstance(document, dict):
-        raise CaseInputError("is not a table of names and values")
-    check_numbers(document)
-    return document
 
 
 def utf8_text(data: bytes) -> str:
