@@ -221,10 +221,8 @@ from cmfsim.planning.replanning import expected_error as expected_error
 from cmfsim.planning.replanning import plan_band as plan_band
 from cmfsim.planning.replanning import planning_model as planning_model
 from cmfsim.planning.server import serve_planning as serve_planning
-from cmfsim.registration import FoldReport as FoldReport
 from cmfsim.registration import LandmarkAgreement as LandmarkAgreement
 from cmfsim.registration import LandmarkMatch as LandmarkMatch
-from cmfsim.registration import fold_report as fold_report
 from cmfsim.registration import icp as icp
 from cmfsim.registration import leave_one_out as leave_one_out
 from cmfsim.registration import match_landmarks as match_landmarks

@@ -1,4 +1,4 @@
-"""Registration: landmarks matched by name and judged, folds of a warp, iterative closest points.
+"""Registration: landmarks matched by name and judged, iterative closest points.
 
 The splines and fits themselves are `cmfsim.ThinPlateSpline` and `cmfsim.rigid_fit` of the core.
 """
@@ -9,8 +9,6 @@ from cmfsim.registration.consistency import common_shift as common_shift
 from cmfsim.registration.consistency import leave_one_out as leave_one_out
 from cmfsim.registration.consistency import mirror_agreement as mirror_agreement
 from cmfsim.registration.consistency import swapped_names as swapped_names
-from cmfsim.registration.folds import FoldReport as FoldReport
-from cmfsim.registration.folds import fold_report as fold_report
 from cmfsim.registration.landmarks import LandmarkMatch as LandmarkMatch
 from cmfsim.registration.landmarks import match_landmarks as match_landmarks
 from cmfsim.registration.landmarks import side_vectors as side_vectors

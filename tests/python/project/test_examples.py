@@ -32,7 +32,6 @@ MADE_BY_STAGES = {
     "FacePlan",
     "FaceSites",
     "Finding",
-    "FoldReport",
     "Folds",
     "Frontier",
     "FrontierRow",

@@ -154,8 +154,7 @@ def test_real_landmarks_match_and_agree():
     assert agreement.outliers == ()
     assert str(agreement).splitlines()[1].startswith(agreement.worst)
     mandible = real_heads.core_surface("atlas_head", "mandible")
-    report = cmfsim.fold_report(found.spline(), mandible.vertices)
-    assert report.n_folded == 0
+    assert found.spline().folds(mandible.vertices).count == 0
 
 
 def test_a_real_landmark_15_mm_off_is_found():

@@ -114,19 +114,20 @@ def test_jacobian_and_folds():
         slope = (warp(points + step) - warp(points - step)) / (2 * h)
         assert np.abs(slope - jacobian[:, :, axis]).max() < 1e-7
     assert np.allclose(warp.folds(points).determinants, np.linalg.det(jacobian), atol=1e-12)
-    quiet = cmfsim.fold_report(cmfsim.ThinPlateSpline(source, source), points)
-    assert not quiet.is_folded
-    assert quiet.smallest == pytest.approx(1.0)
+    still = cmfsim.ThinPlateSpline(source, source)
+    for quiet in (still.folds(points), still.landmark_folds()):
+        assert quiet.count == 0
+        assert quiet.smallest == pytest.approx(1.0)
     target = source.copy()
     target[3] -= 250.0 * (source[3] - source.mean(0)) / np.linalg.norm(source[3] - source.mean(0))
     warp = cmfsim.ThinPlateSpline(source, target)
-    report = cmfsim.fold_report(warp, np.concatenate([points, source[[3]] + 0.01]))
-    determinants = np.linalg.det(warp.jacobian(np.concatenate([points, source[[3]] + 0.01])))
-    assert report.n_folded == np.count_nonzero(determinants <= 0) > 0
-    assert report.smallest == pytest.approx(determinants.min())
-    assert 3 in report.folded_landmarks
-    assert f"{report.n_folded} of 201 points folded" in str(report)
-    assert cmfsim.fold_report(warp, np.zeros((0, 3))).smallest is None
+    near = np.concatenate([points, source[[3]] + 0.01])
+    folds, determinants = warp.folds(near), np.linalg.det(warp.jacobian(near))
+    assert folds.count == np.count_nonzero(determinants <= 0) > 0
+    assert folds.smallest == pytest.approx(determinants.min())
+    assert folds.worst == np.argmin(determinants)
+    assert warp.landmark_folds().determinants[3] <= 0.0
+    assert warp.folds(np.zeros((0, 3))).smallest is None
 
 
 def thread_digest():
