@@ -35,7 +35,6 @@ from cmfsim.bones import segments_from_surfaces as segments_from_surfaces
 from cmfsim.bones.achieved import AchievedMotion as AchievedMotion
 from cmfsim.bones.achieved import AchievedPlan as AchievedPlan
 from cmfsim.bones.achieved import achieved_plan as achieved_plan
-from cmfsim.bones.achieved import measure_motion as measure_motion
 from cmfsim.bones.pairs.coherent_motion import MatchOptions as MatchOptions
 from cmfsim.doctor import Examination as Examination
 from cmfsim.doctor import diagnose as diagnose

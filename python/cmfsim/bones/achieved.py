@@ -26,7 +26,6 @@ from cmfsim.values.checks import (
     Floats,
     Frozen,
     as_floats,
-    as_positive,
     as_text,
     check_instance,
     check_one_of,
@@ -197,42 +196,15 @@ class AchievedPlan(Frozen):
         )
 
 
-def measure_motion(
-    before: SurfaceData,
-    after: SurfaceData,
-    *,
-    centre: ArrayLike | None = None,
-    tolerance: float = RIGID_TOLERANCE,
+def motion_by_vertices(
+    before: SurfaceData, after: SurfaceData, *, centre: ArrayLike | None = None
 ) -> AchievedMotion:
     """The motion between two surfaces with the same triangles, vertex by vertex.
 
-    Parameters
-    ----------
-    before, after : SurfaceData
-        The same vertices and triangles in the same order, in one frame.
-    centre : (3,) float64, mm, optional
-        About which the turn is written. Default: the middle of the vertices before.
-    tolerance : float, mm
-        The motion counts as rigid if the best rigid motion reproduces every vertex to this
-        tolerance.
-
-    Raises
-    ------
-    RegistrationError
-        (also `ValueError`) Other triangles; vertices that lie on one line.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> bone = cmfsim.SurfaceData([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2]])
-    >>> moved = cmfsim.SurfaceData([[0, -4, 1], [9, -4, 1], [0, 5, 1]], [[0, 1, 2]])
-    >>> found = cmfsim.measure_motion(bone, moved)
-    >>> found.is_rigid, found.motion.translation.round(9).tolist()
-    (True, [0.0, -4.0, 1.0])
+    before, after: The same vertices and triangles in the same order, in one frame.
+    centre: (3,), mm, about which the turn is written. Default: the middle of the vertices before.
+    Raises `RegistrationError`: Other triangles; vertices that lie on one line.
     """
-    for name, surface in (("before", before), ("after", after)):
-        check_instance(f"the surface {name}", surface, SurfaceData)
-    as_positive("tolerance", tolerance)
     if not _same_triangles(before, after):
         raise RegistrationInputError(
             f"the surfaces have different triangles: {len(before.triangles)} on "
@@ -247,7 +219,7 @@ def measure_motion(
         matrix=frozen(fit.matrix),
         motion=decompose_motion(fit.matrix, _centre(centre, here)),
         method="vertices",
-        is_rigid=worst <= tolerance,
+        is_rigid=worst <= RIGID_TOLERANCE,
         rms=float(fit.rms),
         worst=worst,
         median=float(np.median(fit.residuals)),
@@ -274,9 +246,9 @@ def measure_pair(
     before, after: The same vertices and triangles in the same order, in one frame.
     centre: (3,), mm, about which the turn is written. Default: the middle of the vertices before.
     is_still: Whether the bone was not operated on: changes on it are then no motion of the bone.
-    Raises `RegistrationError`: See `measure_motion`.
+    Raises `RegistrationError`: See `motion_by_vertices`.
     """
-    found = measure_motion(before, after, centre=centre)
+    found = motion_by_vertices(before, after, centre=centre)
     if found.is_rigid:
         return found
     coherent = coherent_motion(MovedSurface(before, after.vertices))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.bones.achieved import motion_by_vertices
 from cmfsim.values.checks import Frozen
 
 HERE = Path(__file__).parents[1]
@@ -110,7 +111,7 @@ def values(folder):
         "Musculature": cmfsim.Musculature((muscle,)),
         "MuscleTemplate": cmfsim.MuscleTemplate.load("default"),
         "ImageData": image,
-        "AchievedMotion": cmfsim.measure_motion(sheet, shifted),
+        "AchievedMotion": motion_by_vertices(sheet, shifted),
         "PhantomHead": cmfsim.make_head(),
         "proxy in a proxy": MappingProxyType({"a": MappingProxyType({"b": line})}),
     }

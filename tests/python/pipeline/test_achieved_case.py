@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import cmfsim
+from cmfsim.bones.achieved import motion_by_vertices
 from cmfsim.pipeline.building.case_checks import plan_sizes
 from cmfsim.pipeline.building.surgery.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.surgery.postoperative import read_postoperative
@@ -215,7 +216,7 @@ def test_slip_of_a_fitted_mesh_is_taken_off_and_said(tmp_path):
     before = knobbly(before, np.array((3, -128, 1445)))
     after = carried(slid(before, 2.0, seed=4), JAW)
     head.surfaces["mandible_after"] = after
-    by_vertices = cmfsim.measure_motion(before, after)
+    by_vertices = motion_by_vertices(before, after)
     assert max(off(by_vertices.matrix, JAW)) > 0.5
     found = achieved_bones(head, tmp_path)
     assert isinstance(found.motions["mandible"], np.ndarray)
