@@ -224,8 +224,6 @@ def _surfaces(case: Case, findings: list[Finding]) -> tuple[Body | None, dict[st
 
 def _check_other_files(case: Case, findings: list[Finding]) -> None:
     """Whether the files that no check looks into are there."""
-    if case.mesh.parting is not None:
-        _check_file(case, "mesh.parting.surface", case.mesh.parting, findings)
     if case.lips.contact and isinstance(case.lips.seam, Path):
         _check_file(case, "lips.seam", case.lips.seam, findings)
     if case.mesh.file is not None:

@@ -280,7 +280,7 @@ def check_lips(evidence: Evidence) -> Iterator[Finding]:
             why="the lips stay attached to the teeth and can hardly meet",
             fix="remove sliding = false from [node_kinds], or set contact = false in [lips]",
         )
-    if isinstance(lips.seam, Path) or case.mesh.parting is not None:
+    if isinstance(lips.seam, Path):
         return
     known = {label_key(name) for name in evidence.skin_landmarks}
     missing = [name for name in (*CORNERS, *BORDERS) if label_key(name) not in known]

@@ -101,7 +101,7 @@ def _surface_files(case: Case) -> Iterator[str]:
     for motion in case.plan.values():
         yield from map(str, (path for path in (motion.surface, motion.moved_surface) if path))
     seam = None if isinstance(case.lips.seam, str) else case.lips.seam
-    yield from map(str, (path for path in (case.mesh.file, case.mesh.parting, seam) if path))
+    yield from map(str, (path for path in (case.mesh.file, seam) if path))
 
 
 def _is_there(module: str) -> bool:

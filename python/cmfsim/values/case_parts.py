@@ -262,7 +262,6 @@ class CaseMesh:
 
     edge_length: mm.
     refine: Smaller tets where tissue is thin, and at the mouth.
-    parting: A surface that parts the lips where the image or skin shows them as one.
     cleft: mm. Tissue of which two segments that part are less than this away, taken together, is
         left out: between tooth rows and at cuts. 0: none.
     file: Tets from elsewhere; edge length, refinement and cleft are then not used.
@@ -271,7 +270,6 @@ class CaseMesh:
     edge_length: float = stated(EDGE_LENGTH, "mm", *EDGE_LENGTHS)
     refine: bool = stated(default=True)
     cleft: float = stated(CLEFT, "mm", 0.0, MOST_CLEFT)
-    parting: Path | None = None
     file: Path | None = stated(None)
 
 

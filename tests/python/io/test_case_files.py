@@ -42,7 +42,7 @@ upper = 120.5
 [mesh]
 edge_length = 2.5
 refine = false
-parting = {surface = "lips.ply"}
+cleft = 3.5
 
 [[osteotomies]]
 procedure = "le_fort_1"
@@ -106,8 +106,7 @@ def test_everything_in_a_case_file_arrives(tmp_path):
     assert case.landmarks.skin is None
     assert case.region.posterior_plane.normal.tolist() == [0.0, 1.0, 0.0]
     assert (case.region.lower, case.region.upper) == (-40.0, 120.5)
-    assert (case.mesh.edge_length, case.mesh.refine) == (2.5, False)
-    assert case.mesh.parting == tmp_path / "lips.ply"
+    assert (case.mesh.edge_length, case.mesh.refine, case.mesh.cleft) == (2.5, False, 3.5)
     assert case.lips == cmfsim.values.case_parts.CaseLips(
         contact=True, seam="landmarks", depth=5.0, height=11.5
     )
@@ -416,12 +415,14 @@ def test_a_plan_typed_in_ras_is_the_same_motion_in_lps(tmp_path):
 
 
 def test_the_seam_between_the_lips_may_be_a_surface(tmp_path):
-    """Beside the case; and not together with another surface that separates the mesh."""
+    """Beside the case; the former key of another table is refused, and says where to write it."""
     case = load(tmp_path, HEAD + SURFACES + '[lips]\ncontact = true\nseam = "seam.ply"\n')
     assert case.lips.seam == tmp_path / "seam.ply"
-    both = '[mesh]\nparting = {surface = "a.ply"}\n[lips]\nseam = "b.ply"\n'
-    with pytest.raises(cmfsim.CaseError, match="give one of them"):
-        load(tmp_path, HEAD + SURFACES + both)
+    former = '[mesh]\nparting = {surface = "a.ply"}\n'
+    with pytest.raises(
+        cmfsim.CaseError, match=r'mesh.parting was removed: .* seam = "FILE" in .lips'
+    ):
+        load(tmp_path, HEAD + SURFACES + former)
 
 
 @pytest.mark.parametrize(

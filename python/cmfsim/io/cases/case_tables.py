@@ -153,10 +153,9 @@ def region_of(table: Table, folder: Path) -> case_parts.Region:
 
 def mesh_of(table: Table, folder: Path) -> case_parts.CaseMesh:
     """The edge lengths of [mesh], or its own mesh."""
-    parting = None
     if "parting" in table:
-        parting = table.table("parting").only("surface").path("surface", folder)
-    return table.part(case_parts.CaseMesh, folder, parting=parting)
+        table.fail("parting", 'was removed: write contact = true and seam = "FILE" in [lips]')
+    return table.part(case_parts.CaseMesh, folder)
 
 
 def lips_of(document: Table, folder: Path) -> case_parts.CaseLips:
@@ -165,8 +164,6 @@ def lips_of(document: Table, folder: Path) -> case_parts.CaseLips:
     seam: Path | str | None = table.text("seam") if "seam" in table else None
     if seam is not None and seam not in case_parts.LIP_SEAMS:
         seam = table.path("seam", folder)
-        if "parting" in document.table("mesh"):
-            table.fail("seam", "is a surface, as is parting in [mesh]: give one of them")
     return table.part(case_parts.CaseLips, folder, seam=seam)
 
 

@@ -333,7 +333,7 @@ def _files(case: Case) -> Iterator[Path]:
     if case.surfaces is not None:
         yield case.surfaces.skin
         yield from case.surfaces.bones.values()
-    optional = [case.landmarks.skull, case.landmarks.skin, case.mesh.parting, case.mesh.file]
+    optional = [case.landmarks.skull, case.landmarks.skin, case.mesh.file]
     if isinstance(case.lips.seam, Path):
         optional.append(case.lips.seam)
     optional.extend(case.landmarks.templates)

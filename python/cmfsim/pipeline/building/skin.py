@@ -116,12 +116,11 @@ def find_seam(
 ) -> LipSeam:
     """The seam of a case that asks for contact of the lips."""
     seam = case.lips.seam
-    file = seam if isinstance(seam, Path) else case.mesh.parting
-    if file is not None:
-        surface = read_surface(file, **stated_frame(case))
-        return LipSeam(_upwards(surface), "file", {"source": "file", "file": file.name})
+    if isinstance(seam, Path):
+        surface = read_surface(seam, **stated_frame(case))
+        return LipSeam(_upwards(surface), "file", {"source": "file", "file": seam.name})
     by_jaw = {} if arches is None else arches.by_jaw
-    return lip_seam(anatomy, by_jaw, skin, way=str(seam), depth=case.lips.depth)
+    return lip_seam(anatomy, by_jaw, skin, way=seam, depth=case.lips.depth)
 
 
 def _upwards(surface: SurfaceData) -> SurfaceData:

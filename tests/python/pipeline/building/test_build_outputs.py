@@ -342,15 +342,13 @@ def test_poor_tets_from_elsewhere_are_a_finding(ellipsoids, small_model):
 
 
 def test_a_surface_parts_the_mesh(ellipsoids, small_model):
-    """`[mesh] parting`: more nodes, tets cut along the sheet, and the report of the whole."""
+    """`[lips] seam`: more nodes, tets cut along the sheet, and the report of the whole."""
     x, y, z = 0.0, -185.0, 1480.0
     corners = [[x - 60, y - 40, z], [x + 60, y - 40, z], [x + 60, y + 10, z], [x - 60, y + 10, z]]
     sheet = cmfsim.SurfaceData(corners, [[0, 1, 2], [0, 2, 3]])
     cmfsim.write_surface(ellipsoids.parent / "lips.ply", sheet)
     text = ellipsoids.read_text(encoding="utf-8")
-    text = text.replace(
-        "edge_length = 14.0", 'edge_length = 14.0\nparting = { surface = "lips.ply" }'
-    )
+    text += '\n[lips]\ncontact = true\nseam = "lips.ply"\n'
     ellipsoids.write_text(text, encoding="utf-8")
     model = cmfsim.build_model(cmfsim.Case.load(ellipsoids), check=False)
     whole, parted = small_model.summary["mesh"], model.summary["mesh"]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, TetMesh, distance_image
-from cmfsim.io import Case, read_surface, read_tet_mesh
+from cmfsim.io import Case, read_tet_mesh
 from cmfsim.meshing import (
     MeshOptions,
     TissueRegion,
@@ -16,7 +16,6 @@ from cmfsim.meshing import (
     mesh_from_level,
     mesh_report,
     near_skin,
-    part_mesh,
     report_of_part,
 )
 from cmfsim.meshing.lips import LipSeam
@@ -35,7 +34,6 @@ from cmfsim.pipeline.building.case_checks import (
     cut_segments,
     untouched,
 )
-from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.skin import (
     held_part,
     lifted_where_held,
@@ -152,11 +150,7 @@ def tissue_mesh(
         if seam is not None and seam.surface is not None:
             needed = np.maximum(needed, lip_halvings(level, seam, case.mesh.edge_length))
     made = mesh_from_level(level, options, allowed=allowed, needed=needed)
-    if case.mesh.parting is None or seam is not None:
-        return made.mesh, made.report, made.findings
-    parted = part_mesh(made.mesh, read_surface(case.mesh.parting, **stated_frame(case)))
-    report = report_of_part(parted, made.report)
-    return parted, report, mesh_findings(report)
+    return made.mesh, made.report, made.findings
 
 
 def allowed_halvings(anatomy: Anatomy) -> Counts:
