@@ -402,6 +402,34 @@ def test_gmsh_numbers_of_nodes_are_looked_up(tmp_path):
             cmfsim.read_tet_mesh(saved(tmp_path, "it.msh", text.format(8).replace(old, new, 1)))
 
 
+GMSH_2 = (
+    "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n4\n40 0 0 0\n3 1 0 0\n7 0 1 0\n8 0 0 1\n"
+    "$EndNodes\n$Elements\n1\n1 4 2 1 1 40 3 7 8\n$EndElements\n"
+    '$NodeData\n1\n"kind"\n1\n0\n3\n0\n1\n4\n8 8\n7 7\n3 3\n40 40\n$EndNodeData\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        ("40 3 7 8", "40 3 7 0", "refers to node 0, which does not exist"),
+        ("40 3 7 8", "40 3 7 8 3", "element 1 has 10 numbers: 9 are needed"),
+        ("\n3 1 0 0", "\n3.5 1 0 0", "a number that is not whole"),
+        ("$Elements\n1\n", "$Elements\n0\n", "where .EndElements is needed"),
+        ("$EndElements\n", "", "where .EndElements is needed"),
+        ("$Elements", "$Nodes\n1\n40 9 0 0\n$EndNodes\n$Elements", "has .Nodes twice"),
+        ("4 2 1 1 40 3 7 8", "11 2 1 1 40 3 7 8 3 7 8 40 3 7", "linear tets are needed"),
+    ],
+)
+def test_gmsh_files_that_meshio_reads_as_another_mesh_are_refused(old, new, match, tmp_path):
+    """All but the last, which other readers may pass on; values of nodes go by their numbers."""
+    whole = read_mesh(saved(tmp_path, "it.msh", GMSH_2))
+    assert whole.point_data["kind"].tolist() == [40.0, 3.0, 7.0, 8.0]
+    assert GMSH_2.count(old) == 1
+    with pytest.raises(cmfsim.CaseError, match=match):
+        cmfsim.read_tet_mesh(saved(tmp_path, "it.msh", GMSH_2.replace(old, new)))
+
+
 def test_other_volume_elements_are_refused_not_left_out(tmp_path):
     """A mesh of tets and a brick was read without the brick: a hole in the tissue."""
     brick = [0, 1, 4, 3, 9, 10, 13, 12]
