@@ -16,7 +16,8 @@ import numpy as np
 import cmfsim
 from cmfsim.io.results.populations import PARTS
 from cmfsim.lab.benchmark.patients import far_from_models, patients_of
-from cmfsim.lab.benchmark.scores import COVERAGE, calibrated_band, table
+from cmfsim.lab.benchmark.scores import COVERAGE, calibrated_band
+from cmfsim.values.table import Table
 
 # Quantiles of the coverage over splits that are printed.
 ENDS = (0.05, 0.95)
@@ -61,7 +62,7 @@ def main() -> None:
     ]
     titles = ["region", "covered: mean (5–95 % of splits)", "of the half farthest from the models"]
     print(f"{len(patients)} patients, {args.splits} splits into halves, {args.model}\n")
-    print(table(titles, rows))
+    print(Table(titles, rows, numeric=False).markdown)
 
 
 def _spread(shares: np.ndarray) -> str:

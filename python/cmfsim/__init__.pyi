@@ -269,12 +269,12 @@ from cmfsim.values.motion import rigid_matrix as rigid_matrix
 from cmfsim.values.motion import rigid_motion as rigid_motion
 from cmfsim.values.musculature import MuscleSurface as MuscleSurface
 from cmfsim.values.musculature import Musculature as Musculature
-from cmfsim.values.node_kinds import NodeKinds as NodeKinds
 from cmfsim.values.patient_model import LiftedTissue as LiftedTissue
 from cmfsim.values.patient_model import PatientModel as PatientModel
 from cmfsim.values.prediction import MODELS as MODELS
 from cmfsim.values.prediction import Prediction as Prediction
 from cmfsim.values.progress import Observer as Observer
+from cmfsim.values.scene import NodeKinds as NodeKinds
 from cmfsim.values.scene import Scene as Scene
 from cmfsim.values.scene import SceneResult as SceneResult
 from cmfsim.values.scene import SegmentData as SegmentData

@@ -33,6 +33,7 @@ from cmfsim.values.checks import (
 )
 from cmfsim.values.motion import RigidMotion, carried, decompose_motion, rigid_matrix
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.table import Table
 
 _LOG = logging.getLogger(__name__)
 
@@ -176,10 +177,10 @@ class AchievedPlan(Frozen):
 
     def text(self) -> str:
         """Translation and rotation of each segment, in the form of Table 2 of Kim et al. (2010)."""
-        lines = [["segment", "left", "back", "up", "turn", "about axis", "rms", "kept"]]
+        rows = []
         for name, found in self.motions.items():
             shift, axis = found.motion.translation, found.motion.axis
-            lines.append(
+            rows.append(
                 [
                     name,
                     *(f"{c:+.2f} mm" for c in shift),
@@ -189,11 +190,8 @@ class AchievedPlan(Frozen):
                     f"{found.share:.0%}",
                 ]
             )
-        widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-        return "\n".join(
-            "  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip()
-            for line in lines
-        )
+        columns = ("segment", "left", "back", "up", "turn", "about axis", "rms", "kept")
+        return Table(columns, rows, numeric=False).text
 
 
 def motion_by_vertices(

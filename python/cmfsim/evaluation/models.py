@@ -1,8 +1,6 @@
 """Models compared on each patient, and the table that Kim et al. (2010) print as Table 3."""
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -25,6 +23,7 @@ from cmfsim.surfaces.depth import moved_outward
 from cmfsim.values.checks import Floats, as_rows, as_text, brief, check_one_of, frozen
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.table import NOTHING, Table, csv_of
 
 # The pre-operative skin taken as a prediction: what any model must beat.
 NO_CHANGE = "no change"
@@ -33,8 +32,6 @@ WHOLE = "whole"
 # Columns of the CSV file after patient, region and model.
 COLUMNS = ("count", *(f"{name}_mm" for name in LENGTHS), "outliers")
 AVERAGE = "average"
-# Stands where a patient has no figure.
-NOTHING = "–"
 
 
 @dataclass(frozen=True)
@@ -344,23 +341,15 @@ class ErrorTable:
 
     def text(self, region: str = WHOLE) -> str:
         """Mean ± SD, 90th and 95th percentile, mm, as Table 3 of Kim et al. (2010) has them."""
-        lines = self._lines(region)
-        widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-        return "\n".join(
-            "   ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip()
-            for line in lines
-        )
+        return self._table(region, numeric=False).text
 
     def markdown(self, region: str = WHOLE) -> str:
         """The same as a table in Markdown."""
-        head, *rows = self._lines(region)
-        lines = [head, ["---", *["---:"] * len(self.models)], *rows]
-        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        return self._table(region, numeric=True).markdown
 
-    def _lines(self, region: str) -> list[list[str]]:
-        """The cells of the table, its head first and the average last."""
+    def _table(self, region: str, *, numeric: bool) -> Table:
         check_one_of("region", region, self.regions)
-        lines = [[f"{region}, mm", *self.models]]
+        rows = []
         for patient in self.patients:
             found = [self.cells.get((patient, region, model)) for model in self.models]
             cells = [
@@ -369,11 +358,12 @@ class ErrorTable:
                 else f"{cell.mean:.2f} ± {cell.std:.2f}  P90 {cell.p90:.2f}  P95 {cell.p95:.2f}"
                 for cell in found
             ]
-            lines.append([patient, *cells])
+            rows.append((patient, *cells))
         whole, count = self.complete(region), len(self.patients)
         name = AVERAGE if len(whole) == count else f"{AVERAGE} of {len(whole)} of {count}"
         means = [f"{self.average(m, region):.2f}" if whole else NOTHING for m in self.models]
-        return [*lines, [name, *means]]
+        columns = (f"{region}, mm", *self.models)
+        return Table(columns, [*rows, (name, *means)], numeric=numeric, gap="   ")
 
     def _means(self, model: str, region: str) -> list[float]:
         check_one_of("model", model, self.models)
@@ -425,18 +415,3 @@ def error_table(patients: Mapping[str, ModelComparison]) -> ErrorTable:
             for model in models:
                 cells[patient, region, model] = by_model[model]
     return ErrorTable(tuple(patients), models, tuple(regions), MappingProxyType(cells))
-
-
-def csv_of(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows of the same names as comma-separated values, with a header."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: _plain(value) for name, value in row.items()} for row in rows)
-    return text.getvalue()
-
-
-def _plain(value: Any) -> Any:
-    """A value that no spreadsheet takes for a formula."""
-    formula = isinstance(value, str) and value[:1] in {"=", "+", "-", "@", "\t", "\r"}
-    return f"'{value}" if formula else value

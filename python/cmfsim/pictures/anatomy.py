@@ -15,7 +15,7 @@ from cmfsim.pictures.canvas import SIZE, Shown, View, bounds, draw, polydata
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import AnyPath, Floats, as_index_rows, as_rows
 from cmfsim.values.musculature import MuscleSurface, Musculature
-from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.scene import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 from cmfsim.values.touching import LipRegion
 

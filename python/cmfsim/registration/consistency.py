@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from cmfsim._core import ThinPlateSpline
 from cmfsim.errors import LandmarkError, LandmarkInputError, RegistrationError
 from cmfsim.values.checks import Floats, as_rows, frozen
+from cmfsim.values.table import Table
 
 # Landmarks of which four are left when one is taken away.
 LEAST_LANDMARKS = 5
@@ -93,14 +94,12 @@ class LandmarkAgreement:
 
     def table(self) -> str:
         """Name, distance and score of each landmark as lines, worst first."""
-        width = max(len("landmark"), *(len(name) for name in self.names))
-        rows = {n: (d, s) for n, d, s in zip(self.names, self.distances, self.scores, strict=True)}
-        lines = [f"{'landmark':<{width}}  distance mm  score"]
-        for name in self.ranking:
-            distance, score = rows[name]
-            mark = "  stands out" if score >= OUTLIER_SCORE else ""
-            lines.append(f"{name:<{width}}  {distance:11.2f}  {score:5.1f}{mark}")
-        return "\n".join(lines)
+        rows = []
+        for i in np.argsort(-self.scores, kind="stable"):
+            distance, score = self.distances[i], self.scores[i]
+            mark = "stands out" if score >= OUTLIER_SCORE else ""
+            rows.append((self.names[i], f"{distance:.2f}", f"{score:.1f}", mark))
+        return Table(("landmark", "distance mm", "score", ""), rows).text
 
     def __str__(self) -> str:
         """The table."""

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
-from cmfsim.report.document import NOTHING, Figure, Note, Section, Table, number
+from cmfsim.report.document import Figure, Note, Section
+from cmfsim.values.table import NOTHING, Table, number
 
 Values: TypeAlias = Mapping[str, Any]
 

@@ -7,21 +7,12 @@ from typing import Any
 from cmfsim.errors import CaseInputError
 from cmfsim.report.band import band_section, not_operated_blocks, statistics_table, thickness_blocks
 from cmfsim.report.clinical import clinical_sections
-from cmfsim.report.document import (
-    NOTHING,
-    Alert,
-    Document,
-    Figure,
-    Note,
-    Section,
-    Table,
-    View,
-    number,
-)
+from cmfsim.report.document import Alert, Document, Figure, Note, Section, View
 from cmfsim.report.page import MEASURES, MESH, MUSCLES, labelled, plan_name, whose
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import Finding, counted, grouped
 from cmfsim.values.language import translated
+from cmfsim.values.table import NOTHING, Table, number
 
 Values = Mapping[str, Any]
 

@@ -3,8 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cmfsim.report.document import NOTHING, Figure, Note, Section, Table
+from cmfsim.report.document import Figure, Note, Section
 from cmfsim.values.language import translated
+from cmfsim.values.table import NOTHING, Table
 
 Values = Mapping[str, Any]
 # A site that moves by less, mm, stays: half of the last digit of the tables.

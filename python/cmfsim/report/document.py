@@ -3,30 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from cmfsim.errors import CaseInputError
-
-# Stands where there is no figure.
-NOTHING = "–"
-
-
-def number(value: object, digits: int = 2) -> str:
-    """A number as a table shows it; a dash where there is none."""
-    if value is None:
-        return NOTHING
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if not isinstance(value, int | float):
-        return str(value)
-    if isinstance(value, int):
-        return f"{value:,}".replace(",", "\u202f")
-    small = value != 0.0 and abs(value) < 0.5 * 10.0**-digits
-    return f"{value:.1e}" if small else f"{value:.{digits}f}"
-
-
-def plain_line(text: str) -> str:
-    """Words of a user as one line in which Markdown finds nothing to mark up."""
-    line = " ".join(text.split())
-    return "".join(f"\\{c}" if c in "\\`*_[]<>#|!" else c for c in line)
+from cmfsim.values.table import Table
 
 
 @dataclass(frozen=True)
@@ -35,56 +12,6 @@ class Note:
 
     text: str
     kind: str = "plain"
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of text under a heading; columns of numbers are set right.
-
-    Attributes
-    ----------
-    columns : tuple of str
-    rows : tuple of tuple of str
-    caption : str
-    numeric : bool
-        Whether all columns but the first hold numbers.
-    """
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str = ""
-    numeric: bool = True
-
-    def __post_init__(self) -> None:
-        for i, row in enumerate(self.rows):
-            if len(row) != len(self.columns):
-                raise CaseInputError(
-                    f"row {i} of a table has {len(row)} cells, its head {len(self.columns)}"
-                )
-
-    @classmethod
-    def of_pairs(cls, pairs: Mapping[str, object], caption: str = "") -> "Table":
-        """Names and values in two columns."""
-        rows = tuple((name, number(value)) for name, value in pairs.items())
-        return cls(("", ""), rows, caption, numeric=False)
-
-    @property
-    def text(self) -> str:
-        """Caption and columns as plain text."""
-        rows = [self.columns, *self.rows]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = [self.caption]
-        for first, *others in rows:
-            cells = [c.rjust(w) for c, w in zip(others, widths[1:], strict=True)]
-            lines.append("  ".join(["", first.ljust(widths[0]), *cells]))
-        return "\n".join(lines)
-
-    @property
-    def markdown(self) -> str:
-        """The columns in Markdown, without the caption."""
-        others = ["---:" if self.numeric else "---"] * (len(self.columns) - 1)
-        head, *rows = [map(plain_line, row) for row in (self.columns, *self.rows)]
-        return "\n".join(f"| {' | '.join(row)} |" for row in (head, ("---", *others), *rows))
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ from importlib import import_module
 from importlib.resources import files
 
 from cmfsim.errors import third_party
-from cmfsim.report.document import Document, Figure, Note, Table, View
+from cmfsim.report.document import Document, Figure, Note, View
 from cmfsim.values.language import language, translated
+from cmfsim.values.table import Table
 
 # How a distance between skins was measured, by the method of `compare_skins`.
 MEASURES: Mapping[str, str] = {

@@ -4,18 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cmfsim.evaluation import NO_CHANGE, ErrorTable
-from cmfsim.report.document import (
-    NOTHING,
-    Alert,
-    Document,
-    Figure,
-    Note,
-    Section,
-    Table,
-    number,
-    plain_line,
-)
+from cmfsim.report.document import Alert, Document, Figure, Note, Section
 from cmfsim.report.page import MEASURES
+from cmfsim.values.table import NOTHING, Table, number, plain_line
 
 Values = Mapping[str, Any]
 

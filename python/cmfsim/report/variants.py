@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cmfsim.evaluation import LEAST_PAIRS, NO_CHANGE, REGIONS, WHOLE
-from cmfsim.report.document import NOTHING, Alert, Document, Note, Section, Table, plain_line
+from cmfsim.report.document import Alert, Document, Note, Section
+from cmfsim.values.table import NOTHING, Table, plain_line
 
 Values = Mapping[str, Any]
 # Variant, model, region and patient of an error.

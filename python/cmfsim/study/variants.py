@@ -10,7 +10,6 @@ from typing import Any
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.evaluation import NO_CHANGE, ErrorTable, PairedChange, paired_change
-from cmfsim.evaluation.models import csv_of
 from cmfsim.io import AS_GIVEN, Case, CaseChanges, Cohort, Variants
 from cmfsim.pipeline.building.case_model import kind_options_of
 from cmfsim.pipeline.building.inputs import case_key, input_hashes
@@ -24,6 +23,7 @@ from cmfsim.study.cohort import (
     run_studies,
     study_table,
 )
+from cmfsim.values.table import csv_of
 
 _log = logging.getLogger(__name__)
 

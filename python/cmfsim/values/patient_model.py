@@ -15,8 +15,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, Frozen, Indices, listing
 from cmfsim.values.finding import Finding, counted_findings
-from cmfsim.values.node_kinds import NodeKinds
-from cmfsim.values.scene import Scene, SegmentData
+from cmfsim.values.scene import NodeKinds, Scene, SegmentData
 from cmfsim.values.skin_motion import SkinEnd, skin_end
 from cmfsim.values.surface_data import MovedSurface, SurfaceData, used_nodes
 from cmfsim.values.tissue_data import TissueData

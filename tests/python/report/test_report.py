@@ -8,8 +8,8 @@ import cmfsim
 from benches.scenes import meshes
 from cmfsim.report import Document, Figure, Note, Section, Table, render_page
 from cmfsim.report.clinical import clinical_sections
-from cmfsim.report.document import number
 from cmfsim.report.page import MESH, MUSCLES, labelled
+from cmfsim.values.table import number
 
 pytest.importorskip("jinja2")
 

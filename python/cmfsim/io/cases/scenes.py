@@ -15,8 +15,7 @@ from cmfsim.io.files.reading_writing import known_keys, named, table_of
 from cmfsim.io.meshes.mesh_files import read_mesh, read_tets
 from cmfsim.io.meshes.surfaces import read_moved_surface, read_surface
 from cmfsim.values.checks import AnyPath
-from cmfsim.values.node_kinds import NODE_KINDS
-from cmfsim.values.scene import Scene, SegmentData
+from cmfsim.values.scene import NODE_KINDS, Scene, SegmentData
 from cmfsim.values.solver_options import SolverOptions
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.tissue_data import TISSUE_ARRAYS, TissueData

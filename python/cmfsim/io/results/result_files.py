@@ -23,10 +23,9 @@ from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.surfaces import write_surface
 from cmfsim.io.meshes.vtk_writing import write_tets, write_triangles
 from cmfsim.values.checks import AnyPath, Floats, as_floats, as_rows, frozen
-from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS
-from cmfsim.values.scene import SceneResult
+from cmfsim.values.scene import NodeKinds, SceneResult
 from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 RESULT_FORMAT = "cmfsim-result"

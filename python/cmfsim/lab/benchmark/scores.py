@@ -1,7 +1,5 @@
 """Errors of predictions by region, calibrated bands, and their tables: CSV, Markdown and JSON."""
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -23,6 +21,7 @@ from cmfsim.lab.benchmark.patients import (
 )
 from cmfsim.values.calibration import BandFactor, Calibration, CalibrationCase
 from cmfsim.values.checks import Floats
+from cmfsim.values.table import NOTHING, Table, csv_of
 
 # The share of patients that a band must cover in each region.
 COVERAGE = 0.9
@@ -33,7 +32,6 @@ REGIONS = (
     "face", "lower face", LIPS, "upper lip", "lower lip", "chin", "nose", "left cheek",
     "right cheek",
 )  # fmt: skip
-FIGURES = ("mean", "p95", "within", "normal")
 # What is usually called acceptable, mm.
 WITHIN = 2.0
 # Decimals of figures in files, mm and shares: beyond what a prediction in single precision has.
@@ -225,26 +223,35 @@ class MethodResult:
         found = self.figures(region, name)
         return float(np.mean(found)) if found else None
 
-    def row(self, region: str, count: int) -> list[str]:
-        """The cells of the CSV file."""
-        means = self.figures(region, "mean")
-        spread = float(np.std(means, ddof=1)) if len(means) > 1 else None
-        values = [self.mean(region, name) for name in FIGURES]
-        banded = self.figures(region, "covered")
-        band = [self.mean(region, name) for name in ("covered", "half_width")]
-        numbers = [_number(value) for value in (values[0], spread, *values[1:])]
-        counts = [str(len(means)), str(count)]
+    def row(self, region: str, count: int) -> dict[str, str]:
+        """The row of the CSV file: of `count` patients, by column."""
+        means, banded = self.figures(region, "mean"), self.figures(region, "covered")
         factor = self.band.factors.get(region) if self.band is not None else None
-        band_cells = [str(len(banded)), *(_number(value) for value in band)]
-        band_cells += ["", ""] if factor is None else [str(factor.n), _number(factor.factor)]
-        return [self.method, region, *counts, *numbers, *band_cells]
+
+        def mean(name: str) -> str:
+            return _number(self.mean(region, name))
+
+        return {
+            "method": self.method,
+            "region": region,
+            "patients": str(len(means)),
+            "of": str(count),
+            "mean_mm": mean("mean"),
+            "sd_between_patients_mm": _number(np.std(means, ddof=1) if len(means) > 1 else None),
+            "p95_mm": mean("p95"),
+            "share_within_2mm": mean("within"),
+            "normal_mm": mean("normal"),
+            "patients_with_band": str(len(banded)),
+            "share_covered": mean("covered"),
+            "half_width_mm": mean("half_width"),
+            "calibration_patients": "" if factor is None else str(factor.n),
+            "standard_deviations": _number(None if factor is None else factor.factor),
+        }
 
 
-def _number(value: float | None) -> str:
+def _number(value: Any) -> str:
     return "" if value is None else f"{value:.6f}"
 
-
-DASH = "–"
 
 ABOUT = (
     "Number of patients whose true skin lies within the band at all vertices of a region; in "
@@ -253,11 +260,6 @@ ABOUT = (
 )
 
 FORMAT = "cmfsim-benchmark"
-COLUMNS = (
-    "method", "region", "patients", "of", "mean_mm", "sd_between_patients_mm", "p95_mm",
-    "share_within_2mm", "normal_mm", "patients_with_band", "share_covered", "half_width_mm",
-    "calibration_patients", "standard_deviations",
-)  # fmt: skip
 IN_SILICO = (
     "In silico: synthetic heads and computed operations, no patients. Each figure is the mean "
     "over patients. The error at a vertex is the length of the difference from its true "
@@ -273,7 +275,7 @@ def band_sections(results: Sequence[MethodResult], far: Sequence[str]) -> list[s
         found = [
             f"## Bands of {COVERAGE:.0%}",
             ABOUT,
-            table(("", *REGIONS), [row for result in banded for row in _rows(result, far)]),
+            _by_region([row for result in banded for row in _rows(result, far)]),
         ]
     for result in results:
         if result.band is not None and not result.band.factors:
@@ -302,7 +304,7 @@ def _rows(result: MethodResult, far: Sequence[str]) -> list[tuple[str, ...]]:
     rows.append((titles["half-width, mm"], *widths))
     if result.band is not None:
         factors = [result.band.factors.get(region) for region in REGIONS]
-        cells = (DASH if f is None else f"{f.factor:.2f} (n = {f.n})" for f in factors)
+        cells = (NOTHING if f is None else f"{f.factor:.2f} (n = {f.n})" for f in factors)
         rows.append((f"{result.method}: standard deviations", *cells))
     return rows
 
@@ -312,7 +314,7 @@ def _covered(result: MethodResult, region: str, names: Sequence[str]) -> str:
     found = [result.scores[name][region].covered for name in names]
     known = [value for value in found if value is not None]
     if not known:
-        return DASH
+        return NOTHING
     text = f"{int(np.count_nonzero(known))} of {len(known)}"
     factor = result.band.factors.get(region) if result.band is not None else None
     if factor is None:
@@ -321,15 +323,14 @@ def _covered(result: MethodResult, region: str, names: Sequence[str]) -> str:
     return f"{text} ({low}–{high})"
 
 
+def _by_region(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells, one for each region after the first."""
+    return Table(("", *REGIONS), rows, numeric=False).markdown
+
+
 def cell(value: float | None, form: str) -> str:
     """A figure in a form, or a dash where there is none."""
-    return DASH if value is None else form.format(value)
-
-
-def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells below their titles."""
-    lines = [titles, ["---"] * len(titles), *rows]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+    return NOTHING if value is None else form.format(value)
 
 
 @dataclass(frozen=True)
@@ -360,12 +361,8 @@ class BenchmarkTable:
 
     def csv(self) -> str:
         """A row for each method and region."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for result in self.results:
-            writer.writerows(result.row(region, len(self.patients)) for region in REGIONS)
-        return text.getvalue()
+        count = len(self.patients)
+        return csv_of([r.row(region, count) for r in self.results for region in REGIONS])
 
     def as_dict(self) -> dict[str, Any]:
         """Every figure of every patient, as plain values."""
@@ -419,7 +416,10 @@ class BenchmarkTable:
         return "\n\n".join([*parts, ""])
 
     def _summary(self) -> str:
-        titles = ("", "patients", "face: mean ± SD, mm", "P95", "< 2 mm", "lips: mean", "P95")
+        titles = (
+            "", "patients", "face: mean ± SD, mm", "P95", "< 2 mm", "lips: mean", "P95",
+            "worse than no change in",
+        )  # fmt: skip
         rows = []
         for result in self.results:
             face = result.figures("face", "mean")
@@ -433,16 +433,17 @@ class BenchmarkTable:
                     cell(result.mean("face", "within"), "{:.0%}"),
                     cell(result.mean(LIPS, "mean"), "{:.2f}"),
                     cell(result.mean(LIPS, "p95"), "{:.2f}"),
+                    self._losses(result.method),
                 )
             )
-        return table((*titles, "worse than no change in"), [(*r, self._losses(r[0])) for r in rows])
+        return Table(titles, rows, numeric=False).markdown
 
     def _losses(self, method: str) -> str:
         """Regions where a method's mean error exceeds that of predicting no change."""
         named = {result.method: result for result in self.results}
         base, found = named.get(NO_CHANGE), named[method]
         if base is None or method == NO_CHANGE:
-            return DASH
+            return NOTHING
         worse = []
         for region in REGIONS:
             both = [
@@ -452,14 +453,14 @@ class BenchmarkTable:
             ]
             if both and np.mean([own - other for own, other in both]) > 0.0:
                 worse.append(region)
-        return ", ".join(worse) or DASH
+        return ", ".join(worse) or NOTHING
 
     def _by_region(self, figure: str, form: str) -> str:
         rows = [
             (result.method, *(cell(result.mean(region, figure), form) for region in REGIONS))
             for result in self.results
         ]
-        return table(("", *REGIONS), rows)
+        return _by_region(rows)
 
     def _missing(self) -> list[str]:
         """Patients missing from the figures."""

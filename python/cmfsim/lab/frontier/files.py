@@ -12,6 +12,7 @@ from cmfsim.io import replacing_files, write_metrics
 from cmfsim.lab.frontier.choice import Choice
 from cmfsim.lab.frontier.rows import SKIN, WHOLE, Frontier, FrontierRow, Spread, unbeaten
 from cmfsim.pictures.charts import write_figure
+from cmfsim.values.table import NOTHING, Table
 
 # Mean error on the skin that a default may have, mm: a tenth of what surgeons can see, and below
 # what a CT resolves.
@@ -21,7 +22,6 @@ TITLES = (
     "mean", "P95", "max", "skin", "build s", "solve s (min–max)", "times base (min–max)", "CPU s",
     "peak MB", "front",
 )  # fmt: skip
-DASH = "–"
 # Told apart in grey too, and by those who see no red or green.
 ELEMENT_COLOURS = {"p1": "#8a5a2b", "anp": "#e0a53f", "p2": "#3f7fb5"}
 KINEMATICS_MARKS = dict(zip(KINEMATICS, "os^Dv<>P", strict=False))
@@ -47,7 +47,7 @@ def frontier_page(found: Frontier) -> str:
                 f"{row.choice.edge_length:g}",
                 row.choice.element,
                 row.choice.kinematics,
-                DASH if row.n_tets is None else str(row.n_tets),
+                NOTHING if row.n_tets is None else str(row.n_tets),
             ),
         ),
         "## One factor at a time",
@@ -104,7 +104,7 @@ def _head(found: Frontier) -> str:
         "maximum; “times base” is taken within each round. CPU and peak memory are those of the "
         "solve. The front: no other choice is both as accurate and as fast.\n\n"
         f"{machine['processor']}, {machine['threads']} threads, "
-        f"cmfsim {machine['cmfsim']}, commit {machine['commit'] or DASH}."
+        f"cmfsim {machine['cmfsim']}, commit {machine['commit'] or NOTHING}."
     )
 
 
@@ -121,40 +121,37 @@ def _table(
     rows: Sequence[FrontierRow],
     first: Callable[[FrontierRow], Sequence[str]],
 ) -> str:
-    head = [*titles, *TITLES]
-    lines = [
-        f"| {' | '.join(head)} |",
-        f"|{'|'.join(['---'] * len(titles) + ['---:'] * len(TITLES))}|",
-    ]
-    lines += [f"| {' | '.join([*first(row), *_figures(row)])} |" for row in rows]
-    return "\n".join(lines)
+    cells = [(*first(row), *_figures(row)) for row in rows]
+    return Table((*titles, *TITLES), cells).markdown
 
 
 def _figures(row: FrontierRow) -> list[str]:
     whole, skin = row.error.get(WHOLE), row.error.get(SKIN)
-    errors = [DASH] * 3 if whole is None else [_mm(v) for v in (whole.mean, whole.p95, whole.max)]
+    errors = (
+        [NOTHING] * 3 if whole is None else [_mm(v) for v in (whole.mean, whole.p95, whole.max)]
+    )
     return [
         *errors,
-        DASH if skin is None else _mm(skin.mean),
-        DASH if row.build_wall is None else f"{row.build_wall:.1f}",
+        NOTHING if skin is None else _mm(skin.mean),
+        NOTHING if row.build_wall is None else f"{row.build_wall:.1f}",
         "failed" if row.failure else _spread(row.solve_wall),
         _spread(row.ratio),
-        DASH if row.solve_cpu is None else f"{row.solve_cpu.median:.2f}",
-        DASH if row.solve_peak is None else f"{row.solve_peak:.0f}",
+        NOTHING if row.solve_cpu is None else f"{row.solve_cpu.median:.2f}",
+        NOTHING if row.solve_peak is None else f"{row.solve_peak:.0f}",
         ("●" if row.on_front else "") + (" base" if row.is_base else ""),
     ]
 
 
 def _regions(rows: Sequence[FrontierRow]) -> str:
     names = list(dict.fromkeys(name for row in rows for name in row.error))
-    lines = [f"| choice | {' | '.join(names)} |", f"|---|{'---:|' * len(names)}"]
+    lines = []
     for row in rows:
-        cells = [_mm(row.error[name].mean) if name in row.error else DASH for name in names]
+        cells = [_mm(row.error[name].mean) if name in row.error else NOTHING for name in names]
         choice = row.choice
         label = f"{choice.element} {choice.kinematics}, {choice.edge_length:g} mm"
         others = [f"{n} {v}" for n, v in choice.changes(rows[0].choice).items() if n not in GRID]
-        lines.append(f"| {', '.join([label, *others])} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append((", ".join([label, *others]), *cells))
+    return Table(("choice", *names), lines).markdown
 
 
 def _mm(value: float) -> str:
@@ -164,7 +161,7 @@ def _mm(value: float) -> str:
 
 def _spread(spread: Spread | None) -> str:
     if spread is None:
-        return DASH
+        return NOTHING
     if spread.count == 1:
         return f"{spread.median:.3g}"
     return f"{spread.median:.3g} ({spread.low:.3g}–{spread.high:.3g})"

@@ -1,7 +1,5 @@
 """The rows of a frontier: choices, their error on points of the skin, their cost; and the front."""
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,6 +15,7 @@ from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
 from cmfsim.values.checks import Floats, as_floats, as_rows
 from cmfsim.values.patient_model import PatientModel
+from cmfsim.values.table import csv_of
 
 Regions = dict[str, NDArray[np.bool_]]
 
@@ -97,15 +96,6 @@ def read_points(path: Path) -> tuple[Floats, Regions]:
 
 # Errors are told apart in steps of this, mm: two methods that solve the same system differ by less.
 ERROR_STEP = 1e-3
-
-
-# Of the CSV file, round the means of the regions.
-ERROR_COLUMNS = ("role", "on_front", "mean_mm", "p95_mm", "max_mm")
-COST_COLUMNS = (
-    "total_wall_s", "build_wall_s", "build_cpu_s", "solve_wall_s", "solve_wall_low_s",
-    "solve_wall_high_s", "solve_cpu_s", "repeats", "ratio", "ratio_low", "ratio_high",
-    "build_peak_mb", "solve_peak_mb", "n_tets", "n_unknowns", "failure",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -256,37 +246,8 @@ class Frontier:
 
     def csv(self) -> str:
         """One line for each row; an error column for each region's mean, mm."""
-        regions = list(dict.fromkeys(name for row in self.rows for name in row.error))
-        names = list(asdict(self.base.choice))
-        means = [f"{name} mean_mm" for name in regions if name != WHOLE]
-        titles = [*names, *ERROR_COLUMNS, *means, *COST_COLUMNS]
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(titles)
-        for row in self.rows:
-            whole = row.error.get(WHOLE)
-            writer.writerow(
-                [
-                    *asdict(row.choice).values(),
-                    "base" if row.is_base else "reference" if row.is_reference else "",
-                    int(row.on_front),
-                    *((whole.mean, whole.p95, whole.max) if whole else ("", "", "")),
-                    *(row.error[n].mean if n in row.error else "" for n in regions if n != WHOLE),
-                    row.total_wall,
-                    row.build_wall,
-                    row.build_cpu,
-                    *_three(row.solve_wall),
-                    row.solve_cpu.median if row.solve_cpu else "",
-                    row.solve_wall.count if row.solve_wall else "",
-                    *_three(row.ratio),
-                    row.build_peak,
-                    row.solve_peak,
-                    row.n_tets,
-                    row.n_unknowns,
-                    row.failure,
-                ]
-            )
-        return text.getvalue()
+        named = dict.fromkeys(name for row in self.rows for name in row.error if name != WHOLE)
+        return csv_of([_csv_row(row, list(named)) for row in self.rows])
 
 
 def with_front(rows: Sequence[FrontierRow]) -> tuple[FrontierRow, ...]:
@@ -302,8 +263,36 @@ def unbeaten(seconds: Sequence[float], errors: Sequence[float]) -> list[bool]:
     return [bool(on) for on in pareto_front(seconds, np.round(np.array(errors) / ERROR_STEP))]
 
 
-def _three(spread: Spread | None) -> tuple[float | str, ...]:
-    return ("", "", "") if spread is None else (spread.median, spread.low, spread.high)
+def _csv_row(row: FrontierRow, regions: Sequence[str]) -> dict[str, Any]:
+    """The choice, errors and cost of a row of the CSV file, by column."""
+    whole = row.error.get(WHOLE)
+    return {
+        **asdict(row.choice),
+        "role": "base" if row.is_base else "reference" if row.is_reference else "",
+        "on_front": int(row.on_front),
+        "mean_mm": whole and whole.mean,
+        "p95_mm": whole and whole.p95,
+        "max_mm": whole and whole.max,
+        **{f"{n} mean_mm": row.error[n].mean if n in row.error else None for n in regions},
+        "total_wall_s": row.total_wall,
+        "build_wall_s": row.build_wall,
+        "build_cpu_s": row.build_cpu,
+        **_spread_columns("solve_wall", "_s", row.solve_wall),
+        "solve_cpu_s": row.solve_cpu and row.solve_cpu.median,
+        "repeats": row.solve_wall and row.solve_wall.count,
+        **_spread_columns("ratio", "", row.ratio),
+        "build_peak_mb": row.build_peak,
+        "solve_peak_mb": row.solve_peak,
+        "n_tets": row.n_tets,
+        "n_unknowns": row.n_unknowns,
+        "failure": row.failure,
+    }
+
+
+def _spread_columns(name: str, unit: str, spread: Spread | None) -> dict[str, float | None]:
+    found = (None,) * 3 if spread is None else (spread.median, spread.low, spread.high)
+    titles = (f"{name}{end}{unit}" for end in ("", "_low", "_high"))
+    return dict(zip(titles, found, strict=True))
 
 
 def pareto_front(first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:

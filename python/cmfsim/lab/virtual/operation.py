@@ -14,7 +14,7 @@ from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import decompose_motion, rigid_motion
-from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.scene import NodeKinds
 
 # Pressure per depth of penetration, MPa/mm: under the pressures of soft tissue (a few kPa), nodes
 # penetrate by less than a tenth of a mm.

@@ -49,9 +49,9 @@ from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, as_index_rows, as_number, as_positive, as_rows
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
-from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import Progress, no_progress
+from cmfsim.values.scene import NodeKinds
 from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 # Where the sum of the distances to both tooth rows is less than the gap of the bite plus this, mm,

@@ -34,7 +34,7 @@ from cmfsim.values.checks import (
 )
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
-from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
+from cmfsim.values.scene import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.touching import LIPS, LipRegion
 

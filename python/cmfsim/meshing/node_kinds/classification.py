@@ -18,8 +18,7 @@ from cmfsim.meshing.node_kinds.options import BORDERS, KindOptions
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats, Indices, as_index_rows, as_point, as_rows, check_instance
 from cmfsim.values.finding import Finding
-from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
-from cmfsim.values.scene import SegmentData
+from cmfsim.values.scene import NODE_KINDS, NodeKinds, SegmentData
 from cmfsim.values.surface_data import SurfaceData, used_nodes
 
 FREE, FIXED, JOINED, SLIDING = range(4)

@@ -11,8 +11,8 @@ from cmfsim.surfaces.depth import distances
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.finding import Finding
-from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.patient_model import LiftedTissue
+from cmfsim.values.scene import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData
 
 # Faces of a cut lie on each other: this close, mm, and facing each other with this cosine.

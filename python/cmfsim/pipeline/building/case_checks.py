@@ -26,9 +26,9 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.landmark_sites import is_for_measures
 from cmfsim.values.mesh_report import MeshReport
 from cmfsim.values.motion import carried
-from cmfsim.values.node_kinds import NodeKinds
 from cmfsim.values.patient_model import LiftedTissue, PatientModel
 from cmfsim.values.proposed_landmarks import ProposedLandmarks
+from cmfsim.values.scene import NodeKinds
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 

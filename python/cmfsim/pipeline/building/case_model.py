@@ -58,10 +58,9 @@ from cmfsim.pipeline.building.tissue.nodes import made_contacts, nodes_of, regio
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
-from cmfsim.values.node_kinds import NODE_KINDS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.progress import expected_stages
-from cmfsim.values.scene import Scene, SegmentData
+from cmfsim.values.scene import NODE_KINDS, Scene, SegmentData
 from cmfsim.values.surface_data import SurfaceData
 
 if TYPE_CHECKING:

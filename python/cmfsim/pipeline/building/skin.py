@@ -29,8 +29,8 @@ from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
-from cmfsim.values.node_kinds import NODE_KINDS, NodeKinds
 from cmfsim.values.patient_model import LiftedTissue
+from cmfsim.values.scene import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData, used_nodes
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 

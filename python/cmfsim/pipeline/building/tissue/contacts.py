@@ -16,7 +16,7 @@ from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
-from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.scene import NodeKinds
 from cmfsim.values.surface_data import MovedSurface, SurfaceData, used_nodes
 
 # Distances from two segments, taken together and relative to the width of a cleft, up to which

@@ -56,7 +56,7 @@ from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.mesh_report import MeshReport
-from cmfsim.values.node_kinds import NodeKinds
+from cmfsim.values.scene import NodeKinds
 from cmfsim.values.surface_data import MovedSurface
 
 Counts = NDArray[np.uint8]
