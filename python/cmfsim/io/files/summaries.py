@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.reading_writing import parsed_json
+from cmfsim.io.files.reading_writing import parsed_json, replacing
 from cmfsim.values.finding import SEVERITIES
 
 # Above these a summary is not what it says it is: bytes, characters of a text, entries of a list.
@@ -126,6 +126,28 @@ def checked_file(folder: Path, summary: Mapping[str, Any], name: str, again: str
             f"{path}: is not the file written with the results in its folder; {again}"
         )
     return path
+
+
+def write_record(path: Path, values: Mapping[str, Any]) -> None:
+    """Writes the record of a finished job, in one step, for `kept_record`.
+
+    Raises `ValueError`: NaN or infinity among the values.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(json.dumps(values, indent=1, allow_nan=False).encode())
+
+
+def kept_record(path: Path, **made_from: object) -> dict[str, Any] | None:
+    """The record of a job that an earlier run finished; None if the job is to be done again.
+
+    made_from: What the record must state of its inputs, by the names in it.
+    """
+    try:
+        found = plain_json(path)
+    except (OSError, ValueError):
+        return None
+    return found if all(found.get(name) == value for name, value in made_from.items()) else None
 
 
 def plain_json(path: Path) -> dict[str, Any]:

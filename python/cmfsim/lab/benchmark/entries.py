@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.errors import CaseInputError, CmfsimError, third_party
 from cmfsim.evaluation import SKIN_LANDMARKS
-from cmfsim.io import replacing
+from cmfsim.io.files.summaries import kept_record, write_record
 from cmfsim.lab.benchmark.patients import (
     BenchmarkPatient,
     SkinPrediction,
@@ -260,7 +260,7 @@ class EntryFolder:
         """Whether a prediction, or its failure, was made from the same, with a band if wanted."""
         file, failure = (self.file(method, patient, ending) for ending in (".npz", FAILURE))
         if failure.exists():
-            return bool(json.loads(failure.read_text("utf-8")).get("made_from") == made_from)
+            return kept_record(failure, made_from=made_from) is not None
         if not file.exists():
             return False
         found = read_skin_prediction(file)
@@ -274,16 +274,13 @@ class EntryFolder:
     def fail(self, method: str, patient: BenchmarkPatient, reason: str, made_from: str) -> None:
         """Records why there is no prediction."""
         self.file(method, patient.name).unlink(missing_ok=True)
-        path = self.file(method, patient.name, FAILURE)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
-            text = json.dumps({"reason": reason, "made_from": made_from}, indent=1)
-            file.write(text.encode())
+        record = {"reason": reason, "made_from": made_from}
+        write_record(self.file(method, patient.name, FAILURE), record)
 
     def reason(self, method: str, patient: str) -> str | None:
         """Why there is no prediction, if that was recorded."""
-        path = self.file(method, patient, FAILURE)
-        return str(json.loads(path.read_text("utf-8"))["reason"]) if path.exists() else None
+        record = kept_record(self.file(method, patient, FAILURE))
+        return None if record is None else str(record["reason"])
 
     def took(self, method: str, patient: str, seconds: float) -> None:
         """Writes the run time of a prediction to a file of its own, as it differs in every run."""

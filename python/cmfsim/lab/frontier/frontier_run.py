@@ -15,6 +15,7 @@ from cmfsim import _core
 from cmfsim.errors import CaseInputError, SolverError
 from cmfsim.io import Case
 from cmfsim.io.files.archives import member_of, read_archive
+from cmfsim.io.files.summaries import kept_record
 from cmfsim.lab.frontier.choice import Choice, case_choice, reference_choice, sweep_choices
 from cmfsim.lab.frontier.rows import (
     WHOLE,
@@ -25,7 +26,7 @@ from cmfsim.lab.frontier.rows import (
     skin_errors,
     with_front,
 )
-from cmfsim.lab.frontier.timing import MOVED_FORMAT, STOPPED, Answer, kept, machine, run_job
+from cmfsim.lab.frontier.timing import MOVED_FORMAT, STOPPED, Answer, machine, run_job
 from cmfsim.pipeline.building.inputs import input_hashes
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.progress import Progress, no_progress
@@ -180,29 +181,34 @@ class _Jobs:
             return
         folder = self.folder / "models" / key
         models = sorted({c.model for c in everyone if c.build_key(self.of) == key})
-        answer = None if self.fresh else kept(folder / "build.json")
-        names = [*(f"{model}.npz" for model in models), "skin.npz"]
-        if answer is None or (
-            "error" not in answer
-            and not (self.points.exists() and all((folder / n).exists() for n in names))
-        ):
-            sampling = f"{choice.samples} samples, {choice.mixing}"
-            muscles = sampling if choice.model.startswith("M") else "no muscles"
-            self.say(f"building at {choice.edge_length:g} mm, {muscles}")
-            answer = run_job(
-                {
-                    "task": "build",
-                    "case": str(self.case.file),
-                    "choice": asdict(choice),
-                    "models": models,
-                    "folder": str(folder),
-                    "points": None if self.points.exists() else str(self.points),
-                    "answer": str(folder / "build.json"),
-                },
-                threads=self.threads,
-                time_limit=self.time_limit,
-            )
-        self.builds[key] = answer
+        made = [folder / name for name in (*(f"{model}.npz" for model in models), "skin.npz")]
+        sampling = f"{choice.samples} samples, {choice.mixing}"
+        muscles = sampling if choice.model.startswith("M") else "no muscles"
+        self.builds[key] = self._answer(
+            f"building at {choice.edge_length:g} mm, {muscles}",
+            folder / "build.json",
+            [self.points, *made],
+            {
+                "task": "build",
+                "case": str(self.case.file),
+                "choice": asdict(choice),
+                "models": models,
+                "folder": str(folder),
+                "points": None if self.points.exists() else str(self.points),
+            },
+        )
+
+    def _answer(self, doing: str, file: Path, made: Sequence[Path], job: Answer) -> Answer:
+        """The answer that an earlier run left in a file, with all that it made, or that of a job.
+
+        doing: What to report when the job is run.
+        """
+        answer = None if self.fresh else kept_record(file)
+        if answer is None or ("error" not in answer and not all(path.exists() for path in made)):
+            self.say(doing)
+            job = {**job, "answer": str(file)}
+            answer = run_job(job, threads=self.threads, time_limit=self.time_limit)
+        return answer
 
     def is_hopeless(self, choice: Choice) -> bool:
         """Whether the same on larger tets was stopped; it is then answered so, and not run."""
@@ -222,23 +228,19 @@ class _Jobs:
         if "error" in built:
             answers.append({"error": f"building: {built['error']}"})
             return answers[-1]
-        file = self.folder / "runs" / f"{choice.key(self.of)}-{number}.json"
-        answer = None if self.fresh else kept(file)
-        if answer is None or ("error" not in answer and not self.moved(choice).exists()):
-            self.say(f"round {number + 1}: solving {_label(choice)}")
-            answer = run_job(
-                {
-                    "task": "solve",
-                    "choice": asdict(choice),
-                    "folder": str(self.folder / "models" / choice.build_key(self.of)),
-                    "points": str(self.points),
-                    "moved": str(self.moved(choice)),
-                    "answer": str(file),
-                    "run": self.run,
-                },
-                threads=self.threads,
-                time_limit=self.time_limit,
-            )
+        answer = self._answer(
+            f"round {number + 1}: solving {_label(choice)}",
+            self.folder / "runs" / f"{choice.key(self.of)}-{number}.json",
+            [self.moved(choice)],
+            {
+                "task": "solve",
+                "choice": asdict(choice),
+                "folder": str(self.folder / "models" / choice.build_key(self.of)),
+                "points": str(self.points),
+                "moved": str(self.moved(choice)),
+                "run": self.run,
+            },
+        )
         if "error" in answer:
             _log.warning("%s: %s", _label(choice), answer["error"])
         answers.append(answer)

@@ -1,6 +1,5 @@
 """Time and memory of one build or one solve, measured in a process of its own; the machine."""
 
-import json
 import os
 import platform
 import shutil
@@ -17,8 +16,9 @@ from numpy.typing import NDArray
 
 from cmfsim._core import __version__
 from cmfsim.errors import CmfsimError
-from cmfsim.io import Case, read_scene, replacing, write_scene
+from cmfsim.io import Case, read_scene, write_scene
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
+from cmfsim.io.files.summaries import write_record
 from cmfsim.lab.frontier.choice import Choice
 from cmfsim.lab.frontier.rows import read_points, skin_points, write_points
 from cmfsim.pipeline.building.case_model import build_model
@@ -157,15 +157,6 @@ def _commit() -> str | None:
     return run_program("git", words, seconds=10.0).stdout.decode().strip() or None
 
 
-def kept(path: Path) -> Answer | None:
-    """The answer of a finished job; None where there is none, or none that can be read."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
 def run_job(job: Mapping[str, Any], *, threads: int | None, time_limit: float) -> Answer:
     """The answer of a job, now in the file that it names: figures, or why there are none.
 
@@ -189,6 +180,5 @@ def run_job(job: Mapping[str, Any], *, threads: int | None, time_limit: float) -
             if ended.code < 0:
                 error = f"killed by signal {-ended.code}; 9 is most often lack of memory"
             answer = {"error": f"{STOPPED} of {time_limit:g} s" if ended.late else error}
-    with replacing(path) as file:
-        file.write(json.dumps(answer).encode())
+    write_record(path, answer)
     return answer

@@ -18,6 +18,7 @@ from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cases.cohorts import COHORT_FORMAT
 from cmfsim.io.files.reading_writing import replacing
+from cmfsim.io.files.summaries import kept_record, write_record
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
 from cmfsim.lab.virtual.population import DRAWN, PATIENTS, VirtualPatient, patient_named
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth, scanned
@@ -249,10 +250,10 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
         text = case_text(patient, {}, COARSER * edge_length, executed=truth.motions)
         (fresh / EXECUTED).write_text(text, encoding="utf-8")
     settings = patient_settings(patient, seed, edge_length, spacing)
-    _write_json(fresh / RECORD, _record(patient, truth, settings))
+    write_record(fresh / RECORD, _record(patient, truth, settings))
     # In a separate file: the record is reproduced to the last byte by the same seed.
     times = {"seconds": time.perf_counter() - begun, "solve_seconds": truth.equilibrium.seconds}
-    _write_json(fresh / TIMES, times)
+    write_record(fresh / TIMES, times)
     shutil.rmtree(folder / TRUTH, ignore_errors=True)
     fresh.rename(folder / TRUTH)
     return folder / "case.toml"
@@ -298,11 +299,6 @@ def _record(
         "truth": _measured(truth),
         "versions": {"cmfsim": __version__, "python": platform.python_version()},
     }
-
-
-def _write_json(path: Path, values: Mapping[str, Any]) -> None:
-    with replacing(path) as file:
-        file.write(json.dumps(values, indent=1, allow_nan=False).encode())
 
 
 def _placed(landmarks: Mapping[str, Floats], noise: float, seed: list[int]) -> dict[str, Floats]:
@@ -438,11 +434,5 @@ def _write_truth(
 
 def is_made(folder: Path, settings: Mapping[str, Any]) -> bool:
     """Whether a complete patient with these settings exists."""
-    record = folder / TRUTH / RECORD
-    if not record.exists() or not (folder / "case.toml").exists():
-        return False
-    try:
-        found = json.loads(record.read_text(encoding="utf-8"))
-    except ValueError:
-        return False
-    return isinstance(found, dict) and found.get("settings") == settings
+    record = kept_record(folder / TRUTH / RECORD, settings=dict(settings))
+    return record is not None and (folder / "case.toml").exists()

@@ -1,6 +1,5 @@
 """A population of drawn patients on disk, made by several processes and resumed where it ended."""
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io import replacing
+from cmfsim.io.files.summaries import kept_record, write_record
 from cmfsim.io.results.populations import (
     FAILED,
     MADE,
@@ -204,11 +204,10 @@ def make_patient(**values: Any) -> tuple[str, str]:
     failure = place / FAILURE
     if is_made(place, settings):
         return "kept", ""
-    if failure.exists():
-        earlier = json.loads(failure.read_text(encoding="utf-8"))
-        if earlier.get("settings") == settings:
-            return "failed", str(earlier["reason"])
-        failure.unlink()
+    earlier = kept_record(failure, settings=settings)
+    if earlier is not None:
+        return "failed", str(earlier["reason"])
+    failure.unlink(missing_ok=True)
     shutil.rmtree(place / TRUTH, ignore_errors=True)
     try:
         write_virtual_patient(
@@ -224,8 +223,6 @@ def make_patient(**values: Any) -> tuple[str, str]:
         # The computer lacks a package: no patient failed, and once it is installed, none is to.
         if isinstance(error.__cause__, ImportError):
             raise
-        found = {"settings": settings, "reason": str(error)}
-        with replacing(failure) as file:
-            file.write(json.dumps(found, indent=1).encode())
+        write_record(failure, {"settings": settings, "reason": str(error)})
         return "failed", str(error)
     return "made", ""

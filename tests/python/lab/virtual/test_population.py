@@ -246,7 +246,7 @@ def test_another_population_is_not_mixed_in(made):
 
 
 def test_a_failure_is_recorded_and_not_tried_again(tmp_path, monkeypatch):
-    """The reason is kept with the settings; other settings are tried anew."""
+    """The reason is kept with the settings; other settings, or a damaged record, are tried."""
     calls = []
 
     def stall(place, patient, **_):
@@ -263,6 +263,9 @@ def test_a_failure_is_recorded_and_not_tried_again(tmp_path, monkeypatch):
     assert calls == ["D004", "D004"]
     record = json.loads((tmp_path / "D004" / "failed.json").read_text(encoding="utf-8"))
     assert record["reason"] == "Newton's method stalls"
+    (tmp_path / "D004" / "failed.json").write_text("{", encoding="utf-8")
+    population_folder.make_patient(**{**job, "edge_length": 8.0})
+    assert calls == ["D004"] * 3
 
 
 def test_a_missing_package_is_no_failure_of_a_patient(tmp_path, monkeypatch):
