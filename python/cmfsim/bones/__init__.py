@@ -5,7 +5,6 @@ from cmfsim.bones.contact_sheets import SheetOptions as SheetOptions
 from cmfsim.bones.contact_sheets import contact_sheet as contact_sheet
 from cmfsim.bones.contact_sheets import sheet_departure as sheet_departure
 from cmfsim.bones.cuts.cutting import CutBones as CutBones
-from cmfsim.bones.cuts.cutting import CutOptions as CutOptions
 from cmfsim.bones.cuts.cutting import cut_bones as cut_bones
 from cmfsim.bones.cuts.cutting import part_segment as part_segment
 from cmfsim.bones.cuts.cutting import segments_from_surfaces as segments_from_surfaces

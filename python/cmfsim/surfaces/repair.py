@@ -15,10 +15,15 @@ from cmfsim.surfaces.checks import (
     thin_triangles,
 )
 from cmfsim.surfaces.topology import component_labels, connected_labels, edges_of, orientation_flips
-from cmfsim.values.checks import Floats, as_number
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.surface_data import SurfaceData, used_nodes
 
+# Vertices closer than this share of the surface's extent are merged: 0.03 µm on a head, less than
+# the resolution of single precision.
+WELD_DISTANCE = 1e-7
+# Pieces with less than this share of the largest piece's area are dropped.
+KEEP_SHARE = 0.01
 # An ear whose area is below this share of the loop's squared extent is cut off only if no other is
 # left: cutting needles first would leave needles behind.
 FLAT_EAR = 1e-9
@@ -32,34 +37,15 @@ class RepairOptions:
 
     Attributes
     ----------
-    weld_distance : float
-        Vertices closer than this share of the surface's extent are merged. 1e-7 is 0.03 µm on a
-        head: less than the resolution of single precision.
-    keep_share : float
-        Pieces with less than this share of the largest piece's area are dropped: 0 keeps all of
-        them, 1 keeps only the largest.
     close_borders : bool
         Whether borders are closed by caps.
     outer_wall : bool
         Whether a large piece inside the largest is dropped: the inner wall of a skin that was saved
         as a shell. Hollows of air are far smaller.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Out of range.
     """
 
-    weld_distance: float = 1e-7
-    keep_share: float = 0.01
     close_borders: bool = True
     outer_wall: bool = False
-
-    def __post_init__(self) -> None:
-        for name, high in (("weld_distance", 0.01), ("keep_share", 1.0)):
-            value = as_number(name, getattr(self, name))
-            if not 0.0 <= value <= high:
-                raise CaseInputError(f"{name} is {value:g}: must be 0 to {high:g}")
 
 
 def clean_surface(surface: SurfaceData) -> SurfaceData:
@@ -121,7 +107,7 @@ def repair_surface(
     vertices = surface.vertices
     triangles = surface.triangles.astype(np.int64)
     check_extent(vertices)
-    vertices, triangles, n_welded = _welded(vertices, triangles, options.weld_distance)
+    vertices, triangles, n_welded = _welded(vertices, triangles)
     if n_welded:
         note(f"{n_welded} vertices were merged with others", "they concealed edges")
     triangles, n_flat, n_again = _without_flat(vertices, triangles)
@@ -131,9 +117,9 @@ def repair_surface(
     if not len(triangles):
         raise CaseInputError(f"{name}: no triangle with an area is left")
 
-    triangles, dropped = _without_debris(vertices, triangles, options.keep_share)
+    triangles, dropped = _without_debris(vertices, triangles)
     if dropped:
-        what = f"{dropped} small pieces are dropped (below {options.keep_share:.0%} of the largest)"
+        what = f"{dropped} small pieces are dropped (below {KEEP_SHARE:.0%} of the largest)"
         note(what, "debris would become islands of bone or skin")
     triangles, n_turned = _outward(vertices, triangles)
     if options.outer_wall:
@@ -219,14 +205,12 @@ def _compact(vertices: Floats, triangles: Integers, crease_angle: float) -> Surf
     return SurfaceData(vertices[used], corners, crease_angle)
 
 
-def _welded(
-    vertices: Floats, triangles: Integers, weld_distance: float
-) -> tuple[Floats, Integers, int]:
+def _welded(vertices: Floats, triangles: Integers) -> tuple[Floats, Integers, int]:
     """Vertices, merged where closer than a share of the extent; the first of each group is kept."""
     if not len(vertices):
         return vertices, triangles, 0
     extent = float((vertices.max(axis=0) - vertices.min(axis=0)).max())
-    distance = weld_distance * extent
+    distance = WELD_DISTANCE * extent
     if distance == 0.0:
         return vertices, triangles, 0
     labels = connected_labels(_near_pairs(vertices, distance), len(vertices))
@@ -319,13 +303,11 @@ def _with_turned_edges(triangles: Integers, flat: Integers, longest: Integers) -
     return triangles
 
 
-def _without_debris(
-    vertices: Floats, triangles: Integers, keep_share: float
-) -> tuple[Integers, int]:
+def _without_debris(vertices: Floats, triangles: Integers) -> tuple[Integers, int]:
     labels = component_labels(edges_of(triangles), len(triangles))
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     areas = np.bincount(labels, weights=0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    keep = areas >= keep_share * areas.max()
+    keep = areas >= KEEP_SHARE * areas.max()
     return triangles[keep[labels]], int((~keep).sum())
 
 

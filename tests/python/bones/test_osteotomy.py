@@ -9,7 +9,7 @@ import pytest
 import cmfsim
 import real_heads
 from benches.scenes.angles import angle_between
-from cmfsim.bones import PROCEDURES, CutOptions
+from cmfsim.bones import PROCEDURES
 from cmfsim.bones.cuts import procedures
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 
@@ -70,9 +70,9 @@ def test_the_cut_lies_on_the_plane_between_voxels(box):
     """Unsmoothed, vertices of the cut face lie on an oblique plane; levels are clipped tightly."""
     tight = box.with_values(np.clip(box.values, -0.3, 0.3))
     plane = cmfsim.CuttingPlane((18.3, 15.2, 13.1), (0.3, 0.2, 1.0))
-    options = CutOptions(surface=SurfaceOptions(smoothing=0))
+    surface = SurfaceOptions(smoothing=0)
     cut = cmfsim.free_cut("mandible", "chin", (plane,))
-    found = cmfsim.cut_bones({"mandible": tight}, [cut], options=options)
+    found = cmfsim.cut_bones({"mandible": tight}, [cut], surface=surface)
     vertices = np.asarray(found["chin"].surface.vertices)
     middle = (np.abs(vertices[:, 0] - 18) < 10) & (np.abs(vertices[:, 1] - 15.5) < 8)
     face = vertices[middle & (vertices[:, 2] < 19)]
@@ -80,7 +80,7 @@ def test_the_cut_lies_on_the_plane_between_voxels(box):
     assert np.abs(plane.distance(face)).max() < 1e-4
 
 
-def test_a_crumb_stays_with_the_bone_that_it_hangs_on():
+def test_a_crumb_stays_with_the_bone_that_it_hangs_on(monkeypatch):
     """A plane through a U leaves two prongs above: the small one joins the rest, and is said."""
     u = np.maximum.reduce(
         [
@@ -98,7 +98,8 @@ def test_a_crumb_stays_with_the_bone_that_it_hangs_on():
     assert np.asarray(found["top"].surface.vertices)[:, 0].max() < 17
     assert volume(found["top"]) == pytest.approx(10 * 10 * 10.5, rel=0.05)
     assert volume(found["mandible"]) == pytest.approx(29 * 100 + 10 * 45 + 6 * 100, rel=0.05)
-    kept = cmfsim.cut_bones({"mandible": level}, [cut], options=CutOptions(crumb_volume=0))
+    monkeypatch.setattr("cmfsim.bones.cuts.cutting.CRUMB_VOLUME", 0.0)
+    kept = cmfsim.cut_bones({"mandible": level}, [cut])
     assert [f.code for f in kept.findings] == ["osteotomy-parts"]
     assert np.asarray(kept["top"].surface.vertices)[:, 0].max() > 33
 
@@ -179,7 +180,6 @@ def test_cuts_that_cannot_be_made_are_named(box):
         (lambda: cmfsim.CuttingPlane((0, 0, np.nan), (0, 0, 1)), "point.* must be finite"),
         (lambda: cmfsim.CuttingPlane((0, 0), (0, 0, 1)), "shape"),
         (lambda: cmfsim.free_cut("mandible", "chin", ()), "without planes"),
-        (lambda: CutOptions(crumb_volume=-1), "crumb_volume is -1"),
         (lambda: SurfaceOptions(max_triangles=10), "max_triangles is 10"),
         (lambda: SurfaceOptions(smoothing=-1), "smoothing is -1"),
         (lambda: cmfsim.procedure_options("le_fort_2"), "use one of le_fort_1"),
@@ -415,8 +415,7 @@ def test_le_fort_bsso_and_genioplasty_together_cut_a_real_head(cut_head):
 def test_le_fort_3_takes_nose_and_zygomas_and_leaves_the_brow(cut_head):
     head, anatomy, points, _ = cut_head
     bones = {"cranium": anatomy.bones["cranium"]}
-    options = CutOptions(surface=UNDECIMATED)
-    found = cmfsim.cut_bones(bones, {"le_fort_3": {}}, landmarks=points, options=options)
+    found = cmfsim.cut_bones(bones, {"le_fort_3": {}}, landmarks=points, surface=UNDECIMATED)
     assert [s.name for s in found.segments] == ["cranium", "midface"]
     volume(found["midface"])
     surfaces = {
@@ -439,9 +438,8 @@ def test_le_fort_3_takes_nose_and_zygomas_and_leaves_the_brow(cut_head):
 def test_le_fort_1_inside_le_fort_3_makes_three_pieces():
     anatomy, points = real_heads.anatomy("ct_phantom"), real_heads.landmarks("ct_phantom")
     bones = {"cranium": anatomy.bones["cranium"]}
-    options = CutOptions(surface=UNDECIMATED)
     plan = {"le_fort_1": {}, "le_fort_3": {}}
-    found = cmfsim.cut_bones(bones, plan, landmarks=points, options=options)
+    found = cmfsim.cut_bones(bones, plan, landmarks=points, surface=UNDECIMATED)
     assert [s.name for s in found.segments] == ["cranium", "midface", "maxilla"]
 
 
@@ -458,9 +456,8 @@ def test_the_lower_jaw_stays_where_the_maxilla_is_cut_from_joined_jaws(head):
     anatomy, points = real_heads.anatomy(head), real_heads.landmarks(head)
     cranium, mandible = anatomy.bones["cranium"], anatomy.bones["mandible"]
     joined = cranium.with_values(np.maximum(cranium.values, mandible.values))
-    options = CutOptions(surface=UNDECIMATED)
     found, parted = (
-        cmfsim.cut_bones(bones, {"le_fort_1": {}}, landmarks=points, options=options)
+        cmfsim.cut_bones(bones, {"le_fort_1": {}}, landmarks=points, surface=UNDECIMATED)
         for bones in ({"skull": joined}, {"cranium": cranium})
     )
     assert "cut-of-joined-jaws" in {finding.code for finding in found.findings}

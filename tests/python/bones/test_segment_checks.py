@@ -10,7 +10,7 @@ import pytest
 
 import cmfsim
 import phantom_case
-from cmfsim.bones import CutOptions, check_segments
+from cmfsim.bones import check_segments
 from cmfsim.io import Case
 from cmfsim.pipeline.building import case_checks
 from cmfsim.pipeline.building.case_model import build_model
@@ -114,9 +114,9 @@ def test_a_decimator_that_exchanges_meshes_ends_the_cut(head, truth, monkeypatch
         return real(*first[0])
 
     monkeypatch.setattr(surfaces._core, "decimated", exchanged)
-    options = CutOptions(surface=surfaces.SurfaceOptions(max_triangles=1000))
+    surface = surfaces.SurfaceOptions(max_triangles=1000)
     with pytest.raises(cmfsim.CaseError, match=r"same surface|is not that of its bone"):
-        cmfsim.cut_bones(truth.bones, PLAN, landmarks=head.skull_landmarks, options=options)
+        cmfsim.cut_bones(truth.bones, PLAN, landmarks=head.skull_landmarks, surface=surface)
 
 
 def test_a_level_and_a_ready_surface_of_another_bone_are_an_error(cut):

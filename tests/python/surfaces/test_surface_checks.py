@@ -303,12 +303,13 @@ def test_a_sound_surface_is_left_as_it_is():
     assert np.array_equal(repaired.triangles, triangles)
 
 
-def test_nearly_equal_vertices_are_welded():
+def test_nearly_equal_vertices_are_welded(monkeypatch):
     """Every triangle with corners of its own, a little apart, becomes a closed sphere."""
     vertices, triangles = sphere()
     rng = np.random.default_rng(3)
     loose = vertices[triangles].reshape(-1, 3) + rng.uniform(-1e-6, 1e-6, (3 * len(triangles), 3))
-    repaired, codes = repair(loose, np.arange(len(loose)).reshape(-1, 3), weld_distance=1e-6)
+    monkeypatch.setattr("cmfsim.surfaces.repair.WELD_DISTANCE", 1e-6)
+    repaired, codes = repair(loose, np.arange(len(loose)).reshape(-1, 3))
     assert codes == ["surface-repaired"]
     assert len(repaired.vertices) == len(vertices)
     assert cmfsim.check_surface(repaired).is_closed
@@ -344,14 +345,15 @@ def test_hollows_stay_hollow_and_neighbours_are_turned():
 
 
 def test_debris_is_dropped_by_its_share():
-    """A hundredth of the area goes; the options keep it, or the largest alone."""
+    """A quarter of a hundredth of the area goes; a hundredth and a half stays."""
     vertices, triangles = sphere()
     both = np.concatenate([vertices, vertices * 0.05 + [200, 0, 0]])
     pieces = np.concatenate([triangles, triangles + len(vertices)])
     repaired, codes = repair(both, pieces)
     assert codes == ["surface-repaired"]
     assert len(repaired.triangles) == len(triangles)
-    assert len(repair(both, pieces, keep_share=0.0)[0].triangles) == len(pieces)
+    both[len(vertices) :] = vertices * 0.12 + [200, 0, 0]
+    assert len(repair(both, pieces)[0].triangles) == len(pieces)
 
 
 @pytest.mark.parametrize("height", [-0.9, -0.3, 0.6])
@@ -393,7 +395,7 @@ def test_a_cap_fills_a_polygon_with_reflex_corners():
         assert {(int(q), int(p)) for p, q in zip(loop, np.roll(loop, -1), strict=True)} <= runs
 
 
-def test_a_flat_triangle_is_removed_without_a_slit():
+def test_a_flat_triangle_is_removed_without_a_slit(monkeypatch):
     """A needle is drawn together; a corner on an edge cuts the triangle across in two."""
     vertices, triangles = sphere(2)
     a, b, c = triangles[0]
@@ -401,9 +403,10 @@ def test_a_flat_triangle_is_removed_without_a_slit():
     point[a] = point[b] + 1e-13 * (point[a] - point[b])
     edge = vertices.copy()
     edge[a] = 0.4 * edge[b] + 0.6 * edge[c]
+    monkeypatch.setattr("cmfsim.surfaces.repair.WELD_DISTANCE", 0.0)
     for spoilt in (point, edge):
         assert len(check(spoilt, triangles).degenerate) > 0
-        repaired, codes = repair(spoilt, triangles, weld_distance=0.0)
+        repaired, codes = repair(spoilt, triangles)
         report = cmfsim.check_surface(repaired)
         assert codes == ["surface-repaired"]
         assert report.is_closed
@@ -415,8 +418,6 @@ def test_nothing_left_is_an_error():
     """Triangles without area alone."""
     with pytest.raises(cmfsim.CaseError, match="it: no triangle with an area"):
         repair([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]])
-    with pytest.raises(cmfsim.CaseError, match="keep_share is 2: must be 0 to 1"):
-        cmfsim.RepairOptions(keep_share=2)
 
 
 # Real anatomy.

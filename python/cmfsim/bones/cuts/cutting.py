@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -17,7 +17,7 @@ from cmfsim.errors import CaseInputError, third_party
 from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import SurfaceOptions, block_of, surface_of_level
 from cmfsim.values.anatomy import BoneSegment
-from cmfsim.values.checks import Floats, as_number, check_instance
+from cmfsim.values.checks import Floats, check_instance
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
@@ -31,30 +31,15 @@ LEAST_VOLUME = 100.0
 Levels = NDArray[np.float32]
 # The upper jaw's cuts come before the lower's, the larger piece before the one inside it.
 ORDER = {"le_fort_3": 0, "le_fort_1": 1, "bsso": 2, "genioplasty": 3}
+# A fragment smaller than this, mm³, that a cut separates from its segment stays with the segment on
+# the other side of the cut, to which it is connected.
+CRUMB_VOLUME = 500.0
 # Half-width of the block of voxels that is transferred with a fragment.
 CRUMB_RIM = 2
 # Edge of the blocks in which distances from planes are measured, voxels.
 BLOCK = 24
 # Number of surfaces made concurrently.
 SURFACES_AT_ONCE = 2
-
-
-@dataclass(frozen=True)
-class CutOptions:
-    """Options of cutting bones.
-
-    crumb_volume: mm³. A fragment smaller than this that a cut separates from its segment is
-        assigned to the segment on the other side of the cut, to which it is still connected.
-    Raises `CaseError`: A negative volume.
-    """
-
-    crumb_volume: float = 500.0
-    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
-
-    def __post_init__(self) -> None:
-        if as_number("crumb_volume", self.crumb_volume) < 0.0:
-            raise CaseInputError(f"crumb_volume is {self.crumb_volume:g} mm³: 0 or more is needed")
-        check_instance("surface", self.surface, SurfaceOptions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +72,7 @@ def cut_bones(
     procedures: Sequence[Procedure] | Mapping[str, Mapping[str, float]] = (),
     *,
     landmarks: Mapping[str, ArrayLike] | None = None,
-    options: CutOptions | None = None,
+    surface: SurfaceOptions | None = None,
 ) -> CutBones:
     """The segments into which osteotomies cut the bones.
 
@@ -99,7 +84,7 @@ def cut_bones(
         Standard procedures are applied from top to bottom, then the others in their order.
     landmarks : mapping of str to (3,) float64, mm, optional
         Skull landmarks, LPS; needed where procedures are given by name.
-    options : CutOptions, optional
+    surface : SurfaceOptions, optional
 
     Raises
     ------
@@ -127,7 +112,6 @@ def cut_bones(
     >>> [s.name for s in cmfsim.cut_bones({"mandible": ball}, [cut]).segments]
     ['mandible_body', 'chin']
     """
-    options = options or CutOptions()
     if not bones:
         raise CaseInputError("there is no bone to cut")
     for name, level in bones.items():
@@ -144,9 +128,9 @@ def cut_bones(
     grid = next(iter(bones.values()))
     for procedure in placed:
         for cut in procedure.cuts:
-            _make_cut(procedure, cut, grid, pieces, findings=findings, options=options)
+            _make_cut(procedure, cut, grid, pieces, findings=findings)
     levels = {name: grid.with_values(values) for name, values in pieces.items()}
-    return CutBones(_checked_segments(levels, options.surface), placed, tuple(findings))
+    return CutBones(_checked_segments(levels, surface), placed, tuple(findings))
 
 
 def _checked_segments(
@@ -224,7 +208,6 @@ def _make_cut(
     pieces: dict[str, Levels],
     *,
     findings: list[Finding],
-    options: CutOptions,
 ) -> None:
     source, rest_name = _names_of_cut(procedure, cut, pieces)
     if source == "skull" and cut.joined is not None:
@@ -258,7 +241,7 @@ def _make_cut(
                 f"(planes: {planes}): check the landmarks, or move the planes"
             )
     for one, other, both in ((piece, rest, names), (rest, piece, names[::-1])):
-        moved, kept = _join_crumbs(one, other, bone, limit, int(options.crumb_volume / voxel))
+        moved, kept = _join_crumbs(one, other, bone, limit, int(CRUMB_VOLUME / voxel))
         volumes = ([n * voxel for n in moved], [n * voxel for n in kept])
         findings.extend(_fragment_findings(procedure.kind, both, *volumes))
     # Clipped beyond the box.
@@ -303,7 +286,7 @@ def _fragment_findings(
             severity="note",
             where=kind,
             why="they would move with a bone to which they are not connected",
-            fix="move the planes, or lower crumb_volume",
+            fix="move the planes",
         )
     if kept:
         yield Finding(

@@ -35,6 +35,9 @@ SIZED_POINTS = 1500
 # The search has converged when a step moves no point by more than this share of the segment's size,
 # some micrometres: below it, a bone of another size only swaps partners, and a robust fit follows.
 REST = 1e-4
+# At the end, the largest RMS distance of the partners, mm, and the least share of the vertices that
+# have one: a worse fit is an error.
+MAX_RMS, LEAST_SHARE = 1.0, 0.3
 MOST_STEPS = 300
 
 
@@ -53,10 +56,6 @@ class MatchOptions:
     max_angle : float, degrees
         Largest angle between normals of partners: prevents matching the inner to the outer side of
         a bone.
-    max_rms : float, mm
-        RMS distance of the partners at the end; a worse fit is an error.
-    least_share : float
-        Share of the vertices that must have a partner at the end.
 
     Raises
     ------
@@ -73,20 +72,13 @@ class MatchOptions:
     trim: float = 0.3
     reach: float = 6.0
     max_angle: float = 60.0
-    max_rms: float = 1.0
-    least_share: float = 0.3
 
     def __post_init__(self) -> None:
-        for name in ("max_angle", "max_rms"):
-            as_positive(name, getattr(self, name))
+        as_positive("max_angle", self.max_angle)
         if as_number("reach", self.reach) < 0.0:
             raise RegistrationInputError(f"reach is {self.reach:g} mm: must not be below 0")
         if not 0.0 <= as_number("trim", self.trim) < 1.0:
             raise RegistrationInputError(f"trim is {self.trim:g}: must be from 0 to below 1")
-        if not 0.0 < as_number("least_share", self.least_share) <= 1.0:
-            raise RegistrationInputError(
-                f"least_share is {self.least_share:g}: must be above 0, to 1"
-            )
 
 
 def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions) -> ShapeFit:
@@ -113,11 +105,11 @@ def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions
             f"segment {name!r} cannot be registered to the post-operative bone: {error}"
         ) from error
     share = float(fit.kept.mean())
-    if fit.rms > options.max_rms or share < options.least_share:
+    if fit.rms > MAX_RMS or share < LEAST_SHARE:
         raise RegistrationError(
             f"segment {name!r} does not fit the post-operative bone: {fit.rms:.2f} mm rms over "
-            f"{share:.0%} of its vertices, at the best size (allowed {options.max_rms:g} mm, at "
-            f"least {options.least_share:.0%}); check that the scans are aligned, that the "
+            f"{share:.0%} of its vertices, at the best size (allowed {MAX_RMS:g} mm, at "
+            f"least {LEAST_SHARE:.0%}); check that the scans are aligned, that the "
             "segment is cut as it was in the operation, and that the scan shows the whole bone; "
             "a larger trim ignores plates and new bone"
         )

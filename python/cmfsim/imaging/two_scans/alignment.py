@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import rigid_matrix
 from cmfsim.errors import BoundaryError, RegistrationError, RegistrationInputError
 from cmfsim.imaging.morphology import Mask, as_itk, box_of, resampled_to, simpleitk, smoothed
-from cmfsim.values.checks import Floats, as_number, as_positive, check_instance
+from cmfsim.values.checks import Floats, as_positive, check_instance
 from cmfsim.values.image_data import ImageData
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -35,6 +35,14 @@ LEAST_GRADIENT = 1e-9
 
 _LOG = logging.getLogger(__name__)
 
+# Bins of the joint histogram along each axis, and the seed of the points.
+BINS, SEED = 48, 1
+# Steps at each resolution.
+MOST_STEPS = 300
+# At the end, the share of the mask in the moving volume, and the correlation of both volumes over
+# it. Scans of one head reach 0.9; of two heads, or at a wrong place, 0.3.
+LEAST_OVERLAP = LEAST_SIMILARITY = 0.5
+
 # Values outside these shares of the voxels, %, (metal, noise) would spend the histogram's bins.
 CLIPPED = (0.2, 99.8)
 
@@ -49,16 +57,6 @@ class AlignmentOptions:
         Voxel sizes, coarse to fine. Starts further away than ten of the first may fail.
     samples : int
         Points of the mask that the metric is taken over, at random places (Mattes et al. 2003).
-    bins : int
-        Of the joint histogram, along each axis.
-    max_iterations : int
-        At each resolution.
-    least_overlap : float
-        Share of the mask that must lie in the moving volume at the end.
-    least_similarity : float
-        Correlation of both volumes over the mask that is needed at the end. Scans of one head reach
-        0.9; of two heads, or at a wrong place, 0.3.
-    seed : int
 
     Raises
     ------
@@ -74,11 +72,6 @@ class AlignmentOptions:
 
     resolutions: tuple[float, ...] = (6.0, 3.0, 1.5)
     samples: int = 60_000
-    bins: int = 48
-    max_iterations: int = 300
-    least_overlap: float = 0.5
-    least_similarity: float = 0.5
-    seed: int = 0
 
     def __post_init__(self) -> None:
         sizes = tuple(as_positive("resolution", s) for s in self.resolutions)
@@ -87,17 +80,11 @@ class AlignmentOptions:
                 f"resolutions are {sizes} mm: give at least one, each finer than the last"
             )
         object.__setattr__(self, "resolutions", sizes)
-        for name, least in (("samples", 1000), ("bins", 8), ("max_iterations", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-                raise RegistrationInputError(
-                    f"{name} is {value!r}: a whole number of at least {least} is needed"
-                )
-        for name in ("least_overlap", "least_similarity"):
-            if not 0.0 <= as_number(name, getattr(self, name)) <= 1.0:
-                raise RegistrationInputError(
-                    f"{name} is {getattr(self, name):g}: must be from 0 to 1"
-                )
+        count = self.samples
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1000:
+            raise RegistrationInputError(
+                f"samples is {count!r}: a whole number of at least 1000 is needed"
+            )
 
 
 class Places:
@@ -177,39 +164,24 @@ def align(
         )
     with _one_thread():
         return _descend(
-            transform,
-            moving,
-            fixed,
-            mask,
-            size=size,
-            options=options,
-            share=options.samples / count,
-            places=places,
+            transform, moving, fixed, mask, size=size, share=options.samples / count, places=places
         )
 
 
 def _descend(
-    transform: Any,
-    moving: Any,
-    fixed: Any,
-    mask: Any,
-    *,
-    size: float,
-    options: AlignmentOptions,
-    share: float,
-    places: Places,
+    transform: Any, moving: Any, fixed: Any, mask: Any, *, size: float, share: float, places: Places
 ) -> tuple[int, float]:
     """Goes down the metric until the step is too small to matter."""
     method = simpleitk().ImageRegistrationMethod()
-    method.SetMetricAsMattesMutualInformation(options.bins)
+    method.SetMetricAsMattesMutualInformation(BINS)
     method.SetMetricFixedMask(mask)
     method.SetMetricSamplingStrategy(method.RANDOM)
-    method.SetMetricSamplingPercentage(min(1.0, share), int(options.seed) + 1)
+    method.SetMetricSamplingPercentage(min(1.0, share), SEED)
     method.SetInterpolator(simpleitk().sitkLinear)
     method.SetOptimizerAsRegularStepGradientDescent(
         learningRate=FIRST_STEP * size,
         minStep=LAST_STEP * size,
-        numberOfIterations=options.max_iterations,
+        numberOfIterations=MOST_STEPS,
         relaxationFactor=RELAXATION,
         gradientMagnitudeTolerance=LEAST_GRADIENT,
     )
@@ -226,9 +198,8 @@ def _descend(
     reason = method.GetOptimizerStopConditionDescription()
     if "Maximum number" in reason:
         raise RegistrationError(
-            f"the registration did not converge at {size:g} mm within {options.max_iterations} "
-            "steps; start closer with `initial`, use a mask that shows the same bone in both, or "
-            "raise max_iterations"
+            f"the registration did not converge at {size:g} mm within {MOST_STEPS} steps; start "
+            "closer with `initial`, or use a mask that shows the same bone in both"
         )
     return steps, -float(method.GetMetricValue())
 
@@ -374,16 +345,16 @@ def register_volumes(
         _LOG.info("alignment at %g mm: %d steps, %.4f nats", size, steps, information)
     to_moving = matrix_of(transform)
     similarity, overlap = _agreement(to_moving, moving, fixed, places, options)
-    if overlap < options.least_overlap:
+    if overlap < LEAST_OVERLAP:
         raise RegistrationError(
             f"only {overlap:.0%} of the mask lies in the moving volume (correlation there "
-            f"{similarity:.2f}): at least {options.least_overlap:.0%} is needed; bring the "
+            f"{similarity:.2f}): at least {LEAST_OVERLAP:.0%} is needed; bring the "
             "volumes closer with `initial`, or restrict the mask to what both scans show"
         )
-    if similarity < options.least_similarity:
+    if similarity < LEAST_SIMILARITY:
         raise RegistrationError(
             f"the volumes do not match after registration: correlation {similarity:.2f}, needed "
-            f"{options.least_similarity:g}; start closer with `initial`, mask out what was "
+            f"{LEAST_SIMILARITY:g}; start closer with `initial`, mask out what was "
             "moved, and check that both show the same person"
         )
     return VolumeAlignment(inverse(to_moving), information, similarity, overlap, tuple(iterations))

@@ -19,6 +19,8 @@ _log = logging.getLogger(__name__)
 
 # Forces below this share of shear modulus times the body's size squared are rounding errors.
 LEAST_FORCE = 1e-9
+# Newton iterations in a step at most.
+MOST_ROUNDS = 60
 # Number of times that a step is halved before the search fails.
 HALVINGS = 12
 # Share of the decrease predicted by the slope that a step must achieve (Armijo 1966).
@@ -75,17 +77,15 @@ class EquilibriumOptions:
     tolerance: Largest residual at the end: the norm of the forces on free nodes, relative to the
         largest norm of the forces on held nodes so far.
     loose: The same at the end of all other steps.
-    most_rounds: Maximum number of Newton iterations in a step.
     """
 
     steps: int = 2
     tolerance: float = 5e-4
     loose: float = 0.03
-    most_rounds: int = 60
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.most_rounds < 1:
-            raise CaseInputError("steps and most_rounds: 1 or more are needed")
+        if self.steps < 1:
+            raise CaseInputError(f"steps is {self.steps!r}: 1 or more are needed")
         if not 0.0 < self.tolerance <= self.loose < 1.0:
             raise CaseInputError("tolerance and loose: 0 < tolerance ≤ loose < 1 is needed")
 
@@ -210,7 +210,7 @@ class _Search:
         """The residual that Newton's method with a line search reaches."""
         energy = self._energy(self.u, part)
         convex = 0
-        for _ in range(self.options.most_rounds):
+        for _ in range(MOST_ROUNDS):
             forces, added = self._forces(self.u, part)
             right = -forces[self.free]
             hold = float(np.linalg.norm(forces[self.held]))
@@ -248,7 +248,7 @@ class _Search:
                 float(np.linalg.norm(self.last_step, axis=1).max()),
             )
         raise SolverError(
-            f"after {self.options.most_rounds} Newton iterations at {part:.0%} of the motion the "
+            f"after {MOST_ROUNDS} Newton iterations at {part:.0%} of the motion the "
             f"residual is {residual:.1e} ({tolerance:.0e} is needed)"
         )
 
