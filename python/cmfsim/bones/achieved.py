@@ -30,6 +30,7 @@ from cmfsim.values.checks import (
     check_instance,
     check_one_of,
     frozen,
+    plain,
 )
 from cmfsim.values.motion import RigidMotion, carried, decompose_motion, rigid_matrix
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
@@ -128,12 +129,9 @@ class AchievedMotion(Frozen):
             "median_mm": self.median,
             "p95_mm": self.p95,
             "share": self.share,
-            "removed": [
-                {"area_mm2": p.area, "depth_mm": p.depth, "place_mm": p.place.tolist()}
-                for p in self.removed
-            ],
-            "stray": [patch.as_dict() for patch in self.stray],
-            **({"pieces": [piece.as_dict() for piece in self.pieces]} if self.pieces else {}),
+            "removed": plain(self.removed),
+            "stray": plain(self.stray),
+            **({"pieces": plain(self.pieces)} if self.pieces else {}),
             **({} if self.fit is None else {"shape": self.fit.as_dict(), "slip_mm": self.slip}),
         }
 
@@ -170,7 +168,7 @@ class AchievedPlan(Frozen):
                 "angle_degrees": self.correction.angle,
             }
         return {
-            "segments": {name: motion.as_dict() for name, motion in self.motions.items()},
+            "segments": plain(self.motions),
             "alignment": self.alignment.tolist(),
             "correction": correction,
         }

@@ -6,7 +6,7 @@ neighbouring vertices move apart, and the triangles between them are torn: they 
 together across the cut, `coherent_motion` finds the pieces.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from cmfsim._core import Surface, SurfaceMotion, rigid_fit
 from cmfsim.errors import BoundaryInputError, RegistrationError
 from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
 from cmfsim.surfaces.topology import connected_labels, edges_of
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, Plain, in_files
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface, SurfaceData, used_nodes
 
@@ -43,7 +43,7 @@ Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class RemovedBone:
+class RemovedBone(Plain):
     """A patch of bone that is missing after the operation.
 
     area: mm², of the surface before.
@@ -53,10 +53,10 @@ class RemovedBone:
     vertices: (n,) int64, of the surface before, that lie in the patch.
     """
 
-    area: float
-    depth: float
-    place: Floats
-    vertices: Integers
+    area: float = field(metadata=in_files("area_mm2"))
+    depth: float = field(metadata=in_files("depth_mm"))
+    place: Floats = field(metadata=in_files("place_mm"))
+    vertices: Integers = field(metadata=in_files(None))
 
 
 def sound_motion(motion: MovedSurface) -> MovedSurface:

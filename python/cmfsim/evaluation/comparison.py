@@ -21,6 +21,7 @@ from cmfsim.values.checks import (
     brief,
     check_one_of,
     frozen,
+    plain,
 )
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
@@ -180,10 +181,10 @@ class SkinComparison:
         return {
             "method": self.method,
             "prediction_to_postoperative": self.statistics.as_dict(),
-            "postoperative_to_prediction": self.backward.as_dict() if self.backward else None,
-            "symmetric": self.symmetric.as_dict() if self.symmetric else None,
+            "postoperative_to_prediction": plain(self.backward),
+            "symmetric": plain(self.symmetric),
             "hausdorff_mm": self.hausdorff,
-            "regions": {name: s.as_dict() for name, s in self.regions.items()},
+            "regions": plain(self.regions),
             "evaluated_share_of_area": self.share,
             "excluded": {
                 "masked": self.n_masked,

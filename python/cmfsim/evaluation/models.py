@@ -20,7 +20,7 @@ from cmfsim.evaluation.statistics import (
     wilcoxon_test,
 )
 from cmfsim.surfaces.depth import moved_outward
-from cmfsim.values.checks import Floats, as_rows, as_text, brief, check_one_of, frozen
+from cmfsim.values.checks import Floats, as_rows, as_text, brief, check_one_of, frozen, plain
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
 from cmfsim.values.table import NOTHING, Table, csv_of
@@ -115,16 +115,10 @@ class ModelComparison:
         """Plain values with units in their names, as JSON holds them; no arrays, no tests."""
         return {
             "n_common_vertices": len(self.vertices),
-            "models": {name: s.as_dict() for name, s in self.statistics.items()},
-            "regions": {
-                region: {name: s.as_dict() for name, s in table.items()}
-                for region, table in self.regions.items()
-            },
-            "improvements": {
-                name: {region: i.as_dict() for region, i in table.items()}
-                for name, table in self.improvements.items()
-            },
-            "comparisons": {name: c.as_dict() for name, c in self.comparisons.items()},
+            "models": plain(self.statistics),
+            "regions": plain(self.regions),
+            "improvements": plain(self.improvements),
+            "comparisons": plain(self.comparisons),
         }
 
 

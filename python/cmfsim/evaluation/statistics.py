@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError, third_party
-from cmfsim.values.checks import Floats, as_floats, check_one_of
+from cmfsim.values.checks import Floats, Plain, as_floats, check_one_of, in_files, plain
 
 PAIRED_BY = ("vertex", "patient")
 CAVEATS = {
@@ -34,7 +34,7 @@ LENGTHS = ("mean", "std", "median", "rms", "p90", "p95", "max", "signed_mean", "
 
 
 @dataclass(frozen=True)
-class PairedTest:
+class PairedTest(Plain):
     """The outcome of a Wilcoxon signed-rank test (Wilcoxon 1945).
 
     Attributes
@@ -62,15 +62,13 @@ class PairedTest:
     n_equal: int
     statistic: float
     p: float
-    median_difference: float
+    median_difference: float = field(metadata=in_files("median_difference_mm"))
     effect: float
     caveat: str
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values with their unit in the name, as JSON holds them."""
-        renamed = {"median_difference": "median_difference_mm"}
-        values = {renamed.get(name, name): value for name, value in asdict(self).items()}
-        return {"test": "Wilcoxon signed-rank, two-sided", **values}
+        return {"test": "Wilcoxon signed-rank, two-sided", **super().as_dict()}
 
 
 def wilcoxon_test(first: ArrayLike, second: ArrayLike, *, by: str = "vertex") -> PairedTest:
@@ -172,9 +170,9 @@ class PairedChange:
             "first_mm": self.first,
             "second_mm": self.second,
             "change_mm": self.change,
-            "interval_mm": None if self.interval is None else list(self.interval),
+            "interval_mm": plain(self.interval),
             "n_better": self.n_better,
-            "test": None if self.test is None else self.test.as_dict(),
+            "test": plain(self.test),
         }
 
 

@@ -5,15 +5,14 @@ and the face after is in every other figure of an evaluation too, and belongs to
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.comparison import SkinComparison, compare_skins
-from cmfsim.values.checks import Floats, as_floats
+from cmfsim.values.checks import Floats, Plain, as_floats, in_files
 from cmfsim.values.surface_data import SurfaceData
 
 # What every model moves by less than this stays, mm: far below the noise of a scan.
@@ -25,7 +24,7 @@ MOST_CHANGE = 0.5
 
 
 @dataclass(frozen=True)
-class ThicknessChange:
+class ThicknessChange(Plain):
     """The change of the soft tissue's thickness, as one fraction of its depth.
 
     share: Of the depth; negative where it became thinner.
@@ -34,21 +33,11 @@ class ThicknessChange:
     before, after: mm. Mean |distance| there without and with the change.
     """
 
-    share: float
-    n: int
-    depth: float
-    before: float
-    after: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
-        return {
-            "share_of_depth": self.share,
-            "vertices": self.n,
-            "mean_depth_mm": self.depth,
-            "mean_before_mm": self.before,
-            "mean_after_mm": self.after,
-        }
+    share: float = field(metadata=in_files("share_of_depth"))
+    n: int = field(metadata=in_files("vertices"))
+    depth: float = field(metadata=in_files("mean_depth_mm"))
+    before: float = field(metadata=in_files("mean_before_mm"))
+    after: float = field(metadata=in_files("mean_after_mm"))
 
 
 def compare_unmoved(

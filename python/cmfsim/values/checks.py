@@ -9,7 +9,7 @@ import copyreg
 import difflib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from types import MappingProxyType
 from typing import Any, cast
 
@@ -32,6 +32,37 @@ class Frozen:
         """Takes the fields as they were, arrays read-only."""
         for name, value in state.items():
             object.__setattr__(self, name, _read_only(value))
+
+
+class Plain:
+    """Base of values that JSON holds, field by field."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values with units in their names, as JSON holds them."""
+        return _plain_fields(self)
+
+
+def in_files(name: str | None) -> Mapping[str, str | None]:
+    """The metadata of a field that JSON holds under another name, with its unit; None: not held."""
+    return {"in_files": name}
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON holds it: with lists, and dictionaries for mappings and other values."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    if hasattr(value, "as_dict"):
+        return value.as_dict()
+    return _plain_fields(value) if is_dataclass(value) else value
+
+
+def _plain_fields(value: Any) -> dict[str, Any]:
+    names = {f.name: f.metadata.get("in_files", f.name) for f in fields(value)}
+    return {name: plain(getattr(value, own)) for own, name in names.items() if name is not None}
 
 
 def keep(value: object, **made: Any) -> None:

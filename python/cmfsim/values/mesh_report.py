@@ -1,15 +1,17 @@
 """The quality of a mesh: shapes, volume and boundary, as plain values and as lines of text."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
+
+from cmfsim.values.checks import Plain
 
 # Bins of the histogram of smallest dihedral angles, degrees; a regular tet has 70.5.
 BINS = tuple(float(angle) for angle in range(0, 80, 5))
 
 
 @dataclass(frozen=True)
-class MeshReport:
+class MeshReport(Plain):
     """The quality of a mesh.
 
     Attributes
@@ -51,10 +53,6 @@ class MeshReport:
     dropped_parts: int = 0
     dropped_volume: float = 0.0
     dropped_tets: int = 0
-
-    def as_dict(self) -> dict[str, Any]:
-        """The report as plain values, ready for JSON."""
-        return asdict(self)
 
     def as_text(self) -> str:
         """The report as lines for a terminal."""

@@ -1,12 +1,12 @@
 """Moduli of fat and muscle: those of the presets, and what a case or a caller sets instead."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from cmfsim._core import Tissue
 from cmfsim.errors import MaterialError, MaterialInputError
-from cmfsim.values.checks import as_number, as_text, check_instance, keep
+from cmfsim.values.checks import Plain, as_number, as_text, check_instance, keep
 from cmfsim.values.finding import Finding
 from cmfsim.values.tissue_data import TissueData
 
@@ -182,7 +182,7 @@ class MuscleModuli:
 
 
 @dataclass(frozen=True)
-class TissueModuli:
+class TissueModuli(Plain):
     """Moduli that differ from a preset: of fat, all muscles, or single muscles.
 
     Attributes
@@ -250,14 +250,6 @@ class TissueModuli:
         return own.fat == base.fat and all(
             moduli == base.muscle for moduli in (own.muscle, *own.muscles.values())
         )
-
-    def as_dict(self) -> dict[str, object]:
-        """Plain values: "fat", "muscle", and "muscles" by name."""
-        return {
-            "fat": asdict(self.fat),
-            "muscle": asdict(self.muscle),
-            "muscles": {name: asdict(moduli) for name, moduli in self.muscles.items()},
-        }
 
 
 # As the core has them in `Preset::from_name`: muscle at rest in fat that can lose volume

@@ -1,11 +1,11 @@
 """Solver options, and the names of the models that are solved."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import as_positive, check_one_of
+from cmfsim.values.checks import Plain, as_positive, check_one_of
 
 # Kim et al. 2010, section 3.2: homogeneous or with muscles, without or with sliding at teeth and
 # mucosa.
@@ -14,7 +14,7 @@ CONTACTS = ("bilateral", "unilateral")
 
 
 @dataclass(frozen=True)
-class SolverOptions:
+class SolverOptions(Plain):
     """Options of solving a scene; the defaults are those of `MassTensors` and `StaticSolver`.
 
     Attributes
@@ -73,10 +73,6 @@ class SolverOptions:
                 continue
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise CaseInputError(f"{name} is {value!r}: a whole number from 1 on is needed")
-
-    def as_dict(self) -> dict[str, Any]:
-        """The options by name, as `MassTensors` (`element`) and `StaticSolver` take them."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def header(self) -> dict[str, Any]:
         """The options as a scene file holds them: element and kinematics where unusual.

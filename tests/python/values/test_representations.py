@@ -1,9 +1,14 @@
 """What the large values show of themselves at a prompt: a few lines, never their arrays."""
 
+import json
+from dataclasses import dataclass, field
+
+import numpy as np
 import pytest
 
 import cmfsim
 import phantom_case
+from cmfsim.values import checks
 from shared_values import coarse_demo_patient, drawn_levels
 
 
@@ -76,3 +81,25 @@ def test_surfaces_images_and_comparisons_show_the_shapes_of_their_arrays(tmp_pat
     head = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0]] * 5, [[0, 1, 2]])
     assert "vertices      (15, 3) float64" in lines_of(head)[1]
     assert max(map(len, repr(cmfsim.check_surface(head)).splitlines())) < 250
+
+
+@dataclass(frozen=True)
+class Measured(checks.Plain):
+    """A value as files hold it."""
+
+    place: np.ndarray = field(metadata=checks.in_files("place_mm"))
+    count: int
+    own: np.ndarray = field(metadata=checks.in_files(None))
+    parts: dict = field(default_factory=dict)
+
+
+def test_files_hold_fields_under_their_names_and_no_others():
+    """Arrays, tuples and numbers of numpy become plain; values within values do as well."""
+    inner = Measured(np.arange(2), np.int64(3), np.ones(4))
+    outer = Measured(np.array([0.5]), 1, np.ones(4), {"a": (inner, None, np.float64(0.25))})
+    assert outer.as_dict() == {
+        "place_mm": [0.5],
+        "count": 1,
+        "parts": {"a": [{"place_mm": [0, 1], "count": 3, "parts": {}}, None, 0.25]},
+    }
+    assert json.loads(json.dumps(outer.as_dict())) == outer.as_dict()

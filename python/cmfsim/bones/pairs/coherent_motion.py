@@ -9,8 +9,7 @@ counts as removed.
 """
 
 import logging
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from cmfsim.bones.pairs.rigid_pieces import PASSES, QUIET, PairedBone, median, r
 from cmfsim.bones.pairs.shape_fit import ShapeFit, fit_shape
 from cmfsim.errors import RegistrationError, RegistrationInputError
 from cmfsim.registration import icp
-from cmfsim.values.checks import Floats, Frozen, as_number, as_positive
+from cmfsim.values.checks import Floats, Frozen, Plain, as_number, as_positive, in_files
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
@@ -211,7 +210,7 @@ INWARDS = -0.7
 
 
 @dataclass(frozen=True, eq=False)
-class RigidPiece(Frozen):
+class RigidPiece(Plain, Frozen):
     """A part of a bone that moved as one.
 
     matrix: (4, 4), mm. Its rigid motion.
@@ -220,12 +219,8 @@ class RigidPiece(Frozen):
     """
 
     matrix: Floats
-    area: float
-    vertices: Integers
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values with units in their names, as JSON holds them."""
-        return {"matrix": self.matrix.tolist(), "area_mm2": self.area}
+    area: float = field(metadata=in_files("area_mm2"))
+    vertices: Integers = field(metadata=in_files(None))
 
 
 @dataclass(frozen=True, eq=False)

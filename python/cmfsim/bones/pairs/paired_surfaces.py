@@ -11,7 +11,7 @@ must know of such a patch.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -30,7 +30,7 @@ from cmfsim.bones.pairs.shape_fit import (
 )
 from cmfsim.errors import BoundaryInputError, RegistrationError, third_party
 from cmfsim.surfaces.topology import connected_labels, edges_of
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, Plain, in_files
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import SurfaceData
 
@@ -71,7 +71,7 @@ RIGID_SHARE, LEAST_LYING = 0.95, 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class StrayPatch:
+class StrayPatch(Plain):
     """A patch of a segment that lies off the bone after the operation.
 
     area: mm², of the surface before.
@@ -83,20 +83,11 @@ class StrayPatch:
     vertices: (n,) int64, of the segment, that lie in the patch.
     """
 
-    area: float
-    distance: float
-    place: Floats
+    area: float = field(metadata=in_files("area_mm2"))
+    distance: float = field(metadata=in_files("distance_mm"))
+    place: Floats = field(metadata=in_files("place_mm"))
     has_bone: bool
-    vertices: NDArray[np.int64]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values with units in their names, as JSON holds them."""
-        return {
-            "area_mm2": self.area,
-            "distance_mm": self.distance,
-            "place_mm": self.place.tolist(),
-            "has_bone": self.has_bone,
-        }
+    vertices: NDArray[np.int64] = field(metadata=in_files(None))
 
 
 def stray_patches(

@@ -4,7 +4,7 @@ Only distances along the normals of the post-operative bone count, so vertices o
 that slid along the surface do not rotate the result.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface
 from cmfsim.errors import RegistrationInputError
-from cmfsim.values.checks import Floats, Frozen, frozen
+from cmfsim.values.checks import Floats, Frozen, Plain, frozen, in_files
 from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
@@ -76,7 +76,7 @@ class OpenDirection(Frozen):
 
 
 @dataclass(frozen=True, eq=False)
-class ShapeFit(Frozen):
+class ShapeFit(Plain, Frozen):
     """The registration of a bone to the post-operative bone, by shape.
 
     matrix: (4, 4), mm. The rigid motion. A change of size is about the centre of the segment's
@@ -92,15 +92,15 @@ class ShapeFit(Frozen):
     middle: (3,), mm, of the segment's vertices, before.
     """
 
-    matrix: Floats
+    matrix: Floats = field(metadata=in_files(None))
     scale: float
     scale_interval: tuple[float, float]
     eigenvalue_ratio: float
     open: tuple[OpenDirection, ...]
-    sigma: float
-    off: Floats
-    kept: NDArray[np.bool_]
-    middle: Floats
+    sigma: float = field(metadata=in_files("sigma_mm"))
+    off: Floats = field(metadata=in_files(None))
+    kept: NDArray[np.bool_] = field(metadata=in_files(None))
+    middle: Floats = field(metadata=in_files(None))
 
     @property
     def image(self) -> Floats:
@@ -123,16 +123,6 @@ class ShapeFit(Frozen):
     def rms(self) -> float:
         """Of the distances of the vertices that count, mm."""
         return float(np.sqrt((self.off[self.kept] ** 2).mean())) if self.kept.any() else np.inf
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values with units in their names, as JSON holds them."""
-        return {
-            "scale": self.scale,
-            "scale_interval": list(self.scale_interval),
-            "eigenvalue_ratio": self.eigenvalue_ratio,
-            "open": [direction.as_dict() for direction in self.open],
-            "sigma_mm": self.sigma,
-        }
 
 
 def fit_shape(

@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import rigid_matrix
 from cmfsim.errors import BoundaryError, RegistrationError, RegistrationInputError
 from cmfsim.imaging.morphology import Mask, as_itk, box_of, resampled_to, simpleitk, smoothed
-from cmfsim.values.checks import Floats, as_positive, check_instance
+from cmfsim.values.checks import Floats, Plain, as_positive, check_instance, in_files
 from cmfsim.values.image_data import ImageData
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -238,7 +238,7 @@ def inverse(rigid: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class VolumeAlignment:
+class VolumeAlignment(Plain):
     """Position of a volume in the frame of another.
 
     Attributes
@@ -256,20 +256,10 @@ class VolumeAlignment:
     """
 
     matrix: Floats
-    information: float
+    information: float = field(metadata=in_files("information_nats"))
     similarity: float
     overlap: float
     iterations: tuple[int, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, as JSON holds them."""
-        return {
-            "matrix": self.matrix.tolist(),
-            "information_nats": self.information,
-            "similarity": self.similarity,
-            "overlap": self.overlap,
-            "iterations": list(self.iterations),
-        }
 
 
 def register_volumes(

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,7 +20,7 @@ from cmfsim.lab.benchmark.patients import (
     read_skin_prediction,
 )
 from cmfsim.values.calibration import BandFactor, Calibration, CalibrationCase
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, Plain, in_files, plain
 from cmfsim.values.table import NOTHING, Table, csv_of
 
 # The share of patients that a band must cover in each region.
@@ -58,7 +58,7 @@ class MethodBand:
         return {
             "calibration_patients": [case.case for case in self.cases],
             "missing": list(self.missing),
-            "factors": {name: factor.as_dict() for name, factor in self.factors.items()},
+            "factors": plain(self.factors),
         }
 
     def write(self, path: Path, model: str, population: Mapping[str, Any]) -> None:
@@ -117,7 +117,7 @@ def _check_settings(prediction: SkinPrediction, settings: str) -> None:
 
 
 @dataclass(frozen=True)
-class RegionScore:
+class RegionScore(Plain):
     """Errors of a prediction in a region of one patient.
 
     mean, p95: mm, of the length of the difference from the true displacement, over vertices.
@@ -128,24 +128,16 @@ class RegionScore:
     half_width: mm, or None. Mean of that band.
     """
 
-    mean: float
-    p95: float
-    within: float
-    normal: float
+    mean: float = field(metadata=in_files("mean_mm"))
+    p95: float = field(metadata=in_files("p95_mm"))
+    within: float = field(metadata=in_files("share_within_2mm"))
+    normal: float = field(metadata=in_files("normal_mm"))
     covered: bool | None = None
-    half_width: float | None = None
+    half_width: float | None = field(default=None, metadata=in_files("half_width_mm"))
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values with their unit in the name."""
-        names = {
-            "mean": "mean_mm",
-            "p95": "p95_mm",
-            "within": "share_within_2mm",
-            "normal": "normal_mm",
-            "covered": "covered",
-            "half_width": "half_width_mm",
-        }
-        return {names[name]: value for name, value in asdict(self).items() if value is not None}
+        return {k: value for k, value in super().as_dict().items() if value is not None}
 
 
 def score(
@@ -380,11 +372,8 @@ class BenchmarkTable:
                     "missing": list(result.missing),
                     "failed": list(result.failed),
                     "reasons": dict(result.failed),
-                    "band": None if result.band is None else result.band.as_dict(),
-                    "patients": {
-                        name: {region: found.as_dict() for region, found in scores.items()}
-                        for name, scores in result.scores.items()
-                    },
+                    "band": plain(result.band),
+                    "patients": plain(result.scores),
                 }
                 for result in self.results
             },

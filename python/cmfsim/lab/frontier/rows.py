@@ -13,7 +13,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.evaluation import SKIN_LANDMARKS, DistanceStatistics, distance_statistics, skin_regions
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
-from cmfsim.values.checks import Floats, as_floats, as_rows
+from cmfsim.values.checks import Floats, as_floats, as_rows, plain
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.table import csv_of
 
@@ -174,18 +174,18 @@ class FrontierRow:
     def as_dict(self) -> dict[str, Any]:
         """Plain values with their unit in the name, as JSON holds them."""
         return {
-            "choice": asdict(self.choice),
+            "choice": plain(self.choice),
             "is_base": self.is_base,
             "is_reference": self.is_reference,
             "on_front": self.on_front,
             "failure": self.failure,
-            "error": {name: figures.as_dict() for name, figures in self.error.items()},
+            "error": plain(self.error),
             "total_wall_s": self.total_wall,
             "build_wall_s": self.build_wall,
             "build_cpu_s": self.build_cpu,
-            "solve_wall_s": self.solve_wall and asdict(self.solve_wall),
-            "solve_cpu_s": self.solve_cpu and asdict(self.solve_cpu),
-            "solve_ratio": self.ratio and asdict(self.ratio),
+            "solve_wall_s": plain(self.solve_wall),
+            "solve_cpu_s": plain(self.solve_cpu),
+            "solve_ratio": plain(self.ratio),
             "build_peak_mb": self.build_peak,
             "solve_peak_mb": self.solve_peak,
             "n_tets": self.n_tets,
@@ -241,7 +241,7 @@ class Frontier:
             "n_points": self.n_points,
             "reference_movement_mm": self.moved,
             "machine": dict(self.machine),
-            "rows": [row.as_dict() for row in self.rows],
+            "rows": plain(self.rows),
         }
 
     def csv(self) -> str:

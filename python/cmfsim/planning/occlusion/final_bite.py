@@ -5,8 +5,7 @@ that brings the lower row into the bite of the scans follows, whatever the frame
 """
 
 import contextlib
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +14,7 @@ from cmfsim._core import IcpFit, icp
 from cmfsim.errors import CaseInputError, RegistrationError
 from cmfsim.planning.occlusion.contacts import contact_map
 from cmfsim.planning.occlusion.rows import ToothRow
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, Plain, in_files
 from cmfsim.values.finding import Finding
 from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import SurfaceData
@@ -40,7 +39,7 @@ TURNS = (0.0, 90.0, 180.0, 270.0)
 
 
 @dataclass(frozen=True, eq=False)
-class FinalBite:
+class FinalBite(Plain):
     """The final bite of two scans, on the rows of a head.
 
     Attributes
@@ -57,11 +56,11 @@ class FinalBite:
     """
 
     motion: Floats
-    upper_error: float
-    lower_error: float
-    overlap: float
-    gap: float
-    mirrored: tuple[str, ...] = ()
+    upper_error: float = field(metadata=in_files("upper_error_mm"))
+    lower_error: float = field(metadata=in_files("lower_error_mm"))
+    overlap: float = field(metadata=in_files("overlap_mm"))
+    gap: float = field(metadata=in_files("gap_mm"))
+    mirrored: tuple[str, ...] = field(default=(), metadata=in_files("fits_mirrored"))
 
     def following(self, upper: ArrayLike) -> Floats:
         """The motion of the lower jaw if the upper one moves by `upper`, (4, 4) mm."""
@@ -72,17 +71,6 @@ class FinalBite:
         """What a person should check before trusting it."""
         what = f"the mirror image of the {' and '.join(self.mirrored)} scan fits the teeth as well"
         return [Finding("bite-scan-symmetric", what)] if self.mirrored else []
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
-        return {
-            "motion": self.motion.tolist(),
-            "upper_error_mm": self.upper_error,
-            "lower_error_mm": self.lower_error,
-            "overlap_mm": self.overlap,
-            "gap_mm": self.gap,
-            "fits_mirrored": list(self.mirrored),
-        }
 
 
 def final_bite(

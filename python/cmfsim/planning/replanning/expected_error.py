@@ -4,14 +4,14 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from cmfsim.errors import CaseInputError, ContactError, SolverError
 from cmfsim.planning.replanning.model import Motions, PlanningModel
-from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.checks import Floats, Plain, as_positive, in_files, plain
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
@@ -27,7 +27,7 @@ USUAL = 90.0
 
 
 @dataclass(frozen=True, eq=False)
-class PlanTrial:
+class PlanTrial(Plain):
     """One plan, computed by the product and solved exactly.
 
     Attributes
@@ -43,11 +43,11 @@ class PlanTrial:
         Of the exact solution.
     """
 
-    plan: Mapping[str, Floats]
-    distance: float
-    mean: float | None
-    p95: float | None
-    largest: float | None
+    plan: Mapping[str, Floats] = field(metadata=in_files(None))
+    distance: float = field(metadata=in_files("distance_mm"))
+    mean: float | None = field(metadata=in_files("mean_mm"))
+    p95: float | None = field(metadata=in_files("p95_mm"))
+    largest: float | None = field(metadata=in_files("largest_mm"))
     failed: str
     seconds: float
 
@@ -115,17 +115,7 @@ class ExpectedError:
             "turn_degrees": self.turn,
             "is_exact": self.is_exact,
             "reach_mm": self.reach,
-            "trials": [
-                {
-                    "distance_mm": t.distance,
-                    "mean_mm": t.mean,
-                    "p95_mm": t.p95,
-                    "largest_mm": t.largest,
-                    "failed": t.failed,
-                    "seconds": t.seconds,
-                }
-                for t in self.trials
-            ],
+            "trials": plain(self.trials),
             "left_out": [
                 {"distance_mm": distance, "mean_mm": mean, "largest_mm": largest}
                 for distance, mean, largest in self.left_out.tolist()
