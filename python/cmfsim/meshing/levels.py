@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim import _core
 from cmfsim.errors import MeshInputError
 from cmfsim.values.anatomy import Anatomy
-from cmfsim.values.checks import Floats, as_number, as_point, as_positive
+from cmfsim.values.checks import Floats, as_number, as_point, as_positive, keep
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
@@ -209,11 +209,8 @@ class TissueRegion:
             if height is not None:
                 as_number(name, height)
         as_positive("foramen_radius", foramen_radius)
-        object.__setattr__(self, "point", place)
-        object.__setattr__(self, "normal", direction / length)
-        object.__setattr__(self, "lower", lower)
-        object.__setattr__(self, "upper", upper)
-        object.__setattr__(self, "foramen_radius", foramen_radius)
+        keep(self, point=place, normal=direction / length, lower=lower, upper=upper)
+        keep(self, foramen_radius=foramen_radius)
 
 
 def tissue_level(anatomy: Anatomy, region: TissueRegion) -> tuple[ImageData, tuple[Finding, ...]]:

@@ -146,8 +146,7 @@ class DentalArch(Frozen):
     def __post_init__(self) -> None:
         check_one_of("jaw", self.jaw, JAWS)
         for name in ("tip", "left", "right", "out"):
-            value = as_point(f"{self.jaw} arch: {name}", getattr(self, name))
-            object.__setattr__(self, name, value)
+            keep(self, **{name: as_point(f"{self.jaw} arch: {name}", getattr(self, name))})
         for name in ("depth_front", "depth_molars"):
             as_number(f"{self.jaw} arch: {name}", getattr(self, name))
         axes = self.axes()

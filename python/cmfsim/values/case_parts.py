@@ -196,7 +196,7 @@ class CaseImage:
     teeth: CaseBite | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "bones", MappingProxyType(dict(self.bones)))
+        checks.keep(self, bones=self.bones)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, keep
 from cmfsim.values.finding import Finding
 
 # A missing or doubtful site whose expected error has fallen to this, mm, need not be placed.
@@ -119,7 +119,7 @@ class ProposedLandmarks:
 
     def __post_init__(self) -> None:
         for name in ("skull", "skin", "missing_skull", "missing_skin", "separation"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+            keep(self, **{name: getattr(self, name)})
 
     @property
     def points(self) -> dict[str, Mapping[str, Floats]]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, Frozen, as_floats, as_text, check_one_of, frozen
+from cmfsim.values.checks import Floats, Frozen, as_floats, as_text, check_one_of, frozen, keep
 
 # Arrays that each kind of tissue needs, with the number of axes after the first.
 TISSUE_ARRAYS: Mapping[str, Mapping[str, tuple[int, ...]]] = MappingProxyType({
@@ -90,11 +90,10 @@ class TissueData(Frozen):
             "young": young, "poisson": poisson, "young_along": young_along, "fibre": fibre,
             "young_across": young_across, "stiffness": stiffness, "fraction": fraction,
         }  # fmt: skip
-        object.__setattr__(self, "kind", kind)
-        for name, value in given.items():
-            object.__setattr__(self, name, self._checked(name, value))
-        for name, text in (("law", law), ("preset", preset), ("mixing", mixing)):
-            object.__setattr__(self, name, as_text(f"tissue {name}", text))
+        keep(self, kind=kind)
+        keep(self, **{name: self._checked(name, value) for name, value in given.items()})
+        texts = {"law": law, "preset": preset, "mixing": mixing}
+        keep(self, **{name: as_text(f"tissue {name}", text) for name, text in texts.items()})
 
     def _checked(self, name: str, value: ArrayLike | None) -> Floats | None:
         """One of the arrays, with a row for each tet or a single one."""

@@ -2,12 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Floats, as_direction, as_point, as_rows, as_text, check_instance
+from cmfsim.values.checks import (
+    Floats,
+    as_direction,
+    as_point,
+    as_rows,
+    as_text,
+    check_instance,
+    keep,
+)
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
@@ -44,9 +51,8 @@ class CuttingPlane:
     def __init__(self, point: ArrayLike, normal: ArrayLike, name: str = "plane") -> None:
         as_text("plane name", name)
         where = f"plane {name!r}"
-        object.__setattr__(self, "point", as_point(f"{where} point", point))
-        object.__setattr__(self, "normal", as_direction(f"{where} normal", normal))
-        object.__setattr__(self, "name", name)
+        normal = as_direction(f"{where} normal", normal)
+        keep(self, point=as_point(f"{where} point", point), normal=normal, name=name)
 
     def distance(self, points: ArrayLike) -> Floats:
         """The signed distance of points (n, 3), mm: positive on the side of the normal."""
@@ -122,7 +128,7 @@ class Procedure:
         as_text("procedure", self.kind)
         for cut in self.cuts:
             check_instance(f"cut of {self.kind!r}", cut, Cut)
-        object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
+        keep(self, options=self.options)
 
 
 def free_cut(

@@ -20,7 +20,7 @@ from cmfsim.io import Case, read_landmarks, read_surface
 from cmfsim.io.files.reading_writing import check_readable, named, replacing
 from cmfsim.io.results.populations import MADE, Population
 from cmfsim.values.calibration import ADDED, PLAN, Source
-from cmfsim.values.checks import Floats, as_rows
+from cmfsim.values.checks import Floats, as_rows, keep
 
 # Vertices of a prediction may differ by this from those of the patient's skin, mm: they are written
 # in single precision.
@@ -80,13 +80,11 @@ class SkinPrediction:
                 f"displacement[{most}] is {length[most]:.0f} mm long: up to {LARGEST_MOVE:g} mm is "
                 "allowed. Use mm, and write displacements, not positions"
             )
-        object.__setattr__(self, "vertices", places)
-        object.__setattr__(self, "displacement", moves)
+        keep(self, vertices=places, displacement=moves)
         if self.half_width is not None and self.sd is not None:
             raise CaseInputError("has both half_width and sd: give only one")
         if self.half_width is not None:
-            widths = _lengths("half_width", self.half_width, len(places))
-            object.__setattr__(self, "half_width", widths)
+            keep(self, half_width=_lengths("half_width", self.half_width, len(places)))
         if self.sd is not None:
             deviations = _lengths("sd", self.sd, len(places))
             bad = np.flatnonzero(~(np.isfinite(deviations) & (deviations > 0.0)))
@@ -94,7 +92,7 @@ class SkinPrediction:
                 raise CaseInputError(
                     f"sd[{bad[0]}] is {deviations[bad[0]]:g} mm: above 0 is needed, at each vertex"
                 )
-            object.__setattr__(self, "sd", deviations)
+            keep(self, sd=deviations)
 
     def check_vertices(self, skin: ArrayLike) -> None:
         """Refuses a prediction of another skin, or of the same one in another order.

@@ -10,7 +10,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
 from cmfsim.phantom.muscles import COURSES
 from cmfsim.values.calibration import ADDED, PLAN
-from cmfsim.values.checks import as_number, check_one_of
+from cmfsim.values.checks import as_number, check_one_of, keep
 
 Triple = tuple[float, float, float]
 # Numbers above this belong to patients drawn at random.
@@ -130,7 +130,7 @@ class TrueTissue:
     vestibule: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "offsets", MappingProxyType(dict(self.offsets)))
+        keep(self, offsets=self.offsets)
 
 
 @dataclass(frozen=True)
@@ -163,8 +163,7 @@ class VirtualPatient:
     tissue: TrueTissue = field(default_factory=TrueTissue)
 
     def __post_init__(self) -> None:
-        for name in ("plan", "departures"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        keep(self, plan=self.plan, departures=self.departures)
 
     @property
     def name(self) -> str:

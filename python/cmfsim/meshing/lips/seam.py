@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,6 +30,7 @@ from cmfsim.values.checks import (
     as_rows,
     check_instance,
     check_one_of,
+    keep,
 )
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import label_key
@@ -192,7 +192,7 @@ class LipSeam:
     findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "summary", MappingProxyType(dict(self.summary)))
+        keep(self, summary=self.summary)
 
 
 def lip_seam(

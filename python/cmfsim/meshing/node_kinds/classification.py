@@ -6,7 +6,6 @@ surface: where skin is thinner than a tet is long, nearness alone would take ski
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +15,15 @@ from cmfsim.errors import CaseInputError
 from cmfsim.meshing.node_kinds.arches import DentalArches, dental_arches, sliding_nodes
 from cmfsim.meshing.node_kinds.options import BORDERS, KindOptions
 from cmfsim.values.anatomy import Anatomy, BoneSegment
-from cmfsim.values.checks import Floats, Indices, as_index_rows, as_point, as_rows, check_instance
+from cmfsim.values.checks import (
+    Floats,
+    Indices,
+    as_index_rows,
+    as_point,
+    as_rows,
+    check_instance,
+    keep,
+)
 from cmfsim.values.finding import Finding
 from cmfsim.values.scene import NODE_KINDS, NodeKinds, SegmentData
 from cmfsim.values.surface_data import SurfaceData, used_nodes
@@ -45,7 +52,7 @@ class ClassifiedNodes:
     findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "counts", MappingProxyType(dict(self.counts)))
+        keep(self, counts=self.counts)
 
 
 def classify_nodes(  # noqa: PLR0913 (options by name)

@@ -16,6 +16,7 @@ from cmfsim.values.checks import (
     as_rows,
     as_text,
     check_one_of,
+    keep,
     nearest,
 )
 
@@ -44,9 +45,7 @@ class SlidingBox:
         corners = as_rows(where, [np.asarray(low), np.asarray(high)], 3)
         if (corners[0] >= corners[1]).any():
             raise CaseInputError(f"{where}: low {corners[0]} must lie below high {corners[1]}")
-        object.__setattr__(self, "segment", segment)
-        object.__setattr__(self, "low", corners[0])
-        object.__setattr__(self, "high", corners[1])
+        keep(self, segment=segment, low=corners[0], high=corners[1])
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which of the points (n, 3) lie in the box."""
@@ -73,9 +72,8 @@ class SlidingSphere:
     def __init__(self, segment: str, centre: ArrayLike, radius: float) -> None:
         as_text("segment of a sliding sphere", segment)
         where = f"sliding sphere on {segment!r}"
-        object.__setattr__(self, "segment", segment)
-        object.__setattr__(self, "centre", as_point(f"{where} centre", centre))
-        object.__setattr__(self, "radius", as_positive(f"{where} radius", radius))
+        radius = as_positive(f"{where} radius", radius)
+        keep(self, segment=segment, centre=as_point(f"{where} centre", centre), radius=radius)
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which of the points (n, 3) lie in the ball."""

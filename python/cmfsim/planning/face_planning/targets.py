@@ -11,7 +11,7 @@ from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
 from cmfsim.planning.replanning import Motions, PlanningModel
-from cmfsim.values.checks import Floats, as_positive, as_rows
+from cmfsim.values.checks import Floats, as_positive, as_rows, keep
 from cmfsim.values.skin_motion import attachment
 from cmfsim.values.surface_data import SurfaceData, used_nodes
 
@@ -80,10 +80,7 @@ class PointTarget:
                     "target directions must be given for each point and must not be zero"
                 )
             ways = ways / sizes
-        object.__setattr__(self, "points", places)
-        object.__setattr__(self, "goals", wished)
-        object.__setattr__(self, "std", std)
-        object.__setattr__(self, "directions", ways)
+        keep(self, points=places, goals=wished, std=std, directions=ways)
 
 
 @dataclass(frozen=True)
