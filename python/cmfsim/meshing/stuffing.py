@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from cmfsim import _core
 from cmfsim._core import Surface, TetMesh
 from cmfsim.errors import MeshInputError
-from cmfsim.values.checks import Indices, as_number, as_point, as_positive
+from cmfsim.values.checks import Indices, as_number, as_point, as_positive, as_whole
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.mesh_report import BINS, MeshReport
@@ -196,11 +196,7 @@ class MeshOptions:
         as_positive("edge_length", self.edge_length)
         if as_number("least_body", self.least_body) < 0.0:
             raise MeshInputError(f"least_body is {self.least_body} mm³: 0 or more is needed")
-        whole = isinstance(self.refinements, int) and not isinstance(self.refinements, bool)
-        if not whole or not 0 <= self.refinements <= MAX_REFINEMENTS:
-            raise MeshInputError(
-                f"refinements is {self.refinements!r}: a whole number from 0 to {MAX_REFINEMENTS}"
-            )
+        as_whole("refinements", self.refinements, 0, MAX_REFINEMENTS, MeshInputError)
 
 
 @dataclass(frozen=True, eq=False)

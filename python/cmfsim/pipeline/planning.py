@@ -44,7 +44,7 @@ from cmfsim.planning.replanning import (
     planning_model,
 )
 from cmfsim.values.anatomy import JAWS, BoneSegment
-from cmfsim.values.checks import Floats, check_one_of
+from cmfsim.values.checks import Floats, as_whole, check_one_of
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.progress import BUILDING, PLANNING
 from cmfsim.values.skin_band import BandOptions
@@ -145,9 +145,8 @@ def make_planning_page(
     """
     case = as_case(case)
     # Before any work, so that an invalid option is not reported a minute later.
-    for name, count, least in (("trials", trials, 1), ("corrections", corrections, 0)):
-        if count < least:
-            raise CaseInputError(f"{name} is {count}: a whole number of {least} or more is needed")
+    as_whole("trials", trials, 1)
+    as_whole("corrections", corrections, 0)
     prepare(case, {PAGE_FILE, PLAN_FILE}.__contains__)
     targets = _read_targets(towards) if isinstance(towards, str | os.PathLike) else towards
     models = named_models(model)

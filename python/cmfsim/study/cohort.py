@@ -32,6 +32,7 @@ from cmfsim.processes.parallel import as_they_end, on_cluster
 from cmfsim.processes.worker import Worker, WorkerEndedError, WorkerFailedError
 from cmfsim.report import Figure, study_document
 from cmfsim.report.study import table3_text
+from cmfsim.values.checks import as_whole
 
 # Lines of a failed case's log that are shown.
 SHOWN_LINES = 12
@@ -179,10 +180,8 @@ def run_studies(
     Raises `CaseError`, `OSError`: As `run_study`.
     """
     cores = os.cpu_count() or 1
-    workers = options.workers
-    if workers is not None and workers < 1:
-        raise CaseInputError(f"workers is {workers}: must be 1 or more")
-    workers = max(1, cores // 2) if workers is None else workers
+    workers = max(1, cores // 2) if options.workers is None else options.workers
+    as_whole("workers", workers, 1)
     begun = time.perf_counter()
     outcomes: list[dict[str, CaseOutcome]] = [{} for _ in cohorts]
     jobs: list[CaseJob] = []

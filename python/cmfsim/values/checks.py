@@ -231,6 +231,22 @@ def as_number(name: str, value: object) -> float:
     return number
 
 
+def as_whole(
+    name: str,
+    value: object,
+    least: int,
+    most: int | None = None,
+    error: type[Exception] = CaseInputError,
+) -> int:
+    """A whole number in a range."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool):
+        number = int(value)
+        if number >= least and (most is None or number <= most):
+            return number
+    end = "on" if most is None else f"to {most}"
+    raise error(f"{name} is {value!r}: a whole number from {least} {end} is needed")
+
+
 def as_positive(name: str, value: object) -> float:
     """A finite float above zero."""
     number = as_number(name, value)

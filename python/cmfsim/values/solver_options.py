@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
-from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import Plain, as_positive, check_one_of
+from cmfsim.values.checks import Plain, as_positive, as_whole, check_one_of, keep
 
 # Kim et al. 2010, section 3.2: homogeneous or with muscles, without or with sliding at teeth and
 # mucosa.
@@ -67,12 +66,10 @@ class SolverOptions(Plain):
             as_positive(name, getattr(self, name))
         if self.memory_limit is not None:
             as_positive("memory_limit", self.memory_limit)
-        for name in ("max_iterations", "contact_iterations"):
-            value = getattr(self, name)
-            if value is None and name == "max_iterations":
-                continue
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise CaseInputError(f"{name} is {value!r}: a whole number from 1 on is needed")
+        if self.max_iterations is not None:
+            keep(self, max_iterations=as_whole("max_iterations", self.max_iterations, 1))
+        steps = as_whole("contact_iterations", self.contact_iterations, 1)
+        keep(self, contact_iterations=steps)
 
     def header(self) -> dict[str, Any]:
         """The options as a scene file holds them: element and kinematics where unusual.

@@ -8,6 +8,7 @@ import pytest
 
 import cmfsim
 import phantom_case
+from cmfsim.errors import CaseInputError
 from cmfsim.values import checks
 from shared_values import coarse_demo_patient, drawn_levels
 
@@ -103,3 +104,13 @@ def test_files_hold_fields_under_their_names_and_no_others():
         "parts": {"a": [{"place_mm": [0, 1], "count": 3, "parts": {}}, None, 0.25]},
     }
     assert json.loads(json.dumps(outer.as_dict())) == outer.as_dict()
+
+
+@pytest.mark.parametrize("value", [0, 5, True, 2.0, "2", None])
+def test_whole_numbers_are_checked_by_kind_and_range(value):
+    """The error has the name, the value and the range; numpy's whole numbers become Python's."""
+    with pytest.raises(CaseInputError, match=f"n is {value!r}: a whole number from 1 to 4 is"):
+        checks.as_whole("n", value, 1, 4)
+    assert type(checks.as_whole("n", np.uint8(4), 1, 4)) is int
+    with pytest.raises(CaseInputError, match="contact_iterations is 0: a whole number from 1 on"):
+        cmfsim.SolverOptions(contact_iterations=0)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import rigid_matrix
 from cmfsim.errors import BoundaryError, RegistrationError, RegistrationInputError
 from cmfsim.imaging.morphology import Mask, as_itk, box_of, resampled_to, simpleitk, smoothed
-from cmfsim.values.checks import Floats, Plain, as_positive, check_instance, in_files
+from cmfsim.values.checks import Floats, Plain, as_positive, as_whole, check_instance, in_files
 from cmfsim.values.image_data import ImageData
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -80,11 +80,7 @@ class AlignmentOptions:
                 f"resolutions are {sizes} mm: give at least one, each finer than the last"
             )
         object.__setattr__(self, "resolutions", sizes)
-        count = self.samples
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1000:
-            raise RegistrationInputError(
-                f"samples is {count!r}: a whole number of at least 1000 is needed"
-            )
+        as_whole("samples", self.samples, 1000, error=RegistrationInputError)
 
 
 class Places:

@@ -35,7 +35,7 @@ from cmfsim.lab.benchmark.patients import (
 )
 from cmfsim.lab.benchmark.scores import BenchmarkTable, MethodResult, calibrated_band, score
 from cmfsim.processes.parallel import answers
-from cmfsim.values.checks import as_number, check_one_of
+from cmfsim.values.checks import as_whole, check_one_of
 from cmfsim.values.solver_options import MODELS
 
 OWN = (*ENTRIES, *ON_REQUEST)
@@ -121,8 +121,7 @@ def run_benchmark(
         check_one_of("entry", entry, OWN)
     for model in band:
         check_one_of("band", model, [entry for entry in entries if entry in MODELS])
-    if as_number("workers", workers) < 1 or int(workers) != workers:
-        raise CaseInputError(f"workers is {workers!r}: a whole number from 1 is needed")
+    as_whole("workers", workers, 1)
     place = Path(folder)
     population = Population.load(place)
     pending = population.named(PENDING)

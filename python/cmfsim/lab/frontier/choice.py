@@ -12,7 +12,7 @@ from cmfsim._core import ELEMENTS, KINEMATICS, METHODS
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.values.case_parts import CaseMuscles
-from cmfsim.values.checks import as_positive, check_one_of, keep
+from cmfsim.values.checks import as_positive, as_whole, check_one_of, keep
 from cmfsim.values.prediction import MODELS
 from cmfsim.values.solver_options import CONTACTS, SolverOptions
 from cmfsim.values.tissue_data import MIXINGS
@@ -89,8 +89,7 @@ class Choice:
 
     def __post_init__(self) -> None:
         keep(self, edge_length=as_positive("edge_length", self.edge_length))
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int) or self.samples < 1:
-            raise CaseInputError(f"samples is {self.samples!r}: a whole number from 1 on is needed")
+        keep(self, samples=as_whole("samples", self.samples, 1))
         check_one_of("mixing", self.mixing, MIXINGS)
         check_one_of("model", self.model, MODELS)
         # SolverOptions knows what its own may be.

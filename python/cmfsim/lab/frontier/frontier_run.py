@@ -28,7 +28,7 @@ from cmfsim.lab.frontier.rows import (
 )
 from cmfsim.lab.frontier.timing import MOVED_FORMAT, STOPPED, Answer, machine, run_job
 from cmfsim.pipeline.building.inputs import input_hashes
-from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.checks import Floats, as_positive, as_whole
 from cmfsim.values.progress import Progress, no_progress
 
 _log = logging.getLogger(__name__)
@@ -103,9 +103,8 @@ def frontier(  # noqa: PLR0913 (options by name)
     >>> found.base.mean, [row.choice.element for row in found.front]  # doctest: +SKIP
     """
     base, choices, reference = _meant(case, choices, reference)
-    for name, number in (("repeats", repeats), ("threads", 1 if threads is None else threads)):
-        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise CaseInputError(f"{name} is {number!r}: a whole number from 1 on is needed")
+    as_whole("repeats", repeats, 1)
+    as_whole("threads", 1 if threads is None else threads, 1)
     jobs = _Jobs(
         case=case,
         folder=Path(folder),

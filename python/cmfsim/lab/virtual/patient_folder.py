@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim._core import __version__
-from cmfsim.errors import CaseInputError, third_party
+from cmfsim.errors import third_party
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cases.cohorts import COHORT_FORMAT
 from cmfsim.io.files.reading_writing import replacing
@@ -23,7 +23,7 @@ from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
 from cmfsim.lab.virtual.population import DRAWN, PATIENTS, VirtualPatient, patient_named
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth, scanned
 from cmfsim.phantom import PhantomHead, make_head
-from cmfsim.values.checks import Floats, as_number, as_positive
+from cmfsim.values.checks import Floats, as_positive, as_whole
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 
@@ -219,8 +219,7 @@ def write_virtual_patient(  # noqa: PLR0913 (options by name)
     for name, value in (("edge_length", edge_length), ("spacing", spacing), ("grid", grid)):
         as_positive(name, value)
     as_positive("skin_spacing", skin_spacing)
-    if as_number("seed", seed) < 0 or int(seed) != seed:
-        raise CaseInputError(f"seed is {seed!r}: a whole number from 0 is needed")
+    seed = as_whole("seed", seed, 0)
     for package in ("skfem", "pyamg"):  # before half a minute of work
         third_party(package, "virtual patients are solved", "study")
     folder = Path(folder)

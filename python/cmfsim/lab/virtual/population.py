@@ -10,7 +10,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
 from cmfsim.phantom.muscles import COURSES
 from cmfsim.values.calibration import ADDED, PLAN
-from cmfsim.values.checks import as_number, check_one_of, keep
+from cmfsim.values.checks import as_whole, check_one_of, keep
 
 Triple = tuple[float, float, float]
 # Numbers above this belong to patients drawn at random.
@@ -323,11 +323,9 @@ def drawn_patient(seed: int, index: int, *, truth: str = OWN) -> VirtualPatient:
     >>> cmfsim.drawn_patient(0, 1) == cmfsim.drawn_patient(0, 1)
     True
     """
-    for name, value, least in (("seed", seed, 0), ("index", index, 1)):
-        if as_number(name, value) < least or int(value) != value:
-            raise CaseInputError(f"{name} is {value!r}: a whole number from {least} is needed")
+    seed, index = as_whole("seed", seed, 0), as_whole("index", index, 1)
     check_one_of("truth", truth, TRUTHS)
-    draws = _Draws(int(seed), int(index))
+    draws = _Draws(seed, index)
     shares = np.array([share for _, share in OPERATIONS])
     osteotomies = OPERATIONS[int(draws.generator.choice(len(OPERATIONS), p=shares))][0]
     person = _person(draws, only_maxilla=osteotomies == ("le_fort_1",))

@@ -31,7 +31,7 @@ from cmfsim.lab.virtual.patient_folder import (
 )
 from cmfsim.lab.virtual.population import OWN, VirtualPatient, drawn_patient
 from cmfsim.processes.parallel import answers
-from cmfsim.values.checks import as_number, as_positive
+from cmfsim.values.checks import as_positive, as_whole
 
 FAILURE = "failed.json"
 # Of the level images that the true mesh is made from, and of the skin, in the mesh's edge length:
@@ -132,9 +132,8 @@ def virtual_population(  # noqa: PLR0913 (options by name)
     >>> import cmfsim
     >>> found = cmfsim.virtual_population("insilico", 20, seed=1)  # doctest: +SKIP
     """
-    for name, value, least in (("count", count, 1), ("seed", seed, 0), ("workers", workers, 1)):
-        if as_number(name, value) < least or int(value) != value:
-            raise CaseInputError(f"{name} is {value!r}: a whole number from {least} is needed")
+    count, seed = as_whole("count", count, 1), as_whole("seed", seed, 0)
+    workers = as_whole("workers", workers, 1)
     edge, voxel = as_positive("edge_length", edge_length), as_positive("spacing", spacing)
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.errors import CaseInputError
 from cmfsim.planning.replanning.correction import PlanNumbers, fitted_correction
 from cmfsim.planning.replanning.expected_error import (
     moving_segments,
@@ -14,7 +13,7 @@ from cmfsim.planning.replanning.expected_error import (
     solved_plans,
 )
 from cmfsim.planning.replanning.model import PlanningModel
-from cmfsim.values.checks import as_positive
+from cmfsim.values.checks import as_positive, as_whole
 from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
 CORRECTING = "solving nearby plans to correct the operator"
@@ -71,8 +70,7 @@ def corrected_planning(
     0.33
     """
     shift, turn = as_positive("shift", shift), as_positive("turn", turn)
-    if isinstance(plans, bool) or not isinstance(plans, int) or plans < 0:
-        raise CaseInputError(f"plans is {plans!r}: a whole number from 0 on is needed")
+    as_whole("plans", plans, 0)
     bare = replace(planning, correction=None)
     if planning.is_exact or plans < LEAST_PLANS:
         return bare

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.errors import CaseInputError, ContactError, SolverError
+from cmfsim.errors import ContactError, SolverError
 from cmfsim.planning.replanning.model import Motions, PlanningModel
-from cmfsim.values.checks import Floats, Plain, as_positive, in_files, plain
+from cmfsim.values.checks import Floats, Plain, as_positive, as_whole, in_files, plain
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
@@ -193,8 +193,7 @@ def expected_error(
     ((0.012, 0.39), 0.11)
     """
     shift, turn = as_positive("shift", shift), as_positive("turn", turn)
-    if isinstance(trials, bool) or not isinstance(trials, int) or trials < 1:
-        raise CaseInputError(f"trials is {trials!r}: a whole number of 1 or more is needed")
+    as_whole("trials", trials, 1)
     rng = np.random.default_rng(seed)
     plans = plans_near(planning, rng, 1 if planning.is_exact else trials, (shift, turn))
     found = []

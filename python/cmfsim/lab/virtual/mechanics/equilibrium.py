@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, SolverError, third_party
 from cmfsim.lab.virtual.mechanics.body import HyperelasticBody
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, as_whole
 
 _log = logging.getLogger(__name__)
 
@@ -84,8 +84,7 @@ class EquilibriumOptions:
     loose: float = 0.03
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise CaseInputError(f"steps is {self.steps!r}: 1 or more are needed")
+        as_whole("steps", self.steps, 1)
         if not 0.0 < self.tolerance <= self.loose < 1.0:
             raise CaseInputError("tolerance and loose: 0 < tolerance ≤ loose < 1 is needed")
 
