@@ -31,7 +31,7 @@ def number(value: object, digits: int = 2) -> str:
 
 def plain_line(text: str) -> str:
     """Words of a user as one line in which Markdown finds nothing to mark up."""
-    return MARKUP.sub(r"\\\g<0>", " ".join(text.split()))
+    return MARKUP.sub(r"\\\g<0>", " ".join(text.splitlines()).strip())
 
 
 @dataclass(frozen=True)
