@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.drafting.finds import HU_AIR, ImageFind, LandmarkFind, SurfaceFind
+from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
@@ -345,8 +346,6 @@ def _choose_frame(marks: Marks, box: Floats | None) -> None:
     )
 
 
-# Lengths of other units that numbers may be in, mm.
-UNITS: Mapping[str, float] = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "inch": 25.4, "um": 0.001}
 # Vertices at which it is asked whether one surface holds another.
 SAMPLES = 300
 

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.drafting.choices import SAMPLES, TURN, UNITS, Anatomy, Question, Taken
+from cmfsim.drafting.choices import SAMPLES, TURN, Anatomy, Question, Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.drafting.roles import JAWS_OF_TEETH, MOVING, safe_key
 from cmfsim.meshing.levels import signed_level
 from cmfsim.surfaces.levels import surface_of_level
+from cmfsim.values.case_parts import SKIN_EXTENT, UNITS
 from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
@@ -20,8 +21,8 @@ ROWS = ("teeth", *JAWS_OF_TEETH)
 NEARER = 0.5
 # Voxels along the longest side of a jaw that its teeth are added to, and the least of them, mm.
 VOXELS_OF_JAW, LEAST_VOXEL = 250.0, 0.5
-# Longest extent of a skin from a face mask to a head with neck, and of bones, mm.
-SKIN_EXTENT, BONE_EXTENT = (110.0, 420.0), (15.0, 320.0)
+# Longest extent of bones, mm.
+BONE_EXTENT = (15.0, 320.0)
 # Share of a piece in a bone from which on it is part of it, and distance that counts as in it, mm.
 PART_SHARE, NEAR = 0.8, 0.6
 # The jaw's middle lies so far in front of the cranium's, mm, for this to tell the frame.

@@ -31,6 +31,8 @@ POSTERIOR_LANDMARKS = ("supraglenoid_L", "supraglenoid_R")
 UNITS: Mapping[str, float] = MappingProxyType(
     {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "inch": 25.4}
 )
+# Longest extent of a skin from a face mask to a head with neck, mm.
+SKIN_EXTENT = (110.0, 420.0)
 FRAMES = ("LPS", "RAS")
 # What the numbers of a transform file do, in 3D Slicer's words: carry a bone from where it is to
 # where it goes, or the moved bone back.

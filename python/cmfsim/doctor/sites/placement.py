@@ -16,12 +16,10 @@ from cmfsim.errors import ImageError
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
 from cmfsim.surfaces.repair import INNER_WALL
-from cmfsim.values.case_parts import UNITS
+from cmfsim.values.case_parts import SKIN_EXTENT, UNITS
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
-# Longest extent of a skin surface from a face mask to a head with neck, mm.
-SKIN_EXTENT = (110.0, 420.0)
 # Longest extents that other units give a head, and their name; normalised to 1 or to −1…1.
 OTHER_UNITS: Sequence[tuple[str, float, float, float]] = (
     ("m", 0.11, 0.42, 1000.0),
