@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, SurfaceMotion, rigid_fit
 from cmfsim.errors import BoundaryInputError, RegistrationError
 from cmfsim.surfaces.checks import duplicate_triangles, has_three_corners, thin_triangles
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.checks import Floats, Plain, in_files
 from cmfsim.values.motion import carried
-from cmfsim.values.surface_data import MovedSurface, SurfaceData, used_nodes
+from cmfsim.values.surface_data import MovedSurface, SurfaceData, triangle_areas, used_nodes
 
 # An edge is torn if its ends move apart by more than this, mm, and by more than this share of its
 # length: noise of 0.3 mm per vertex does the first to one edge in 10 000, and a turn of 15° the
@@ -138,7 +139,7 @@ def missing_patches(
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)
-    off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
+    off = distances(moved, bone)
     far = np.flatnonzero((off > REMOVED_RIM) & (off < shown))
     gone = np.zeros(len(here), dtype=bool)
     if _encloses(bone):
@@ -191,13 +192,6 @@ def _rigid(here: Floats, there: Floats) -> Floats | None:
         return rigid_fit(here, there).matrix
     except RegistrationError:
         return None
-
-
-def triangle_areas(vertices: Floats, triangles: Integers) -> Floats:
-    """The area of each triangle, (t,) mm²."""
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    areas: Floats = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return areas
 
 
 def _part(motion: MovedSurface, triangles: Integers) -> MovedSurface:

@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import dataclasses
-import json
 import logging
 import sys
 import textwrap
@@ -25,6 +24,7 @@ from cmfsim.cli.terminal import (
     columns,
     escaped,
     in_colour,
+    print_json,
     print_text,
 )
 from cmfsim.doctor import Examination, examine, findings_text
@@ -104,7 +104,7 @@ def init(options: argparse.Namespace) -> int:
     folder = options.folder if options.folder.is_dir() else options.folder.parent
     case = folder / CASE_FILE
     if options.json:
-        print(json.dumps({"case": str(case), **draft.as_dict()}, allow_nan=False))
+        print_json({"case": str(case), **draft.as_dict()})
         return DONE
     for entry in draft.taken:
         is_open = entry.question or not entry.taken_for
@@ -133,7 +133,7 @@ def doctor(options: argparse.Namespace) -> int:
         counts = {f"{s}s": sum(f.severity == s for f in findings) for s in SEVERITIES}
         entries = [dataclasses.asdict(finding) for finding in findings]
         report = {"case": case.name, "file": str(case.file), **counts, "plan": plan}
-        print(json.dumps({**report, "findings": entries}, allow_nan=False))
+        print_json({**report, "findings": entries})
     else:
         for line in plan_lines(plan):
             print_text(f"plan: {escaped(line)}")
@@ -159,7 +159,7 @@ def build(options: argparse.Namespace) -> int:
     if not options.no_doctor:
         summary["timings"] = {"checking the case": seconds, **summary["timings"]}
     if options.json:
-        print(json.dumps(summary, allow_nan=False))
+        print_json(summary)
         return DONE
     width = min(columns(), WIDTH) if sys.stdout.isatty() else WIDTH
     print_text(build_text(summary, width=width))
@@ -252,7 +252,7 @@ def view(options: argparse.Namespace) -> int:
     if options.json:
         names = [part.name for part in parts]
         picture = None if options.screenshot is None else str(options.screenshot)
-        print(json.dumps({"parts": names, "screenshot": picture}))
+        print_json({"parts": names, "screenshot": picture})
     elif options.screenshot is not None:
         print_text(f"wrote {options.screenshot}")
     return DONE

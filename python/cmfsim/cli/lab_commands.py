@@ -1,13 +1,12 @@
 """`cmfsim phantom`, `virtual-patients`, `benchmark` and `bench frontier`: methods are tried."""
 
 import argparse
-import json
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 from cmfsim.cli import DONE
-from cmfsim.cli.terminal import StageProgress, argument, escaped, print_text
+from cmfsim.cli.terminal import StageProgress, argument, escaped, print_json, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.io.results.populations import FAILED, MADE, PARTS, PENDING
@@ -76,7 +75,7 @@ def frontier(options: argparse.Namespace) -> int:
         names = write_frontier(options.output, found)
     if options.json:
         answer = {**found.as_dict(), "output": str(options.output), "files": names}
-        print(json.dumps(answer, allow_nan=False))
+        print_json(answer)
     else:
         print_text(_frontier_text(found))
         print_text(f"written  {escaped(str(options.output))}: {', '.join(names)}")
@@ -125,7 +124,7 @@ def phantom(options: argparse.Namespace) -> int:
         progress.stage("imaging it")
         case = write_phantom_case(options.folder, head, spacing=spacing)
     if options.json:
-        print(json.dumps({"case": str(case)}, allow_nan=False))
+        print_json({"case": str(case)})
     else:
         print_text(f"wrote {case}; build it with: cmfsim build {case}")
     return DONE
@@ -149,7 +148,7 @@ def virtual_patients(options: argparse.Namespace) -> int:
             progress=progress.stage,
         )
     if options.json:
-        print(json.dumps({"cases": [str(case) for case in cases]}, allow_nan=False))
+        print_json({"cases": [str(case) for case in cases]})
     else:
         for case in cases:
             print_text(f"wrote {case} (in silico); the truth is in {case.parent / 'truth'}")
@@ -183,7 +182,7 @@ def _population(options: argparse.Namespace) -> int:
     )
     if options.json:
         patients = {name: entry.as_dict() for name, entry in found.patients.items()}
-        print(json.dumps({"settings": dict(found.settings), "patients": patients}))
+        print_json({"settings": dict(found.settings), "patients": patients})
         return DONE
     counts = ", ".join(f"{len(found.named(MADE, part))} {part}" for part in PARTS)
     print_text(f"{len(found.patients)} patients drawn (in silico): {counts}")

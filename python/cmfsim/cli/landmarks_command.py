@@ -1,7 +1,6 @@
 """`cmfsim landmarks`: automatic landmarks of a case, with a picture to confirm them."""
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Mapping
@@ -13,7 +12,7 @@ import numpy as np
 
 from cmfsim.cli import DONE
 from cmfsim.cli.case_commands import print_findings
-from cmfsim.cli.terminal import StageProgress, escaped, open_page, print_text
+from cmfsim.cli.terminal import StageProgress, escaped, open_page, print_json, print_text
 from cmfsim.errors import CmfsimError, LandmarkError
 from cmfsim.io import Case
 from cmfsim.io.landmarks import write_landmarks
@@ -74,7 +73,7 @@ def landmarks(options: argparse.Namespace) -> int:
         "findings": [asdict(finding) for finding in findings],
     }
     if options.json:
-        print(json.dumps(report, allow_nan=False))
+        print_json(report)
         return DONE
     _print(report, found)
     print_findings(findings, sys.stdout)

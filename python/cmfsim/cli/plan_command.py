@@ -1,7 +1,6 @@
 """`cmfsim plan`, `cmfsim splint` and `cmfsim bite` of a case; `cmfsim desk`: scan to plan."""
 
 import argparse
-import json
 import sys
 import time
 import webbrowser
@@ -13,7 +12,7 @@ import numpy as np
 
 from cmfsim.cli import DONE
 from cmfsim.cli.case_commands import band_options, case_of, checked
-from cmfsim.cli.terminal import StageProgress, can_open, escaped, open_page, print_text
+from cmfsim.cli.terminal import StageProgress, can_open, escaped, open_page, print_json, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface, write_plan, write_surface
 from cmfsim.pipeline.building.inputs import check_output, plan_key
@@ -59,7 +58,7 @@ def plan(options: argparse.Namespace) -> int:
         return DONE
     if options.json:
         answer = {"case": case.name, "seconds": seconds, **made.as_dict()}
-        print(json.dumps({**answer, "findings": notices.as_dicts()}, allow_nan=False))
+        print_json({**answer, "findings": notices.as_dicts()})
         return DONE
     print_text(f"page   {escaped(str(made.path))} ({made.path.stat().st_size / 1e6:.1f} MB)")
     print_text(f"error  {_error_text(made.errors)}")
@@ -77,7 +76,7 @@ def plan(options: argparse.Namespace) -> int:
 def _show(options: argparse.Namespace, what: str, url: str) -> None:
     """Prints the address of a page that is served, and opens it."""
     if options.json:
-        print(json.dumps({"url": url}), flush=True)
+        print_json({"url": url}, flush=True)
     else:
         print_text(f"{what}   {url}\nOnly this machine can open it; stop with Ctrl-C.", flush=True)
     if not options.no_open and can_open():
@@ -184,7 +183,7 @@ def splint_case(options: argparse.Namespace) -> int:
         "opening_degrees": made.opening,
     }
     if options.json:
-        print(json.dumps({"case": case.name, **values}, allow_nan=False))
+        print_json({"case": case.name, **values})
         return DONE
     print_text(f"splint {kind}: {escaped(str(path))}")
     print_text(
@@ -215,7 +214,7 @@ def bite_case(options: argparse.Namespace) -> int:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_plan(path, plan, made_for=plan_key(case))
     if options.json:
-        print(json.dumps({"case": case.name, "file": str(path), **bite.as_dict()}))
+        print_json({"case": case.name, "file": str(path), **bite.as_dict()})
         return DONE
     print_text(f"plan   {escaped(str(path))}: cmfsim predict --plan")
     print_text(

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import json
 import logging
 import sys
 import time
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli import DONE, FAILED
-from cmfsim.cli.terminal import Notices, StageProgress, escaped, open_page, print_text
+from cmfsim.cli.terminal import Notices, StageProgress, escaped, open_page, print_json, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.io import read_plan, read_scene, result_suffixes, write_result
 from cmfsim.lab.virtual.demo import DemoCase, write_demo_case
@@ -39,7 +38,7 @@ def solve(options: argparse.Namespace) -> int:
     size = np.linalg.norm(result.displacements, axis=1)
     if options.json:
         extra = {"output": str(options.output), "seconds": seconds, "largest": float(size.max())}
-        print(json.dumps({**summary, **extra}, allow_nan=False))
+        print_json({**summary, **extra})
         return DONE
     print_text(f"solved        {summary['n_tets']} tets, {summary['n_unknowns']} unknowns")
     print_text(f"method        {summary['method']}, {summary['iterations']} iterations")
@@ -105,7 +104,7 @@ def info(options: argparse.Namespace) -> int:
             "tissue": scene.header()["tissue"], "segments": counts,
             "solver": scene.options.header(),
         }  # fmt: skip
-        print(json.dumps(answer, allow_nan=False))
+        print_json(answer)
         return DONE
     print_text("\n".join(map(escaped, repr(scene).split("\n"))))
     if len(nodes):
@@ -141,7 +140,7 @@ def demo(options: argparse.Namespace) -> int:
     seconds = time.perf_counter() - begun
     if options.json:
         answer = {"case": str(made.case.file), "report": str(page), "seconds": seconds}
-        print(json.dumps({**answer, "findings": notices.as_dicts()}, allow_nan=False))
+        print_json({**answer, "findings": notices.as_dicts()})
         return DONE
     print_text(f"case    {escaped(str(made.case.file))}")
     for finding in notices.findings:

@@ -13,7 +13,7 @@ from typing import Any
 
 from cmfsim.cli import DONE, FAILED
 from cmfsim.cli.case_commands import band_options, case_of, checked
-from cmfsim.cli.terminal import Notices, StageProgress, escaped, print_text
+from cmfsim.cli.terminal import Notices, StageProgress, escaped, print_json, print_text
 from cmfsim.errors import CmfsimError
 from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
 from cmfsim.io.results.predictions import predictions_of
@@ -81,7 +81,7 @@ def predict(options: argparse.Namespace) -> int:
         entries = [_figures(entry, case.output) for entry in written.predictions]
         answer = {"case": case.name, "predictions": entries, "failed": failed}
         more = {"findings": notices.as_dicts(), "left_out": written.left_out}
-        print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
+        print_json({**answer, **more, "report": written.report})
         return FAILED if failed else DONE
     summary = written.predictions[0].summary
     print_text(_plan_text(summary))
@@ -146,7 +146,7 @@ def evaluate(options: argparse.Namespace) -> int:
     if options.json:
         answer = {**values, "output": str(case.output), "files": written.files}
         more = {"findings": notices.as_dicts(), "left_out": written.left_out}
-        print(json.dumps({**answer, **more, "report": written.report}, allow_nan=False))
+        print_json({**answer, **more, "report": written.report})
         return code
     print_text(_plan_text(found.predictions[0].summary))
     print_text(_text_of(summary_blocks(values)))
@@ -189,7 +189,7 @@ def sensitivity(options: argparse.Namespace) -> int:
     with replacing(case.output / "sensitivity.json") as file:
         file.write(f"{text}\n".encode())
     if options.json:
-        print(json.dumps(values, allow_nan=False))
+        print_json(values)
         return DONE
     print_text(
         f"{escaped(case.name)}, model {options.model}: mean distances from the positions under "
@@ -234,7 +234,7 @@ def study(options: argparse.Namespace) -> int:
         )
     names = write_study_report(found)
     if options.json:
-        print(json.dumps({**found.as_dict(), "files": names}, allow_nan=False))
+        print_json({**found.as_dict(), "files": names})
     else:
         print_text(_shown(study_text(found.as_dict())))
         print_text(f"written       {escaped(str(cohort.output))}: {', '.join(names)}")
@@ -287,7 +287,7 @@ def _study_variants(cohort: Cohort, options: argparse.Namespace) -> int:
     names = write_variants_report(found)
     if options.json:
         more = {"output": str(found.output), "files": names}
-        print(json.dumps({**found.as_dict(), **more}, allow_nan=False))
+        print_json({**found.as_dict(), **more})
     else:
         print_text(_shown(found.text()))
         print_text(f"written       {escaped(str(found.output))}: {', '.join(names)}")
@@ -312,7 +312,7 @@ def report(options: argparse.Namespace) -> int:
         return FAILED
     if options.json:
         clinical = {e["model"]: e.get("clinical") for e in predictions_of(folder).values()}
-        print(json.dumps({"output": str(folder), "report": name, **pages, "clinical": clinical}))
+        print_json({"output": str(folder), "report": name, **pages, "clinical": clinical})
     else:
         for written in (name, *pages.values()):
             _print_report(folder, written)

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from cmfsim.cli import BAD_INPUT, DONE
 from cmfsim.cli.case_commands import print_findings
-from cmfsim.cli.terminal import StageProgress, escaped, print_text
+from cmfsim.cli.terminal import StageProgress, escaped, print_json, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.muscles.template import (
     MorphedMusculature,
@@ -41,7 +40,7 @@ def list_templates(options: argparse.Namespace) -> int:
             {"name": name, "muscles": muscles, "landmarks": list(template.landmarks), **texts}
         )
     if options.json:
-        print(json.dumps({"templates": entries}, allow_nan=False))
+        print_json({"templates": entries})
         return DONE
     for entry in entries:
         counts = f"{len(entry['muscles'])} muscles, {len(entry['landmarks'])} landmarks"
@@ -57,7 +56,7 @@ def check(options: argparse.Namespace) -> int:
     if options.json:
         counts = {f"{s}s": sum(f.severity == s for f in findings) for s in SEVERITIES}
         entries = [dataclasses.asdict(finding) for finding in findings]
-        print(json.dumps({"template": options.template, **counts, "findings": entries}))
+        print_json({"template": options.template, **counts, "findings": entries})
     else:
         print_findings(findings, sys.stdout)
     return BAD_INPUT if any(f.severity == "error" for f in findings) else DONE
@@ -82,7 +81,7 @@ def import_atlas(options: argparse.Namespace) -> int:
         }
         template.save(options.output, report=_beside(options.output, report))
     if options.json:
-        print(json.dumps({"folder": str(options.output), **report}, allow_nan=False))
+        print_json({"folder": str(options.output), **report})
         return DONE
     print_findings(template.findings, sys.stdout)
     print_text(
@@ -105,7 +104,7 @@ def morph(options: argparse.Namespace) -> int:
         }
         muscles.save(options.output, report=_beside(options.output, report))
     if options.json:
-        print(json.dumps({"folder": str(options.output), **report}, allow_nan=False))
+        print_json({"folder": str(options.output), **report})
         return DONE
     if muscles.findings:
         print_findings(muscles.findings, sys.stdout)
@@ -125,7 +124,7 @@ def show(options: argparse.Namespace) -> int:
             muscles = _chosen(template, options.only)
         picture_muscles(path, muscles, template.skull, fibres=options.fibres)
     if options.json:
-        print(json.dumps({"picture": str(path), "muscles": [m.name for m in muscles]}))
+        print_json({"picture": str(path), "muscles": [m.name for m in muscles]})
     else:
         print_text(f"wrote {path}: {len(muscles)} muscles")
     return DONE

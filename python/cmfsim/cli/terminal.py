@@ -1,6 +1,7 @@
 """What commands print: progress, tables, and findings as they arise and at the end."""
 
 import codecs
+import json
 import logging
 import os
 import shlex
@@ -152,6 +153,11 @@ def print_text(
     """Prints lines in the reader's language."""
     lines = "\n".join(map(translated, text.split("\n")))
     print(lines, file=file, flush=flush, end=end)
+
+
+def print_json(values: Mapping[str, Any], *, flush: bool = False) -> None:
+    """Prints values as a line that programs read: NaN and infinity are an error, not JSON."""
+    print(json.dumps(values, allow_nan=False), flush=flush)
 
 
 def print_error(error: BaseException) -> None:

@@ -9,6 +9,7 @@ from cmfsim.drafting.choices import SAMPLES, TURN, Anatomy, Question, Taken
 from cmfsim.drafting.finds import SurfaceFind
 from cmfsim.drafting.roles import JAWS_OF_TEETH, MOVING, safe_key
 from cmfsim.meshing.levels import signed_level
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import surface_of_level
 from cmfsim.values.case_parts import SKIN_EXTENT, UNITS
 from cmfsim.values.checks import Floats
@@ -101,10 +102,8 @@ def _jaw_of(anatomy: Anatomy, teeth: SurfaceFind) -> str | None:
     away = {}
     for name in found.values():
         bone = anatomy.bones[name]
-        closest, _, _ = SurfaceData(anatomy.placed(bone), bone.surface.triangles).searched.closest(
-            points
-        )
-        away[name] = float(np.quantile(np.linalg.norm(closest - points, axis=1), 0.9))
+        placed = SurfaceData(anatomy.placed(bone), bone.surface.triangles)
+        away[name] = float(np.quantile(distances(points, placed.searched), 0.9))
     near, far = sorted(away, key=away.__getitem__) if len(away) == 2 else ("", "")
     return near if near and away[near] < NEARER * away[far] else None
 
@@ -279,8 +278,7 @@ def _share(piece: SurfaceFind, whole: SurfaceFind) -> float:
     points = piece.surface.vertices
     points = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLES)], dtype=np.float64)
     index = whole.surface.searched
-    closest, _, _ = index.closest(points)
-    near = np.linalg.norm(closest - points, axis=1) < NEAR * whole.extent.max() / 150.0
+    near = distances(points, index) < NEAR * whole.extent.max() / 150.0
     inside = index.winding_number(points) > 0.5
     return float((near | inside).mean())
 

@@ -14,7 +14,7 @@ from cmfsim.surfaces.depth import barycentric
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats, as_floats, as_rows
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
-from cmfsim.values.surface_data import SurfaceData, used_nodes
+from cmfsim.values.surface_data import SurfaceData, used_nodes, vertex_areas
 
 # Left and up in the view from the front, mm.
 Place = tuple[float, float]
@@ -296,14 +296,7 @@ class Skin:
 
     def vertex_areas(self) -> Floats:
         """A third of the area of the triangles round each vertex, (v,) mm²."""
-        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
-        third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
-        return np.asarray(
-            np.bincount(
-                self.triangles.ravel(), weights=np.repeat(third, 3), minlength=len(self.vertices)
-            ),
-            dtype=np.float64,
-        )
+        return vertex_areas(self.vertices, self.triangles)
 
     def covered(self) -> NDArray[np.bool_]:
         """Which vertices have other skin within 3 mm in front of them, such as between lips, (v,).

@@ -16,7 +16,7 @@ import numpy as np
 
 from cmfsim.pictures.charts import write_figure
 from cmfsim.values.checks import Floats
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, triangle_areas
 
 # Inches of both panels, so that the letters of one are legible across a column of the chart.
 PANELS, DPI = (6.4, 3.2), 220
@@ -175,8 +175,7 @@ def _shells(surface: SurfaceData, axes: Floats, window: Floats) -> Floats:
     across, high = (int(size) for size in np.ceil(np.ptp(window, axis=1) / PIXEL))
     total = np.zeros(high * across)
     corners = surface.vertices[surface.triangles]
-    edges = corners[:, 1:] - corners[:, :1]
-    areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    areas = triangle_areas(surface.vertices, surface.triangles)
     flat = (corners @ axes[:2].T - window[:, 0]) / PIXEL
     longest = np.linalg.norm(flat - np.roll(flat, 1, axis=1), axis=2).max(axis=1)
     # Each triangle as points closer to each other than pixels are, with their share of it.

@@ -19,7 +19,7 @@ from cmfsim.values.motion import decompose_motion, plan_digits
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.scene import Scene, SegmentData
-from cmfsim.values.surface_data import MovedSurface, SurfaceData
+from cmfsim.values.surface_data import MovedSurface, SurfaceData, area_vectors
 
 # Skin fails in tension at a stretch of about 1.5 (Ní Annaidh et al. 2012: 54 % ± 17 % at failure).
 MOST_STRETCH = 1.5
@@ -306,7 +306,7 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
     edges = np.column_stack(np.divmod(np.unique(ends @ [len(before), 1]), len(before)))
     rest, now = (np.linalg.norm(np.subtract(*v[edges.T]), axis=1) for v in (before, after))
     torn = (now > MOST_STRETCH * rest) & (now - rest > VISIBLE_LENGTH)
-    one, other = (_areas(v[triangles]) for v in (before, after))
+    one, other = (area_vectors(v, triangles) for v in (before, after))
     turned = (np.einsum("ta,ta->t", one, other) < 0.0) & (
         np.linalg.norm(one, axis=1) > VISIBLE_AREA
     )
@@ -336,8 +336,3 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
         ", and ".join(facts),
         where=f"about ({place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f}) mm",
     )
-
-
-def _areas(corners: Floats) -> Floats:
-    """The area vectors of triangles given by their corners, (t, 3) mm²."""
-    return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

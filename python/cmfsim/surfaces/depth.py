@@ -24,8 +24,7 @@ def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
     places = as_rows("points", points, 3)
     depth = np.full(len(places), np.inf)
     for bone in bones:
-        closest, _, _ = bone.searched.closest(places)
-        depth = np.minimum(depth, np.linalg.norm(closest - places, axis=1))
+        depth = np.minimum(depth, distances(places, bone.searched))
     if len(depth) and not np.isfinite(depth).all():
         raise MeshInputError(
             "the depth of the soft tissue needs at least one bone, but there is none"

@@ -17,7 +17,7 @@ from cmfsim.surfaces.checks import (
 from cmfsim.surfaces.topology import component_labels, connected_labels, edges_of, orientation_flips
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
-from cmfsim.values.surface_data import SurfaceData, used_nodes
+from cmfsim.values.surface_data import SurfaceData, triangle_areas, used_nodes
 
 # Vertices closer than this share of the surface's extent are merged: 0.03 µm on a head, less than
 # the resolution of single precision.
@@ -305,8 +305,7 @@ def _with_turned_edges(triangles: Integers, flat: Integers, longest: Integers) -
 
 def _without_debris(vertices: Floats, triangles: Integers) -> tuple[Integers, int]:
     labels = component_labels(edges_of(triangles), len(triangles))
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    areas = np.bincount(labels, weights=0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    areas = np.bincount(labels, weights=triangle_areas(vertices, triangles))
     keep = areas >= KEEP_SHARE * areas.max()
     return triangles[keep[labels]], int((~keep).sum())
 

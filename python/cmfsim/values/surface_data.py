@@ -36,6 +36,23 @@ def used_nodes(cells: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64
     return np.flatnonzero(used).astype(np.int64), number[cells]
 
 
+def area_vectors(vertices: Floats, triangles: NDArray[np.integer]) -> Floats:
+    """The normal of each triangle, as long as its area, (t, 3) mm²."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    return np.asarray(0.5 * np.cross(b - a, c - a))
+
+
+def triangle_areas(vertices: Floats, triangles: NDArray[np.integer]) -> Floats:
+    """The area of each triangle, (t,) mm²."""
+    return np.asarray(np.linalg.norm(area_vectors(vertices, triangles), axis=1))
+
+
+def vertex_areas(vertices: Floats, triangles: NDArray[np.integer]) -> Floats:
+    """A third of the area of the triangles round each vertex, (v,) mm²."""
+    thirds = np.repeat(triangle_areas(vertices, triangles) / 3.0, 3)
+    return np.bincount(triangles.ravel(), thirds, len(vertices)).astype(np.float64)
+
+
 @dataclass(frozen=True, eq=False)
 class SurfaceData(Frozen):
     """A triangle surface.

@@ -19,20 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, rigid_fit
-from cmfsim.bones.motion import RemovedBone, missing_patches, triangle_areas
-from cmfsim.bones.pairs.shape_fit import (
-    LEAST_SIGMA,
-    TO_SIGMA,
-    TUKEY,
-    ShapeFit,
-    fit_shape,
-    vertex_areas,
-)
+from cmfsim.bones.motion import RemovedBone, missing_patches
+from cmfsim.bones.pairs.shape_fit import LEAST_SIGMA, TO_SIGMA, TUKEY, ShapeFit, fit_shape
 from cmfsim.errors import BoundaryInputError, RegistrationError, third_party
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.topology import connected_labels, edges_of
 from cmfsim.values.checks import Floats, Plain, in_files
 from cmfsim.values.motion import carried
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, triangle_areas, vertex_areas
 
 # A vertex is off if it lies further from the bone than this, mm, three times the accuracy of a
 # segmented bone, and than this many times the rms of the fit: noise does so to 1 vertex in 10 000.
@@ -118,8 +112,8 @@ def stray_patches(
         if not stray.any():
             break
         asked = np.flatnonzero(stray)
-        nearest = Surface(other.vertices, other.triangles).closest(here[asked])[0]
-        stray[asked[np.linalg.norm(nearest - here[asked], axis=1) <= CUT_FACE]] = False
+        away = distances(here[asked], Surface(other.vertices, other.triangles))
+        stray[asked[away <= CUT_FACE]] = False
     if not stray.any():
         return (), off
     normals = Surface(segment.vertices, segment.triangles).vertex_normals
@@ -156,7 +150,7 @@ class AlongSurface:
     def __init__(self, surface: SurfaceData) -> None:
         self.here = surface.vertices
         self.ends = edges_of(surface.triangles.astype(np.int64)).ends
-        self.areas = np.maximum(vertex_areas(surface), LEAST_AREA)
+        self.areas = np.maximum(vertex_areas(surface.vertices, surface.triangles), LEAST_AREA)
 
     @cached_property
     def _walk(self) -> tuple[Any, float]:
@@ -253,7 +247,7 @@ def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
     gone = np.zeros(len(here), dtype=bool)
     for patch in removed:
         gone[patch.vertices] = True
-    areas = vertex_areas(before)
+    areas = vertex_areas(before.vertices, before.triangles)
     total = areas.sum()
     moved = carried(fit.matrix, here)
     large = [patch.vertices for patch in removed if patch.area >= LEAST_STRAY]
@@ -303,5 +297,4 @@ def _is_displaced(here: Floats, there: Floats, bone: Surface, patch: NDArray[np.
         # Squeezed to a point or a line.
         return False
     moved = carried(own, here[patch])
-    off = np.linalg.norm(bone.closest(moved)[0] - moved, axis=1)
-    return bool((off <= OWN).mean() >= OWN_SHARE)
+    return bool((distances(moved, bone) <= OWN).mean() >= OWN_SHARE)

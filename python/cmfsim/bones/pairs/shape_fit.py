@@ -14,7 +14,7 @@ from cmfsim._core import Surface
 from cmfsim.errors import RegistrationInputError
 from cmfsim.values.checks import Floats, Frozen, Plain, frozen, in_files
 from cmfsim.values.motion import carried, rigid_motion
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, vertex_areas
 
 # Tukey's constant, with which the biweight is 95 % as efficient as least squares on normal noise,
 # and what makes the median of absolute values a standard deviation (Huber 1981).
@@ -155,7 +155,9 @@ def fit_shape(
     points = segment.vertices
     middle = points.mean(axis=0)
     own = Surface(segment.vertices, segment.triangles)
-    whole = _Sample(points - middle, own.vertex_normals, vertex_areas(segment))
+    whole = _Sample(
+        points - middle, own.vertex_normals, vertex_areas(segment.vertices, segment.triangles)
+    )
     # Points from all over the segment, in whatever order the file has the vertices.
     few = whole.some(np.random.default_rng(0).permutation(len(points))[:most_points])
     radius = float(np.sqrt((few.arms**2).sum(axis=1).mean()))
@@ -313,12 +315,3 @@ def _blocks(points: Floats) -> NDArray[np.int64]:
     for n, block in enumerate(blocks):
         number[block] = n
     return number
-
-
-def vertex_areas(surface: SurfaceData) -> Floats:
-    """A third of the triangles round each vertex, mm²."""
-    vertices = surface.vertices
-    triangles = surface.triangles.astype(np.int64)
-    a, b, c = (vertices[triangles[:, i]] for i in range(3))
-    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return np.asarray(np.bincount(triangles.ravel(), np.repeat(areas / 3.0, 3), len(vertices)))

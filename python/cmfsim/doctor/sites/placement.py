@@ -15,6 +15,7 @@ from cmfsim.doctor.sites.landmarks import (
 from cmfsim.errors import ImageError
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.repair import INNER_WALL
 from cmfsim.values.case_parts import SKIN_EXTENT, UNITS
 from cmfsim.values.checks import Floats
@@ -404,8 +405,7 @@ def _check_bone_inside(evidence: Evidence, name: str, body: Body) -> Iterator[Fi
     if not outside.any():
         return
     depth = np.zeros(len(points))
-    closest = skin.index.closest(points[outside])[0]
-    depth[outside] = np.linalg.norm(closest - points[outside], axis=1)
+    depth[outside] = distances(points[outside], skin.index)
     share = float(outside.mean())
     if share > ELSEWHERE_SHARE and (thickness := _shell_thickness(skin, body)) is not None:
         yield Finding(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.doctor.evidence import place_text
+from cmfsim.surfaces.depth import distances
 from cmfsim.values.anatomy import LOWER_BEARERS, UPPER_BEARERS
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -101,9 +102,7 @@ class BonePart:
         searched = surface.searched
         inside = inside[searched.winding_number(places[inside]) > 0.5]
         inside = inside[self.owns(places[inside])]
-        if len(inside):
-            closest = searched.closest(places[inside])[0]
-            found[inside] = np.linalg.norm(closest - places[inside], axis=1)
+        found[inside] = distances(places[inside], searched)
         return found
 
 

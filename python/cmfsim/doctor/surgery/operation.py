@@ -19,6 +19,7 @@ from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.meshes.photos import read_photo
 from cmfsim.io.meshes.surfaces import surface_as_stored
 from cmfsim.io.slicer.transforms import motion_in_lps
+from cmfsim.surfaces.depth import distances
 from cmfsim.values.anatomy import JAWS
 from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
 from cmfsim.values.checks import Floats
@@ -106,11 +107,10 @@ def _check_landmarks(case: Case, file: Path, skin: SurfaceData) -> Iterator[Find
     where = case.where("postoperative.landmarks")
     try:
         places = read_landmark_file(file, frame=case.landmarks.frame).points
-        closest, _, _ = Surface(skin.vertices, skin.triangles).closest([*places.values()])
+        away = distances(np.array([*places.values()]), Surface(skin.vertices, skin.triangles))
     except CmfsimError as error:
         yield _unreadable(where, error)
         return
-    away = np.linalg.norm(closest - np.array([*places.values()]), axis=1)
     far = [n for n, d in zip(places, away, strict=True) if d > LANDMARK_WARNING]
     if far:
         more = ", …" if len(far) > 4 else ""
@@ -371,8 +371,7 @@ def _check_through_skin(
     through = np.flatnonzero(inside_before & outside_after)
     if not len(through):
         return
-    closest = skin.index.closest(moved[through])[0]
-    depth = np.linalg.norm(closest - moved[through], axis=1)
+    depth = distances(moved[through], skin.index)
     if depth.max() <= THROUGH_SKIN:
         return
     worst = int(np.argmax(depth))

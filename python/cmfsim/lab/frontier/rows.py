@@ -13,6 +13,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.evaluation import SKIN_LANDMARKS, DistanceStatistics, distance_statistics, skin_regions
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
+from cmfsim.surfaces.depth import distances
 from cmfsim.values.checks import Floats, as_floats, as_rows, plain
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.table import csv_of
@@ -48,7 +49,7 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
     vertices = face.vertices
     landmarks = patient.landmarks.get("skin", {})
     skin = Surface(patient.skin.vertices, patient.skin.triangles)
-    on_tissue = np.linalg.norm(skin.closest(vertices)[0] - vertices, axis=1) <= ON_TISSUE
+    on_tissue = distances(vertices, skin) <= ON_TISSUE
     regions = {WHOLE: on_tissue}
     if set(SKIN_LANDMARKS) <= set(landmarks):
         regions = skin_regions(vertices, landmarks)

@@ -149,11 +149,8 @@ def _bearers(
     own; what lies behind the upper teeth are the pterygoid processes, from which muscles arise.
     """
     places = np.array([p for arch in arches.values() for p in (arch.tip, arch.left, arch.right)])
-    distances = []
-    for segment in segments:
-        closest, _, _ = segment.surface.searched.closest(places)
-        distances.append(np.linalg.norm(closest - places, axis=1))
-    nearest = np.argmin(distances, axis=0).reshape(len(arches), 3)
+    away = [distances(places, segment.surface.searched) for segment in segments]
+    nearest = np.argmin(away, axis=0).reshape(len(arches), 3)
     bearers = {jaw: set(near.tolist()) for jaw, near in zip(arches, nearest, strict=True)}
     bones = {name: bone.values > 0.0 for name, bone in anatomy.bones.items()}
     owners = [_bone_of(bones, segment) for segment in segments]

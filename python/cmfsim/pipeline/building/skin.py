@@ -31,7 +31,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.patient_model import LiftedTissue
 from cmfsim.values.scene import NODE_KINDS, NodeKinds
-from cmfsim.values.surface_data import SurfaceData, used_nodes
+from cmfsim.values.surface_data import SurfaceData, triangle_areas, used_nodes
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 
 # Held nodes that a body needs: three hold it unless they are in line.
@@ -326,8 +326,7 @@ def with_photo(head: Head) -> tuple[SurfaceData, NDArray[np.uint8], Finding]:
         ours = head.landmarks.get("skin", {})
         matrix = _registered(scale * photo.vertices, points, ours, skin, where)
     vertices = scale * photo.vertices @ matrix[:3, :3].T + matrix[:3, 3]
-    closest, _, _ = skin.searched.closest(vertices)
-    away = float(np.median(np.linalg.norm(closest - vertices, axis=1)))
+    away = float(np.median(distances(vertices, skin.searched)))
     if away > MOST_AWAY:
         raise CaseInputError(
             f"{where}: half of the 3D photo lies {away:.1f} mm from the skin or more (at most "
@@ -480,9 +479,7 @@ def _without_specks(
     # Patches are connected by edges between triangles of one choice.
     alike = chosen[edges.pairs[:, 0]] == chosen[edges.pairs[:, 1]]
     patch = connected_labels(edges.pairs[alike], len(triangles))
-    a, b, c = (nodes[triangles[:, k]] for k in range(3))
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    small = np.bincount(patch, weights=area) < LEAST_PATCH
+    small = np.bincount(patch, weights=triangle_areas(nodes, triangles)) < LEAST_PATCH
     # A closed surface of its own, round a small cavity, is surrounded by nothing.
     bordered = np.zeros(len(small), dtype=bool)
     bordered[patch[edges.pairs[~alike]]] = True

@@ -27,6 +27,7 @@ from cmfsim.planning.face_measures.occlusion import (
     occlusion,
 )
 from cmfsim.planning.occlusion import bite_sites, first_molars, patient_rows, rigid_of
+from cmfsim.surfaces.depth import distances
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import profile_sites, short_name, tooth_of
@@ -124,8 +125,7 @@ def bone_sites(patient: PatientModel) -> dict[str, face.BoneSite]:
     for name, place in skull.items():
 
         def away(segment: BoneSegment, place: Any = place) -> float:
-            closest = segment.surface.searched.closest(place[None])[0][0]
-            return float(np.linalg.norm(closest - place))
+            return float(distances(place[None], segment.surface.searched)[0])
 
         sites[name] = face.BoneSite(place, min(patient.segments, key=away).name)
     with suppress(CaseInputError):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, __version__
 from cmfsim.planning.page.document import Document, document_text
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import (
@@ -197,7 +198,7 @@ def _packed(
         allowed = max(500, most[part] * len(surface.triangles) // counts[part])
         drawn = simplified_surface(name, surface, allowed)
         there = Surface(surface.vertices, surface.triangles)
-        away = np.linalg.norm(there.closest(drawn.vertices)[0] - drawn.vertices, axis=1)
+        away = distances(drawn.vertices, there)
         arrays[f"{prefix}_{number}"] = _singles(drawn.vertices)
         arrays[f"{prefix}_{number}_triangles"] = np.asarray(drawn.triangles, dtype=np.uint32)
         found.append({"name": name, "part": part, "away": round(float(away.max()), 3)})

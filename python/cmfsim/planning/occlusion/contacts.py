@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.planning.occlusion.rows import ToothRow, patient_rows, rigid_of
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.topology import connected_labels
 from cmfsim.values.checks import Floats, as_rows
 from cmfsim.values.patient_model import PatientModel
@@ -29,8 +30,7 @@ def signed_gaps(points: ArrayLike, surface: SurfaceData) -> Floats:
     surface : SurfaceData
     """
     places = as_rows("points", points, 3)
-    closest = surface.searched.closest(places)[0]
-    gaps: Floats = np.linalg.norm(closest - places, axis=1)
+    gaps = distances(places, surface.searched)
     return np.where(surface.searched.winding_number(places) > 0.5, -gaps, gaps)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import rigid_fit
 from cmfsim.errors import CaseInputError
 from cmfsim.meshing.node_kinds import dental_arches
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import (
     JAWS,
@@ -249,10 +250,7 @@ def patient_rows(patient: PatientModel) -> tuple[ToothRow, ToothRow]:
 def _bearer(segments: Sequence[BoneSegment], arch: DentalArch) -> str:
     """The segment at the front teeth; an error where molars lie on a piece of their own."""
     places = np.stack([arch.tip, arch.left, arch.right])
-    away = [
-        np.linalg.norm(segment.surface.searched.closest(places)[0] - places, axis=1)
-        for segment in segments
-    ]
+    away = [distances(places, segment.surface.searched) for segment in segments]
     nearest = np.argmin(away, axis=0)
     names = [segments[int(number)].name for number in nearest]
     front, molars = names[0], names[1:]

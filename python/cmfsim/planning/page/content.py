@@ -33,7 +33,7 @@ from cmfsim.planning.replanning import (
     PlanningModel,
     segment_boxes,
 )
-from cmfsim.surfaces.depth import barycentric
+from cmfsim.surfaces.depth import barycentric, distances
 from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -184,8 +184,7 @@ def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) 
         return surface
     fewer = simplified_surface(name, surface, most)
     there = Surface(surface.vertices, surface.triangles)
-    closest, _, _ = there.closest(fewer.vertices)
-    away = float(np.linalg.norm(closest - fewer.vertices, axis=1).max())
+    away = float(distances(fewer.vertices, there).max())
     findings.append(
         Finding(
             "page-simplified",

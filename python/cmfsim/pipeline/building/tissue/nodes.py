@@ -49,6 +49,7 @@ from cmfsim.pipeline.building.tissue.contacts import (
     without_clefts,
     without_crushed,
 )
+from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import block_of
 from cmfsim.surfaces.topology import Integers
 from cmfsim.values.anatomy import Anatomy, BoneSegment
@@ -220,8 +221,7 @@ def lip_halvings(level: ImageData, seam: LipSeam, edge_length: float) -> Counts:
     crop = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     index = np.argwhere(values[crop] > 0.0) + low
     points = level.lowest + index * spacing
-    closest, _, _ = Surface(vertices, seam.surface.triangles).closest(points)
-    near = index[np.linalg.norm(closest - points, axis=1) <= SEAM_REACH]
+    near = index[distances(points, Surface(vertices, seam.surface.triangles)) <= SEAM_REACH]
     needed[tuple(near.T)] = min(wanted, GAP_REFINEMENTS)
     return needed
 
