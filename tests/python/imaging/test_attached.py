@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import cmfsim
 from synthetic_head import AIR, SOFT, made_head
@@ -105,3 +106,23 @@ def test_pads_of_a_clamp_as_dense_as_bone_are_reported_and_no_bone(head):
         assert np.count_nonzero(found.bones[name].values > 0.0) == pytest.approx(
             np.count_nonzero(bone.values > 0.0), rel=0.01
         )
+
+
+@pytest.mark.parametrize(
+    ("density", "spread", "is_reported"), [(110.0, 8.0, True), (110.0, 90.0, False)]
+)
+def test_a_soft_rest_round_the_chin_is_reported_and_streaks_there_are_not(
+    head, density, spread, is_reported
+):
+    """On both sides alike, as thick as the chin itself, and without a step at its rim."""
+    x, y, z = head.image.axes()
+    values = np.array(head.image.values)
+    away = (x / 62.0) ** 2 + ((y + 45.0) / 58.0) ** 2 + ((z + 60.0) / 70.0) ** 2
+    rest = (away < 1.0) & (y < -60.0) & (z < -70.0) & (values < 0.0)
+    noise = np.random.default_rng(1).normal(0.0, spread, values.shape)
+    # Streaks run through several voxels.
+    values[rest] = (
+        density + (noise if spread < 50.0 else 3.0 * ndimage.gaussian_filter(noise, 1.0))[rest]
+    )
+    found = attachments(head.image.with_values(values), head)
+    assert any("denser all through" in finding.what for finding in found) == is_reported
