@@ -9,7 +9,7 @@ import cmfsim
 from cmfsim.imaging.bones.model_seeds import bite_shifts
 from cmfsim.registration.proposed.shape_model.fitted_head import LYING, fit_head
 from cmfsim.registration.proposed.shape_model.model import HINGE
-from cmfsim.registration.proposed.shape_model.samples import samples_of
+from cmfsim.registration.proposed.shape_model.samples import cut_planes, samples_of
 from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.surface_data import joined_surface
@@ -90,3 +90,41 @@ def test_the_bite_is_the_layer_with_least_bone(tilt):
 def test_rows_without_a_poorer_layer_show_no_bite():
     heights, along, dense = _rows(0.0)
     assert bite_shifts(heights, along, np.ones_like(dense), (8.0, 8.0), 1.0) is None
+
+
+TILTED = np.array([0.3, 0.5, -1.0]) / np.linalg.norm([0.3, 0.5, -1.0])
+
+
+def _ball(height, *, is_capped=False, radius=90.0, around=48):
+    """A ball that ends at a height along a tilted direction, by rings about it."""
+    side = np.cross(TILTED, [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    turns = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
+    circle = np.outer(np.cos(turns), side) + np.outer(np.sin(turns), np.cross(TILTED, side))
+    heights = -radius * np.cos(np.linspace(0.0, np.arccos(-height / radius), 40)[1:])
+    rings = [np.sqrt(max(radius**2 - h**2, 0.0)) * circle + h * TILTED for h in heights]
+    points = np.vstack([-radius * TILTED, *rings, heights[-1] * TILTED])
+    one = np.arange(around)
+    two = (one + 1) % around
+    strips = [np.column_stack([np.zeros_like(one), 1 + two, 1 + one])]
+    for k in range(len(rings) - 1):
+        a, b = 1 + k * around, 1 + (k + 1) * around
+        strips += [np.column_stack([a + one, a + two, b + one])]
+        strips += [np.column_stack([a + two, b + two, b + one])]
+    if is_capped:
+        last = len(points) - 1 - around
+        strips += [np.column_stack([last + one, last + two, np.full_like(one, len(points) - 1)])]
+    return cmfsim.SurfaceData(points, np.vstack(strips).astype(np.uint32))
+
+
+@pytest.mark.parametrize("is_capped", [True, False])
+def test_a_surface_ends_at_an_oblique_plane(is_capped):
+    (cut,) = cut_planes([_ball(50.0, is_capped=is_capped)])
+    assert cut.name == "bottom"
+    assert cut.normal @ TILTED == pytest.approx(1.0, abs=1e-6)
+    assert cut.place == pytest.approx(50.0, abs=0.01)
+
+
+def test_no_end_is_flat_that_is_round_or_beyond_which_another_surface_goes_on():
+    assert cut_planes([_ball(89.999, is_capped=True)]) == ()
+    assert cut_planes([_ball(50.0), _ball(79.999, radius=80.0)]) == ()

@@ -120,7 +120,8 @@ def with_model(
     """Sites and missing ones after the others and the model have their say.
 
     Each goes where it is likeliest. One that lies far from the model's is doubtful, as is one that
-    was not found: it is where the others place it, if the image goes on and a surface is near.
+    was not found: it is where the others place it, if the image goes on and a surface is near. It
+    is missing if the image does not.
     """
     kind = found.kind
     sites: dict[str, ProposedSite] = {}
@@ -128,6 +129,9 @@ def with_model(
     for name, site in found.sites.items():
         gap = float(np.linalg.norm(site.point - head.sites[kind, name]))
         deviations = _deviations(head, (kind, name), site)
+        if deviations >= DOUBTFUL and not head.shows(likely[kind, name][0]):
+            missing[name] = f"{IMAGE_ENDS}, by the shape of the whole head"
+            continue
         moved = _surface_place(found, name, likely[kind, name][0], size)
         point = site.point if moved is None else moved
         error, doubt = float(np.hypot(site.error, GAP_SHARE * gap)), site.doubt

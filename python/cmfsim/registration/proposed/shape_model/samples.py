@@ -1,21 +1,29 @@
 """What a head shows of bone and skin: points with normals, and where the image cuts it off."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cmfsim.errors import third_party
 from cmfsim.registration.proposed.pose import surface_samples
 from cmfsim.values.checks import Floats
 from cmfsim.values.shown_region import ShownRegion
 from cmfsim.values.surface_data import SurfaceData
 
-# A surface is cut where so much of it lies in a plane at its end, mm²: the vertex of a round head
-# has some 150 mm² there.
+# A surface is cut where so much of it lies in a plane at its end, or is missing there within an
+# open border, mm²: the vertex of a round head has some 150 mm² there.
 LEAST_CAP = 400.0
 # Thickness of that plane, mm, and cosine of its normals to the axis.
 CAP_DEPTH, CAP_NORMAL = 0.6, 0.95
+# A layer that is so many times as thick has so many times the area at the end of a ball
+# (Archimedes), the root of it at the side of a cylinder, as a neck is, and no more at a flat end.
+# An oblique end has to be nearer to the last: the second is the root of the cylinder's.
+THICKER, MOST_AREA = 5.0, 1.5
+# Flat ends of other directions are faces of the convex hull of so many vertices; no triangle of
+# such a face is smaller than this, mm².
+HULL_POINTS, SMALL_FACE = 20_000, 10.0
 ENDS = ("right", "left", "front", "back", "bottom", "top")
 # The same next to padding, mm, and the cosine between planes that are the same.
 PADDED_DEPTH, SAME = 2.0, 0.999
@@ -44,14 +52,20 @@ def cut_planes(
 ) -> tuple[CutPlane, ...]:
     """The planes at which surfaces end flat: borders of the image, padding, or a cut neck."""
     ends = [(sign * np.eye(3)[axis], CAP_DEPTH) for axis in range(3) for sign in (-1.0, 1.0)]
+    shapes = [_Shape.of(surface) for surface in surfaces]
     if shown is not None:
         # Voxels make steps of a plane that runs obliquely.
         ends += [(normal, PADDED_DEPTH) for normal in shown.normals]
+    oblique = len(ends)
+    ends += [(normal, CAP_DEPTH) for shape in shapes for normal in shape.flat_ends()]
     found: list[CutPlane] = []
     for row, (normal, depth) in enumerate(ends):
-        caps = [_cap(surface, normal, depth) for surface in surfaces]
+        caps = [shape.cap(normal, depth) for shape in shapes]
         places = [place for place, area in caps if area > LEAST_CAP]
-        if row >= len(ENDS) and shown is not None:
+        if row >= oblique:
+            # Where another surface goes on, as bone does beyond a mask of skin, nothing ends.
+            places *= max(places, default=-np.inf) > max(place for place, _ in caps) - PADDED_DEPTH
+        elif row >= len(ENDS) and shown is not None:
             near = shown.places[row - len(ENDS)] - depth
             places = [place for place in places if place > near]
         if places and not any(cut.normal @ normal > SAME for cut in found):
@@ -61,16 +75,84 @@ def cut_planes(
     return tuple(found)
 
 
-def _cap(surface: SurfaceData, normal: Floats, depth: float) -> tuple[float, float]:
-    """Place of the end of a surface along a direction, and the area that lies flat there."""
-    corners = surface.vertices[surface.triangles.astype(np.int64)]
-    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = 0.5 * np.linalg.norm(doubled, axis=1)
-    along = corners @ normal
-    end = float(along.max())
-    near = (end - along < depth).all(axis=1)
-    flat = doubled @ normal > CAP_NORMAL * 2.0 * areas
-    return end, float(areas[near & flat].sum())
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """A surface with what its flat ends are found from.
+
+    vertices: (n, 3), mm.
+    corners: (t, 3). The rows of each triangle's vertices.
+    doubled: (t, 3), mm². Twice the area of each triangle along its normal.
+    """
+
+    vertices: Floats
+    corners: NDArray[np.int64]
+    doubled: Floats
+
+    @classmethod
+    def of(cls, surface: SurfaceData) -> "_Shape":
+        corners = surface.triangles.astype(np.int64)
+        used = np.zeros(len(surface.vertices), dtype=bool)
+        used[corners] = True
+        vertices = surface.vertices[used]
+        corners = (np.cumsum(used) - 1)[corners]
+        a, b, c = (vertices[corners[:, k]] for k in range(3))
+        return cls(vertices, corners, np.cross(b - a, c - a))
+
+    def cap(self, normal: Floats, depth: float) -> tuple[float, float]:
+        """Place of the end along a direction, and the area that lies flat, or is missing, there."""
+        along = self.vertices @ normal
+        near = along.max() - along < depth
+        return float(along.max()), self._flat(normal, near) + self._missing(normal, near)
+
+    def flat_ends(self) -> Iterator[Floats]:
+        """The directions, (3,), in which the surface ends flat or open, of its convex hull."""
+        spatial = third_party("scipy.spatial", "landmarks are proposed", "imaging")
+        points = self.vertices[:: max(1, len(self.vertices) // HULL_POINTS)]
+        try:
+            hull = spatial.ConvexHull(points)
+        except spatial.QhullError:
+            # All points lie in a plane.
+            return
+        a, b, c = (points[hull.simplices[:, k]] for k in range(3))
+        areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        normals, left = hull.equations[:, :3], np.ones(len(areas), dtype=bool)
+        while left.any():
+            normal = normals[left][np.argmax(areas[left])]
+            alike = left & (normals @ normal > SAME)
+            left &= ~alike
+            if areas[alike].sum() > LEAST_CAP and self._ends_flat(normal):
+                yield normal
+            elif areas[left].max(initial=0.0) < SMALL_FACE:
+                return
+
+    def _ends_flat(self, normal: Floats) -> bool:
+        along = self.vertices @ normal
+        away = along.max() - along
+        near = away < CAP_DEPTH
+        missing = self._missing(normal, near)
+        area = self._flat(normal, near) + missing
+        if area <= LEAST_CAP:
+            return False
+        return self._flat(normal, away < THICKER * CAP_DEPTH) + missing < MOST_AREA * area
+
+    def _flat(self, normal: Floats, near: NDArray[np.bool_]) -> float:
+        """The area of the triangles between some vertices that face along a direction."""
+        doubled = self.doubled[near[self.corners].all(axis=1)]
+        lengths = np.linalg.norm(doubled, axis=1)
+        return 0.5 * float(lengths[doubled @ normal > CAP_NORMAL * lengths].sum())
+
+    def _missing(self, normal: Floats, near: NDArray[np.bool_]) -> float:
+        """The area that open borders between some vertices enclose, seen along a direction."""
+        beside = self.corners[near[self.corners].sum(axis=1) > 1]
+        starts, ends = beside.ravel(), beside[:, [1, 2, 0]].ravel()
+        count = len(self.vertices)
+        border = near[starts] & near[ends] & ~np.isin(starts * count + ends, ends * count + starts)
+        if not border.any():
+            return 0.0
+        # By Stokes' theorem; triangles run the other way round than the cap that they lack.
+        first = self.vertices[starts[border][0]]
+        one, two = (self.vertices[rows[border]] - first for rows in (starts, ends))
+        return max(-0.5 * float(np.cross(one, two).sum(axis=0) @ normal), 0.0)
 
 
 # Points on bone and skin that a fit is made with.
