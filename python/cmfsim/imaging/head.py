@@ -169,7 +169,8 @@ def _noticed(
 ) -> tuple[Sequence[Finding], Sequence[Finding]]:
     """What is noticed on the scan's values, and on what it shows of the head."""
     values = weak_bone(work.hu[skin.mask], options.least_bone)
-    return values, [*view_findings(work, skin, bone), *attached_findings(work, skin, bone)]
+    attached = attached_findings(work, skin, bone, options.skin_threshold)
+    return values, [*view_findings(work, skin, bone), *attached]
 
 
 def _bones(

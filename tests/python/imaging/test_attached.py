@@ -126,3 +126,13 @@ def test_a_soft_rest_round_the_chin_is_reported_and_streaks_there_are_not(
     )
     found = attachments(head.image.with_values(values), head)
     assert any("denser all through" in finding.what for finding in found) == is_reported
+
+
+def test_the_shell_of_a_mask_that_is_left_out_of_the_head_is_reported(head):
+    """Its rim changes the skin that it touches, and landmarks with it: 7 mm at the nose."""
+    x, y, z = head.image.axes()
+    values = np.array(head.image.values)
+    front = (np.abs(x) < 30.0) & (np.abs(z + 68.0) < 28.0) & (np.abs(y + 103.0) < 1.5)
+    values[front] = SOFT
+    (finding,) = attachments(head.image.with_values(values), head)
+    assert "left out" in finding.what

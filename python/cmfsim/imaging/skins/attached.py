@@ -6,6 +6,7 @@ further than a nose. What is thick is checked by its density. What lies flat on 
 all round (`find_plates`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -31,6 +32,7 @@ from cmfsim.imaging.skins.plates import STEP as PLATE_STEP
 from cmfsim.imaging.skins.plates import find_plates
 from cmfsim.imaging.skins.skin import Skin
 from cmfsim.imaging.working_grid import Working, coarse_of
+from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
 # Voxels that things on the face are told apart on, mm.
@@ -66,6 +68,9 @@ LEAST_VOLUME = 600.0
 LEAST_LENGTH = 18.0
 # The face lies in front of this part of the head's depth: ears, folded or not, lie behind.
 FACE_PART = 0.45
+LEFT_OUT_TEXT = (
+    "a shell too thin for a head and left out of it, which may touch the skin at its rim"
+)
 ONE_SIDED_TEXT = "with no counterpart on the other side"
 FLAT_TEXT = "flat, with a step all round that no part of a face has"
 # A flat thing whose middle lies within the box of another one, wider by this, is the same, mm.
@@ -119,11 +124,14 @@ class _Thing:
     kind: str
 
 
-def attached_findings(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
-    """A finding for each thing on the face: one-sided, dense as plastic, or flat with a rim."""
+def attached_findings(work: Working, skin: Skin, bone: Bone, threshold: float) -> list[Finding]:
+    """A finding for each thing on the face: one-sided, dense as plastic, or flat with a rim.
+
+    threshold: Of the skin, HU.
+    """
     inside, spacing, shift = coarse_of(skin.mask.astype(np.float32), work.spacing, STEP)
     head = _Head(np.asfortranarray(inside > 0.5), spacing, work.origin + shift)
-    things = _protruding(head, work, bone)
+    things = [*_protruding(head, work, bone), *_left_out(work, skin, threshold)]
     for flat in _flat(head, work, skin):
         near = [np.abs(flat.middle - thing.middle) < 0.5 * thing.size + SAME for thing in things]
         if not any(inside.all() for inside in near):
@@ -175,23 +183,39 @@ def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
         hu, face & (around > UNDER_SKIN[0]) & (around < UNDER_SKIN[1]), spacing
     )
     found: Mask = dense | alone | far | lump
+    kinds = (
+        (far, "further out than a nose"),
+        (dense, "with the density of plastic"),
+        (lump, "denser all through than soft tissue"),
+        (found, ONE_SIDED_TEXT),
+    )
+    return _pieces(found, kinds, spacing, head.origin)
+
+
+def _left_out(work: Working, skin: Skin, threshold: float) -> list[_Thing]:
+    """What is as dense as skin in front of it: shells of masks, too thin for a head."""
+    out = (work.hu > threshold) & ~skin.mask
+    out[:, _behind(box_of(skin.mask)[1]) :] = False
+    return _pieces(np.asfortranarray(out), ((out, LEFT_OUT_TEXT),), work.spacing, work.origin)
+
+
+def _pieces(
+    found: Mask, kinds: Sequence[tuple[Mask, str]], spacing: Floats, origin: Floats
+) -> list[_Thing]:
+    """The pieces that are large enough, each of the first kind that most of it is."""
     labels, sizes = label(found, corners=True)
+    blocks = ndimage().find_objects(labels)
     things = []
-    for piece in range(1, len(sizes)):
-        voxels = np.argwhere(labels == piece)
-        volume = len(voxels) * float(np.prod(spacing))
-        size = (np.ptp(voxels, axis=0) + 1) * spacing
-        if volume < LEAST_VOLUME or float(np.linalg.norm(size)) < LEAST_LENGTH:
+    for piece in np.flatnonzero(sizes * float(np.prod(spacing)) >= LEAST_VOLUME).tolist():
+        block = blocks[piece - 1]
+        size = np.array([b.stop - b.start for b in block]) * spacing
+        if float(np.linalg.norm(size)) < LEAST_LENGTH:
             continue
-        middle = head.origin + voxels.mean(axis=0) * spacing
-        kinds = (
-            (far, "further out than a nose"),
-            (dense, "with the density of plastic"),
-            (lump, "denser all through than soft tissue"),
-        )
-        here = labels == piece
-        kind = next((text for which, text in kinds if which[here].mean() > 0.5), ONE_SIDED_TEXT)
-        things.append(_Thing(middle, size, volume, kind))
+        here = labels[block] == piece
+        first = np.array([b.start for b in block])
+        middle = origin + (first + np.argwhere(here).mean(axis=0)) * spacing
+        kind = next(text for which, text in kinds if which[block][here].mean() > 0.5)
+        things.append(_Thing(middle, size, sizes[piece] * float(np.prod(spacing)), kind))
     return things
 
 
