@@ -194,7 +194,7 @@ def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
 
 def _left_out(work: Working, skin: Skin, threshold: float) -> list[_Thing]:
     """What is as dense as skin in front of it: shells of masks, too thin for a head."""
-    out = (work.hu > threshold) & ~skin.mask
+    out = (work.hu > threshold) & ~np.maximum.accumulate(skin.mask, axis=1)
     out[:, _behind(box_of(skin.mask)[1]) :] = False
     return _pieces(np.asfortranarray(out), ((out, LEFT_OUT_TEXT),), work.spacing, work.origin)
 
