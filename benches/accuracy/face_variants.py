@@ -32,6 +32,7 @@ from scipy.spatial import cKDTree
 
 import cmfsim
 from benches.accuracy import scan_variants
+from benches.scenes import clinic_scans as clinic
 from benches.scenes import ct_variants as variants
 from benches.scenes.marked import publish
 from cmfsim import ImageData
@@ -104,8 +105,8 @@ class Variant:
     cut: Mapping[str, float] = field(default_factory=dict)
 
 
-def _landmarks() -> dict[str, np.ndarray]:
-    path = data_folder() / "ct_phantom" / "skull_landmarks.mrk.json"
+def _landmarks(kind: str = "skull") -> dict[str, np.ndarray]:
+    path = data_folder() / "ct_phantom" / f"{kind}_landmarks.mrk.json"
     return dict(cmfsim.read_landmarks(path))
 
 
@@ -193,6 +194,19 @@ VARIANTS: Mapping[str, Variant] = {
     ),
     "beard": Variant(lambda i: variants.with_beard(i, _landmarks()), causes=ON_SKIN),
     "pads on the cheeks": Variant(_pads, causes=ON_SKIN),
+    "soft rest at the chin": Variant(
+        lambda i: clinic.with_soft_rest(i, _landmarks(), _landmarks("skin")), causes=ON_SKIN
+    ),
+    "oxygen mask": Variant(lambda i: clinic.with_mask(i, _landmarks("skin")), causes=ON_SKIN),
+    "bandage": Variant(lambda i: clinic.with_bandage(i, _landmarks()), causes=ON_SKIN),
+    "plates of titanium": Variant(
+        lambda i: clinic.with_plates(i, _landmarks()), causes=frozenset({"metal"})
+    ),
+    "contrast agent": Variant(
+        lambda i: clinic.with_contrast(i, _landmarks(), _landmarks("skin")),
+        causes=frozenset({"bone-vessels"}),
+    ),
+    "slices of 5 mm": Variant(clinic.in_thick_slices, causes=frozenset({"ct-spacing-coarse"})),
     "slices of 3 mm": Variant(
         lambda i: variants.resampled(i, (i.spacing[0], i.spacing[1], 3.0)),
         causes=frozenset({"ct-spacing-coarse"}),
