@@ -202,10 +202,7 @@ VARIANTS: Mapping[str, Variant] = {
     "plates of titanium": Variant(
         lambda i: clinic.with_plates(i, _landmarks()), causes=frozenset({"metal"})
     ),
-    "contrast agent": Variant(
-        lambda i: clinic.with_contrast(i, _landmarks(), _landmarks("skin")),
-        causes=frozenset({"bone-vessels"}),
-    ),
+    "contrast agent": Variant(lambda i: clinic.with_contrast(i, _landmarks(), _landmarks("skin"))),
     "slices of 5 mm": Variant(clinic.in_thick_slices, causes=frozenset({"ct-spacing-coarse"})),
     "slices of 3 mm": Variant(
         lambda i: variants.resampled(i, (i.spacing[0], i.spacing[1], 3.0)),

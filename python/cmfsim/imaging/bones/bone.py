@@ -24,7 +24,6 @@ from cmfsim.imaging.morphology import (
     grown,
     label,
     ndimage,
-    opened,
     resampled_to,
     shrunk,
     watershed,
@@ -62,13 +61,6 @@ LEAST_CAVITY = 300_000.0
 LEAST_BOUNDED = 0.85
 # Bone partly in a voxel seals a hollow from this part of the way between soft tissue and bone on.
 SEAL_PART = 0.6
-
-
-# Bone as thick as twice the first has compact bone, denser than the second, HU, within the third,
-# mm; vessels with contrast agent have 250 to 450 HU all through. Where voxels are larger than the
-# fourth, mm, thin bone has less too. Seven scans without vessels have 0 to 1.8 cm³ of such bone,
-# the CT phantom with them 14.8: the fifth is between, mm³.
-LUMEN, COMPACT, COMPACT_NEAR, FINE, LEAST_VESSELS = 2.0, 500.0, 4.0, 2.5, 5000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +108,6 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     surface = hu
     if options.bone_threshold is None:
         surface, mask = at_half_height(hu, mask, threshold, BONE_SCALE, work.spacing)
-    findings += _vessels(hu, solid, work.spacing)
     return Bone(hu, surface, mask, solid & mask, bare, cavity, tuple(findings))
 
 
@@ -158,26 +149,6 @@ def _without_islands(
             )
         )
     return kept_mask, bare, findings
-
-
-def _vessels(hu: Volume, solid: Mask, spacing: NDArray[np.float64]) -> list[Finding]:
-    """A finding where much thick bone is far from compact bone: vessels with contrast agent."""
-    if float(spacing.max()) > FINE:
-        return []
-    size = [2 * round(COMPACT_NEAR / s) + 1 for s in spacing]
-    bright = solid & (ndimage().maximum_filter(hu, size=size) < COMPACT)
-    thick = opened(np.asfortranarray(bright), LUMEN, spacing)
-    volume = float(np.count_nonzero(thick) * np.prod(spacing))
-    if volume < LEAST_VESSELS:
-        return []
-    return [
-        Finding(
-            "bone-vessels",
-            f"{volume / 1000.0:.0f} cm³ taken for bone have {COMPACT:g} HU at most, as vessels "
-            "with contrast agent have",
-            where="bone",
-        )
-    ]
 
 
 def _cranial_cavity(solid: Mask, skin: Skin, work: Working) -> Mask | None:
