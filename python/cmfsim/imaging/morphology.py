@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cmfsim import _core
 from cmfsim.errors import ImageError, third_party
 from cmfsim.values.shown_region import ShownRegion
+from cmfsim.values.surface_data import triangle_areas
 
 Mask = NDArray[np.bool_]
 Volume = NDArray[np.float32]
@@ -329,10 +330,7 @@ def shown_region(values: NDArray[Any]) -> ShownRegion | None:
         return None
     hull = third_party("scipy.spatial", "images are segmented", "imaging", ImageError)
     hull = hull.ConvexHull(ends)
-    corners = ends[hull.simplices]
-    sizes = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    sizes = triangle_areas(ends, hull.simplices)
     facing = hull.equations[np.argsort(-sizes, kind="stable"), :3]
     kept: list[NDArray[np.float64]] = []
     while len(facing):

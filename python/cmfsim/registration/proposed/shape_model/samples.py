@@ -10,7 +10,7 @@ from cmfsim.errors import third_party
 from cmfsim.registration.proposed.pose import surface_samples
 from cmfsim.values.checks import Floats
 from cmfsim.values.shown_region import ShownRegion
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, area_vectors, triangle_areas, used_nodes
 
 # A surface is cut where so much of it lies in a plane at its end, or is missing there within an
 # open border, mm²: the vertex of a round head has some 150 mm² there.
@@ -81,22 +81,18 @@ class _Shape:
 
     vertices: (n, 3), mm.
     corners: (t, 3). The rows of each triangle's vertices.
-    doubled: (t, 3), mm². Twice the area of each triangle along its normal.
+    areas: (t, 3), mm². The normal of each triangle, as long as its area.
     """
 
     vertices: Floats
     corners: NDArray[np.int64]
-    doubled: Floats
+    areas: Floats
 
     @classmethod
     def of(cls, surface: SurfaceData) -> "_Shape":
-        corners = surface.triangles.astype(np.int64)
-        used = np.zeros(len(surface.vertices), dtype=bool)
-        used[corners] = True
+        used, corners = used_nodes(surface.triangles)
         vertices = surface.vertices[used]
-        corners = (np.cumsum(used) - 1)[corners]
-        a, b, c = (vertices[corners[:, k]] for k in range(3))
-        return cls(vertices, corners, np.cross(b - a, c - a))
+        return cls(vertices, corners, area_vectors(vertices, corners))
 
     def cap(self, normal: Floats, depth: float) -> tuple[float, float]:
         """Place of the end along a direction, and the area that lies flat, or is missing, there."""
@@ -113,8 +109,7 @@ class _Shape:
         except spatial.QhullError:
             # All points lie in a plane.
             return
-        a, b, c = (points[hull.simplices[:, k]] for k in range(3))
-        areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        areas = triangle_areas(points, hull.simplices)
         normals, left = hull.equations[:, :3], np.ones(len(areas), dtype=bool)
         while left.any():
             normal = normals[left][np.argmax(areas[left])]
@@ -137,9 +132,9 @@ class _Shape:
 
     def _flat(self, normal: Floats, near: NDArray[np.bool_]) -> float:
         """The area of the triangles between some vertices that face along a direction."""
-        doubled = self.doubled[near[self.corners].all(axis=1)]
-        lengths = np.linalg.norm(doubled, axis=1)
-        return 0.5 * float(lengths[doubled @ normal > CAP_NORMAL * lengths].sum())
+        areas = self.areas[near[self.corners].all(axis=1)]
+        sizes = np.linalg.norm(areas, axis=1)
+        return float(sizes[areas @ normal > CAP_NORMAL * sizes].sum())
 
     def _missing(self, normal: Floats, near: NDArray[np.bool_]) -> float:
         """The area that open borders between some vertices enclose, seen along a direction."""
