@@ -281,10 +281,9 @@ def _beyond(work: Working, skin: Skin, bone: Bone) -> list[Finding]:
     if work.shown is None:
         return []
     inside = np.argwhere(skin.mask)
-    depths = work.shown.depths(work.origin + work.spacing * inside)
-    wall = np.argmin(depths, axis=1)
-    at_end = np.take_along_axis(depths, wall[:, None], axis=1)[:, 0] < FIELD_RING
-    inside, normals = inside[at_end], work.shown.normals[wall[at_end]]
+    within, plane = work.shown.nearest(work.origin + work.spacing * inside)
+    at_end = within < FIELD_RING
+    inside, normals = inside[at_end], work.shown.normals[plane[at_end]]
     is_bone = bone.solid[tuple(inside.T)]
     middle = np.average(np.arange(skin.mask.shape[1]), weights=skin.mask.sum(axis=(0, 2)))
     in_front = inside[:, 1] < middle - 25.0 / work.spacing[1]

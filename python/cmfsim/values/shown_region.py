@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmfsim.values.checks import Floats
 
@@ -23,10 +24,21 @@ class ShownRegion:
         found: Floats = self.places - points @ self.normals.T
         return found
 
+    def nearest(self, points: Floats) -> tuple[Floats, NDArray[np.int64]]:
+        """How far points (n, 3) lie within the region, (n,), and the plane nearest to each.
+
+        Plane by plane: a round region has some 90, and a head millions of voxels.
+        """
+        depth, plane = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
+        for row, (normal, place) in enumerate(zip(self.normals, self.places, strict=True)):
+            behind = place - points @ normal
+            nearer = behind < depth
+            depth[nearer], plane[nearer] = behind[nearer], row
+        return depth, plane
+
     def depth(self, points: Floats) -> Floats:
         """How far points (n, 3) lie within the region, (n,); negative outside of it."""
-        least: Floats = np.min(self.depths(points), axis=1, initial=np.inf)
-        return least
+        return self.nearest(points)[0]
 
     def scaled(self, spacing: Floats, origin: Floats) -> "ShownRegion":
         """The region of voxels in mm."""
