@@ -87,6 +87,14 @@ def test_the_bite_is_the_layer_with_least_bone(tilt):
     assert abs(end - front - tilt) < 0.8
 
 
+def test_the_bite_is_not_where_the_jaw_ends():
+    """Below the crowns of a lower jaw cut off there is less bone than in a bite full of metal."""
+    heights, along, dense = _rows(0.0)
+    front, end = bite_shifts(heights, along, np.where(heights < -6.0, 0.1, dense), (8.0, 8.0), 1.0)
+    assert abs(front - 2.0) < 0.6
+    assert abs(end - 2.0) < 0.8
+
+
 def test_rows_without_a_poorer_layer_show_no_bite():
     heights, along, dense = _rows(0.0)
     assert bite_shifts(heights, along, np.ones_like(dense), (8.0, 8.0), 1.0) is None

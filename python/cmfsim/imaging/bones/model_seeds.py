@@ -193,22 +193,19 @@ def bite_shifts(
     half = max(reach) + CROWNS[1]
     edges = np.arange(-half, half + LAYER, LAYER)
     middles = 0.5 * (edges[1:] + edges[:-1])
-    planes, profiles = [], []
+    away = middles - middles[:, None]
+    beside = [(sign * away > CROWNS[0]) & (sign * away < CROWNS[1]) for sign in (-1.0, 1.0)]
+    planes = []
     for rise in np.arange(-sum(reach), sum(reach) + LAYER, LAYER):
         counts, _ = np.histogram(heights - rise * along, edges, weights=dense)
         profile = ndimage().gaussian_filter1d(counts, soft / LAYER, mode="constant")
-        for k in np.flatnonzero(
-            (np.abs(middles) <= reach[0]) & (np.abs(middles + rise) <= reach[1])
-        ):
-            planes.append((profile[k], middles[k], middles[k] + rise))
-            profiles.append(profile)
+        crowns = np.min([np.where(side, profile, 0.0).max(axis=1) for side in beside], axis=0)
+        taken = (np.abs(middles) <= reach[0]) & (np.abs(middles + rise) <= reach[1])
+        # A layer that is poor because the jaw ends there has no crowns beyond it.
+        taken &= crowns > CONTRAST * profile
+        planes += [(profile[k], middles[k], middles[k] + rise) for k in np.flatnonzero(taken)]
+    if not planes:
+        return None
     costs, fronts, ends = np.array(planes).T
     ties = costs <= 1.02 * costs.min() + 1e-9
-    front, end = float(fronts[ties].mean()), float(ends[ties].mean())
-    nearest = int(np.argmin(np.hypot(fronts - front, ends - end)))
-    for sign in (-1.0, 1.0):
-        away = sign * (middles - fronts[nearest])
-        beside = profiles[nearest][(away > CROWNS[0]) & (away < CROWNS[1])]
-        if not beside.max() > CONTRAST * costs.min():
-            return None
-    return front, end
+    return float(fronts[ties].mean()), float(ends[ties].mean())
