@@ -17,7 +17,7 @@ from cmfsim.imaging.intensities.intensity import weak_bone
 from cmfsim.imaging.intensities.levels import level_of
 from cmfsim.imaging.morphology import Mask, Volume, depth, label, load
 from cmfsim.imaging.options import SegmentOptions
-from cmfsim.imaging.skins.attached import attached_findings
+from cmfsim.imaging.skins.attached import Attached, find_attached
 from cmfsim.imaging.skins.skin import SKIN_SCALE, Skin, find_skin
 from cmfsim.imaging.working_grid import COARSE, Working, working_grid
 from cmfsim.registration.proposed.shape_model.model import head_model
@@ -134,11 +134,13 @@ def segmented(
         bones, teeth, jaws = _bones(work, bone, skin, points, level, options=options, say=say)
         say("air")
         hollow = air_level(work, skin, bone, options)
-        (first, second), (weak, seen) = head.noticed, noticed.result()
-        findings = (*first, *weak, *second, *seen, *jaws)
+        (first, second), (weak, seen, attached) = head.noticed, noticed.result()
+        things = [thing.finding for thing in attached]
+        findings = (*first, *weak, *second, *seen, *things, *jaws)
     air = None if hollow is None else work.image(hollow)
     levels = work.image(skin.level), bones, air, teeth
-    return Anatomy(*levels, findings, shown=work.shown), head
+    boxes = tuple(thing.box for thing in attached)
+    return Anatomy(*levels, findings, shown=work.shown, attached=boxes), head
 
 
 def _opened(
@@ -166,11 +168,11 @@ def _opened(
 
 def _noticed(
     work: Working, skin: Skin, bone: Bone, options: SegmentOptions
-) -> tuple[Sequence[Finding], Sequence[Finding]]:
-    """What is noticed on the scan's values, and on what it shows of the head."""
+) -> tuple[Sequence[Finding], Sequence[Finding], Sequence[Attached]]:
+    """What is noticed on the scan's values, on what it shows of the head, and on the face."""
     values = weak_bone(work.hu[skin.mask], options.least_bone)
-    attached = attached_findings(work, skin, bone, options.skin_threshold)
-    return values, [*view_findings(work, skin, bone), *attached]
+    attached = find_attached(work, skin, bone, options.skin_threshold)
+    return values, view_findings(work, skin, bone), attached
 
 
 def _bones(

@@ -44,6 +44,9 @@ SURFACES_AT_ONCE = 2
 BY_SHAPE = "jaws-parted-by-shape"
 # What voxels add to the expected error of a site, as a share of their longest edge.
 VOXEL_ERROR = 0.5
+# A site of the skin this near to something on the face may lie on it, and is then expected to be
+# off by the second, mm.
+ON_THINGS, UNDER_THINGS = 3.0, 8.0
 # A site that moves by more when the jaws are separated again is doubtful, mm.
 MOVED = 3.5
 # What a template head keeps its surfaces in.
@@ -227,12 +230,27 @@ def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:
     if not anatomy.surfaces:
         # The voxels of an image blur what the definitions read.
         blur = VOXEL_ERROR * float(anatomy.skin.spacing.max())
-        found = replace(found, skull=_blurred(found.skull, blur), skin=_blurred(found.skin, blur))
+        on_skin = _under_things(_blurred(found.skin, blur), anatomy.attached)
+        found = replace(found, skull=_blurred(found.skull, blur), skin=on_skin)
     return ProposedHead(anatomy, bones, skin, found)
 
 
 def _blurred(sites: Mapping[str, ProposedSite], blur: float) -> dict[str, ProposedSite]:
     return {n: replace(s, error=float(np.hypot(s.error, blur))) for n, s in sites.items()}
+
+
+def _under_things(
+    sites: Mapping[str, ProposedSite], boxes: Sequence[Floats]
+) -> dict[str, ProposedSite]:
+    """The sites of the skin, those doubtful that may lie on what is attached to the face."""
+    result = dict(sites)
+    for name, site in sites.items():
+        near = ((b[0] - ON_THINGS < site.point) & (site.point < b[1] + ON_THINGS) for b in boxes)
+        if any(inside.all() for inside in near):
+            reason = "something that is no part of the face lies there (skin-attachment)"
+            doubt = "; ".join(filter(None, (site.doubt, reason)))
+            result[name] = replace(site, error=max(site.error, UNDER_THINGS), doubt=doubt)
+    return result
 
 
 def _is_worse(second: ProposedLandmarks, first: ProposedLandmarks) -> bool:

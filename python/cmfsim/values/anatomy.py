@@ -49,6 +49,8 @@ class Anatomy(Frozen):
         The surfaces that levels were made from ("skin" and bones), where surfaces were given.
     shown : ShownRegion or None
         What padding surrounds in the image, mm; None where there is none.
+    attached : tuple of (2, 3) float64
+        The lowest and the highest corner of each thing on the face that is no part of it, mm.
     """
 
     skin: ImageData
@@ -58,6 +60,7 @@ class Anatomy(Frozen):
     findings: tuple[Finding, ...] = ()
     surfaces: Mapping[str, SurfaceData] = field(default_factory=dict)
     shown: ShownRegion | None = None
+    attached: tuple[Floats, ...] = ()
 
     __repr__ = brief
 

@@ -134,5 +134,9 @@ def test_the_shell_of_a_mask_that_is_left_out_of_the_head_is_reported(head):
     values = np.array(head.image.values)
     front = (np.abs(x) < 30.0) & (np.abs(z + 68.0) < 28.0) & (np.abs(y + 103.0) < 1.5)
     values[front] = SOFT
-    (finding,) = attachments(head.image.with_values(values), head)
+    found = cmfsim.segment_head(head.image.with_values(values), landmarks=head.landmarks)
+    (finding,) = [finding for finding in found.findings if finding.code == "skin-attachment"]
     assert "left out" in finding.what
+    inside = found.attached[0]
+    assert (inside[0] < [0.0, -103.0, -68.0]).all()
+    assert (inside[1] > [0.0, -103.0, -68.0]).all()

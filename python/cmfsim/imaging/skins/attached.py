@@ -111,7 +111,7 @@ class _Head:
 
 
 @dataclass(frozen=True, eq=False)
-class _Thing:
+class Attached:
     """What is on the face.
 
     middle, size: (3,), mm.
@@ -123,9 +123,26 @@ class _Thing:
     volume: float
     kind: str
 
+    @property
+    def box(self) -> Floats:
+        """The lowest and the highest corner of what it takes up, (2, 3) mm."""
+        return self.middle + 0.5 * np.array([-self.size, self.size])
 
-def attached_findings(work: Working, skin: Skin, bone: Bone, threshold: float) -> list[Finding]:
-    """A finding for each thing on the face: one-sided, dense as plastic, or flat with a rim.
+    @property
+    def finding(self) -> Finding:
+        """What is reported of it."""
+        size = " × ".join(f"{length:.0f}" for length in self.size)
+        volume = f", {self.volume / 1000.0:.1f} cm³" if self.volume else ""
+        x, y, z = self.middle
+        return Finding(
+            "skin-attachment",
+            f"something protrudes from the face, {self.kind}: {size} mm{volume}",
+            where=f"skin at ({x:.0f}, {y:.0f}, {z:.0f}) mm",
+        )
+
+
+def find_attached(work: Working, skin: Skin, bone: Bone, threshold: float) -> list[Attached]:
+    """Each thing on the face: one-sided, dense as plastic, or flat with a rim.
 
     threshold: Of the skin, HU.
     """
@@ -136,10 +153,10 @@ def attached_findings(work: Working, skin: Skin, bone: Bone, threshold: float) -
         near = [np.abs(flat.middle - thing.middle) < 0.5 * thing.size + SAME for thing in things]
         if not any(inside.all() for inside in near):
             things.append(flat)
-    return [_finding(thing) for thing in things]
+    return things
 
 
-def _flat(head: _Head, work: Working, skin: Skin) -> list[_Thing]:
+def _flat(head: _Head, work: Working, skin: Skin) -> list[Attached]:
     """What lies flat on the face."""
     level, spacing, shift = coarse_of(skin.level, work.spacing, PLATE_STEP)
     things = []
@@ -149,7 +166,7 @@ def _flat(head: _Head, work: Working, skin: Skin) -> list[_Thing]:
         index = np.clip(index, 0, np.array(head.mask.shape) - 1)
         if head.away_broadly[tuple(index.T)].max() <= FLAT:
             size = (np.ptp(voxels, axis=0) + 1) * spacing
-            things.append(_Thing(places.mean(axis=0), size, 0.0, FLAT_TEXT))
+            things.append(Attached(places.mean(axis=0), size, 0.0, FLAT_TEXT))
     return things
 
 
@@ -158,7 +175,7 @@ def _behind(rows: slice) -> int:
     return int(rows.start + int(FACE_PART * (rows.stop - rows.start)))
 
 
-def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
+def _protruding(head: _Head, work: Working, bone: Bone) -> list[Attached]:
     """What protrudes, and is one-sided, has the density of plastic, or reaches too far."""
     spacing = head.spacing
     hu = coarse_of(work.hu, work.spacing, STEP)[0]
@@ -192,7 +209,7 @@ def _protruding(head: _Head, work: Working, bone: Bone) -> list[_Thing]:
     return _pieces(found, kinds, spacing, head.origin)
 
 
-def _left_out(work: Working, skin: Skin, threshold: float) -> list[_Thing]:
+def _left_out(work: Working, skin: Skin, threshold: float) -> list[Attached]:
     """What is as dense as skin in front of it: shells of masks, too thin for a head."""
     out = (work.hu > threshold) & ~np.maximum.accumulate(skin.mask, axis=1)
     out[:, _behind(box_of(skin.mask)[1]) :] = False
@@ -201,7 +218,7 @@ def _left_out(work: Working, skin: Skin, threshold: float) -> list[_Thing]:
 
 def _pieces(
     found: Mask, kinds: Sequence[tuple[Mask, str]], spacing: Floats, origin: Floats
-) -> list[_Thing]:
+) -> list[Attached]:
     """The pieces that are large enough, each of the first kind that most of it is."""
     labels, sizes = label(found, corners=True)
     blocks = ndimage().find_objects(labels)
@@ -215,7 +232,7 @@ def _pieces(
         first = np.array([b.start for b in block])
         middle = origin + (first + np.argwhere(here).mean(axis=0)) * spacing
         kind = next(text for which, text in kinds if which[block][here].mean() > 0.5)
-        things.append(_Thing(middle, size, sizes[piece] * float(np.prod(spacing)), kind))
+        things.append(Attached(middle, size, sizes[piece] * float(np.prod(spacing)), kind))
     return things
 
 
@@ -273,17 +290,6 @@ def _thick(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
     thick = np.zeros_like(mask)
     thick[:, :, low:] = opened(longer, WIDEST, spacing)[:, :, below:]
     return thick
-
-
-def _finding(thing: _Thing) -> Finding:
-    size = " × ".join(f"{length:.0f}" for length in thing.size)
-    volume = f", {thing.volume / 1000.0:.1f} cm³" if thing.volume else ""
-    x, y, z = thing.middle
-    return Finding(
-        "skin-attachment",
-        f"something protrudes from the face, {thing.kind}: {size} mm{volume}",
-        where=f"skin at ({x:.0f}, {y:.0f}, {z:.0f}) mm",
-    )
 
 
 def _mirrored(around: Volume, spacing: NDArray[np.float64], behind: int, out: Mask) -> Volume:
