@@ -5,10 +5,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cmfsim.registration.proposed.proposal import SitesOfKind, likeliest
+from cmfsim.registration.proposed.proposal import SitesOfKind, likeliest, without_outliers
 from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
+    SITES,
     SiteDistribution,
+    _aligned_prior,
+    _measured,
+    left_out_gaps,
     likeliest_places,
     placed_distribution,
     site_covariance,
@@ -159,3 +163,49 @@ def test_without_sites_the_head_is_guessed_from_the_bone_and_unsure(bone):
     assert np.mean(away) < found.errors.mean()
     assert found.errors.min() > 15.0
     assert PLACED_STD == 1.0
+
+
+def test_residuals_of_sites_left_out_are_those_of_the_normal_distribution(bone):
+    """One site after the other against the textbook formula (Bishop 2006, equation 2.81)."""
+    given = proposal({"menton": 5.0}, gone=("gonion_L",), shift={"nasion": [0.0, -6.0, 3.0]})
+    sites = {("skull", n): site for n, site in given.skull.items()}
+    sites |= {("skin", n): site for n, site in given.skin.items()}
+    known = [k for k, key in enumerate(SITES) if key in sites]
+    found = np.array([sites[SITES[k]].point for k in known])
+    prior = _aligned_prior(sites, bone)
+    rows = np.array([[3 * k, 3 * k + 1, 3 * k + 2] for k in known]).ravel()
+    errors = np.array([sites[SITES[k]].error for k in known]) / np.sqrt(3.0)
+    total = prior.covariance[np.ix_(rows, rows)] + _measured(found, known, errors)
+    away = (found - prior.mean[known]).ravel()
+    gaps = left_out_gaps(sites)
+    assert gaps.keys() == sites.keys()
+    for i in (0, 7, len(known) - 1):
+        own = np.arange(3 * i, 3 * i + 3)
+        others = np.setdiff1d(np.arange(len(away)), own)
+        gain = total[np.ix_(own, others)] @ np.linalg.inv(total[np.ix_(others, others)])
+        residual = away[own] - gain @ away[others]
+        spread = total[np.ix_(own, own)] - gain @ total[np.ix_(others, own)]
+        gap, deviations = gaps[SITES[known[i]]]
+        assert gap == pytest.approx(np.linalg.norm(residual), rel=1e-8)
+        squared = residual @ np.linalg.solve(spread, residual) / 3.0
+        assert deviations == pytest.approx(np.sqrt(squared), rel=1e-8)
+
+
+def test_a_site_that_all_others_place_elsewhere_is_doubtful_and_as_far_off_as_that():
+    given = proposal(shift={"supraglenoid_R": np.array([0.0, 0.0, -11.0])})
+    skull, skin = without_outliers(
+        [SitesOfKind("skull", given.skull, {}, {}), SitesOfKind("skin", given.skin, {}, {})]
+    )
+    doubtful = {name: site for name, site in skull.sites.items() if site.doubt}
+    assert doubtful.keys() == {"supraglenoid_R"}
+    assert "the other sites place it" in doubtful["supraglenoid_R"].doubt
+    assert 7.0 < doubtful["supraglenoid_R"].error < 12.0
+    assert not any(site.doubt for site in skin.sites.values())
+
+
+def test_an_unusual_head_is_not_doubtful():
+    """A ramus 12 mm longer than average, on both sides: each of its sites fits the others."""
+    down = np.array([0.0, 4.0, -12.0])
+    given = proposal(shift={"gonion_L": down, "gonion_R": down})
+    (skull,) = without_outliers([SitesOfKind("skull", given.skull, {}, {})])
+    assert not any(site.doubt for site in skull.sites.values())

@@ -1,6 +1,6 @@
 """The expected error of a proposed landmark, doubts about it, and parts missing from the image."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -9,6 +9,7 @@ import numpy as np
 from cmfsim.registration.proposed.definitions.groups import misfits
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.registration.proposed.shape_model.samples import CutPlane
+from cmfsim.registration.proposed.shape_model.site_covariance import SiteKey
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 from cmfsim.values.proposed_landmarks import ProposedSite
@@ -24,8 +25,6 @@ _ERRORS: Mapping[str, float] = MappingProxyType({
 USUAL_ERROR, ALIKE_ERROR = 2.0, 1.0
 # How the reason of a site begins that the image does not show.
 IMAGE_ENDS = "the image ends there"
-# Left and right differ by so much in few faces, mm of the average head.
-MOST_UNEVEN = 8.5
 # A point so near to where the image ends may lie on the cut instead of on bone, mm.
 AT_CUT = 3.0
 # The jaw below the lower incisors must be there as far down as this for its profile to be read,
@@ -33,7 +32,7 @@ AT_CUT = 3.0
 TO_FOLD, TO_CHIN = 18.0, 27.0
 # Correct sites of two real heads lie within 12 mm of where the others of their group put them in an
 # average head, wrong ones 16 mm and more: mm of the average head.
-STRANGE, IMPOSSIBLE = 9.5, 15.0
+IMPOSSIBLE = 15.0
 
 
 # Sites of the skull, on the same side, that others are found from: those of the skin are gone with
@@ -75,8 +74,12 @@ def missing_sites(
     pose: Pose,
     *,
     has_jaw: bool,
+    odd: Collection[SiteKey],
 ) -> MissingSites:
-    """The sites that are absent, or that lie where the image ends."""
+    """The sites that are absent, that lie where the image ends, or that cannot be right.
+
+    odd: Kind and label of those that all others place elsewhere.
+    """
     gone: dict[str, str] = {}
     for name in SKULL_LANDMARKS:
         if name not in skull:
@@ -92,11 +95,12 @@ def missing_sites(
     _below_a_cut_chin(skull, cuts, pose, gone)
     there = {name: place for name, place in skull.items() if name not in gone}
     own = _own(there, pose)
-    off = misfits(own, _own(skin, pose))
-    # Two sides that agree, each found on its own, are an unusual head (a long ramus) and stay.
-    uneven = _unevenness(own)
-    even = {n for n in own if uneven.get(n[:-2], np.inf) < MOST_UNEVEN}
-    _impossible({n: away for n, away in off["skull"].items() if n not in even}, gone)
+    # What is far from an average head, but fits the other sites, is an unusual head and stays.
+    off = {
+        kind: {n: away for n, away in found.items() if (kind, n) in odd}
+        for kind, found in misfits(own, _own(skin, pose)).items()
+    }
+    _impossible(off["skull"], gone)
     lost: dict[str, str] = {}
     for name in SKIN_LANDMARKS:
         if name not in skin:
@@ -140,30 +144,15 @@ def _cut_at(point: Floats, cuts: Sequence[CutPlane], depth: float) -> CutPlane |
     return next((cut for cut in cuts if cut.inside(point) < depth), None)
 
 
-def judged(
-    kind: str, points: Mapping[str, Floats], pose: Pose, likeness: float
-) -> dict[str, ProposedSite]:
-    """The sites with their expected errors, and what speaks against the doubtful ones."""
-    own = _own(points, pose)
-    uneven = _unevenness(own)
-    off = misfits(own, {}) if kind == "skull" else misfits({}, own)
-    odd = {name: distance for name, distance in off[kind].items() if distance > STRANGE}
+def judged(points: Mapping[str, Floats], pose: Pose, likeness: float) -> dict[str, ProposedSite]:
+    """The sites with their expected errors: larger where left and right differ."""
+    uneven = _unevenness(_own(points, pose))
     sites = {}
     for name, point in points.items():
         base = name[:-2] if name.endswith(("_L", "_R")) else name
-        usual = _ERRORS.get(base, USUAL_ERROR)
-        gap = uneven.get(base, 0.0)
-        error = likeness * ALIKE_ERROR + (1.0 - likeness) * usual
-        error = pose.size * float(np.hypot(error, 0.35 * max(gap - 1.4, 0.0)))
-        doubts = []
-        if gap > MOST_UNEVEN:
-            doubts.append(f"left and right differ by {pose.size * gap:.1f} mm")
-        if name in odd:
-            doubts.append(
-                f"the other sites place it {pose.size * odd[name]:.1f} mm away in an average head"
-            )
-            error = max(error, 0.5 * pose.size * odd[name])
-        sites[name] = ProposedSite(point, error, "; ".join(doubts))
+        error = likeness * ALIKE_ERROR + (1.0 - likeness) * _ERRORS.get(base, USUAL_ERROR)
+        error = float(np.hypot(error, 0.35 * max(uneven.get(base, 0.0) - 1.4, 0.0)))
+        sites[name] = ProposedSite(point, pose.size * error)
     return sites
 
 

@@ -39,7 +39,11 @@ from cmfsim.registration.proposed.pose import (
 )
 from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead, fit_head
 from cmfsim.registration.proposed.shape_model.samples import cut_planes, samples_of
-from cmfsim.registration.proposed.shape_model.site_covariance import SiteKey, likeliest_places
+from cmfsim.registration.proposed.shape_model.site_covariance import (
+    SiteKey,
+    likeliest_places,
+    outliers,
+)
 from cmfsim.registration.proposed.template_head import TemplateHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import JAW_SITES, SKIN_LANDMARKS, SKULL_LANDMARKS
@@ -105,6 +109,19 @@ def likeliest(
     return places
 
 
+def without_outliers(kinds: Sequence[SitesOfKind]) -> list[SitesOfKind]:
+    """The sites, those doubtful that all others place elsewhere, and as far off as that."""
+    sites = {(found.kind, name): site for found in kinds for name, site in found.sites.items()}
+    for key, gap in outliers(sites, DOUBTFUL).items():
+        site, reason = sites[key], f"the other sites place it {gap:.1f} mm away"
+        doubt = "; ".join(filter(None, (site.doubt, reason)))
+        sites[key] = replace(site, error=max(site.error, gap), doubt=doubt)
+    return [
+        replace(found, sites={name: sites[found.kind, name] for name in found.sites})
+        for found in kinds
+    ]
+
+
 def _deviations(head: FittedHead, key: SiteKey, site: ProposedSite) -> float:
     """How many expected errors a site lies from the model's."""
     gap = np.linalg.norm(site.point - head.sites[key])
@@ -147,6 +164,8 @@ def with_model(
         moved = _surface_place(found, name, place, size) if head.shows(place) else None
         if moved is not None:
             doubt = f"{reason}; placed by the shape of the head"
+            # A place that no surface is near is less certain than the shapes of heads tell.
+            error = float(np.hypot(error, np.linalg.norm(moved - place)))
             sites[name] = ProposedSite(moved, error, doubt)
             del missing[name]
     order = [name for of, name in head.sites if of == kind and name in sites]
@@ -214,7 +233,13 @@ def landmarks_from(
     by_skin = {} if skin is None else dict.fromkeys((False, True), skin.searched)
     on_skin = _on_surface(found.skin, pose, by_skin)
     cuts = cut_planes([*([] if skin is None else [skin]), parts.upper], shown)
-    gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None)
+    all_sites = {
+        (kind, name): site
+        for kind, points in (("skull", placed), ("skin", on_skin))
+        for name, site in judged(points, pose, max(likeness)).items()
+    }
+    odd = outliers(all_sites, DOUBTFUL).keys()
+    gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None, odd=odd)
     evidence = JawEvidence("", ())
     if parts.lower is not None:
         edges = {name: place for name, place in found.skull.items() if name.startswith("_")}
@@ -222,14 +247,15 @@ def landmarks_from(
         evidence = jaw_evidence({**skull, **edges}, parts.lower, pose, strange)
     placed = {name: placed[name] for name in SKULL_LANDMARKS if name in placed.keys() - gone.skull}
     on_skin = {name: on_skin[name] for name in SKIN_LANDMARKS if name in on_skin.keys() - gone.skin}
-    sites = judged("skull", placed, pose, max(likeness))
+    sites = judged(placed, pose, max(likeness))
     if evidence.impossible or parts.lower is None:
         # The model puts no site on a surface that is no jaw.
         del surface[True]
     of_skull = SitesOfKind("skull", weakened(sites, evidence, pose.size), gone.skull, surface)
     lost = gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given")
-    of_mouth = weakened(judged("skin", on_skin, pose, max(likeness)), evidence, pose.size, "skin")
+    of_mouth = weakened(judged(on_skin, pose, max(likeness)), evidence, pose.size, "skin")
     of_skin = SitesOfKind("skin", of_mouth, lost, by_skin)
+    of_skull, of_skin = without_outliers((of_skull, of_skin))
     likely = likeliest((of_skull, of_skin), fitted)
     all_skull, missing_skull = with_model(of_skull, likely, fitted, pose.size)
     added = {name: site for name, site in all_skull.items() if name not in of_skull.sites}

@@ -24,7 +24,7 @@ EYE_BELOW = 2.5
 # The line between closed lips is a groove as deep as this, mm, between blurs of two widths. It ends
 # where it is half as deep as where it is deepest: so far from the middle, in a face of average
 # breadth.
-GROOVE, GROOVE_SIGMAS, MOUTH_REACH = (0.3, 4.0), (0.8, 4.0), (16.0, 37.0)
+GROOVE, GROOVE_SIGMAS, MOUTH_REACH = (0.3, 4.0), (0.8, 4.0), (20.0, 37.0)
 # A corner lies so far before that end and above it, mm: the mean of two real heads, from which each
 # is 0.8 and 0.6 mm off. Without a groove it lies so far from the middle.
 CORNER_BEFORE, CORNER_UP, MOUTH_CORNER = 1.2, 1.8, 26.6

@@ -130,6 +130,46 @@ def likeliest_places(sites: Mapping[SiteKey, ProposedSite]) -> dict[SiteKey, tup
     return dict(zip(SITES, zip(after.mean, after.errors.tolist(), strict=True), strict=True))
 
 
+def left_out_gaps(sites: Mapping[SiteKey, ProposedSite]) -> dict[SiteKey, tuple[float, float]]:
+    """How far each site lies from where all others place it: in mm, and in expected deviations.
+
+    Notes
+    -----
+    Residuals of a normal distribution with one measurement left out after the other, from one
+    inverse (Rasmussen & Williams 2006, Gaussian processes for machine learning, eq. 5.12).
+    """
+    known = [i for i, key in enumerate(SITES) if key in sites]
+    found = np.array([sites[SITES[i]].point for i in known]).reshape(-1, 3)
+    stds = np.array([sites[SITES[i]].error for i in known]) / np.sqrt(3.0)
+    prior = _aligned_prior(sites, found)
+    rows = (3 * np.array(known, dtype=np.intp)[:, None] + np.arange(3)).ravel()
+    total = prior.covariance[np.ix_(rows, rows)] + _measured(found, known, stds)
+    precision = np.linalg.inv(total)
+    weighted = (precision @ (found - prior.mean[known]).ravel()).reshape(-1, 3)
+    gaps = {}
+    for k, i in enumerate(known):
+        away = np.linalg.solve(precision[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], weighted[k])
+        deviations = np.sqrt(max(float(away @ weighted[k]), 0.0) / 3.0)
+        gaps[SITES[i]] = float(np.linalg.norm(away)), float(deviations)
+    return gaps
+
+
+def outliers(sites: Mapping[SiteKey, ProposedSite], limit: float) -> dict[SiteKey, float]:
+    """How far off the sites are, mm, that all others place elsewhere: the worst leaves first.
+
+    limit: The expected deviations from which a site leaves the others.
+    """
+    rest, found = dict(sites), dict[SiteKey, float]()
+    while len(rest) > LEAST_SITES:
+        gaps = left_out_gaps(rest)
+        worst = max(gaps, key=lambda key: gaps[key][1])
+        if gaps[worst][1] <= limit:
+            break
+        found[worst] = gaps[worst][0]
+        del rest[worst]
+    return found
+
+
 def _aligned_prior(sites: Mapping[SiteKey, ProposedSite], bone: Floats) -> SiteDistribution:
     """The average head's sites brought onto those of a head, before any is a measurement."""
     known = [i for i, key in enumerate(SITES) if key in sites]
