@@ -98,12 +98,12 @@ def test_sites_of_the_skin_are_gone_with_those_that_they_are_found_from(wrong, l
     average = average_head()
     skull = {**average.skull, wrong: average.skull[wrong] + [0.0, 0.0, -60.0]}
     pose = Pose(np.zeros(3), np.eye(3), 1.0, 0.0)
-    skin, odd = average.skin_landmarks, {("skull", wrong)}
+    skin, odd = average.skin_landmarks, {("skull", wrong): 60.0}
     gone = missing_sites(skull, skin, [], pose, has_jaw=True, odd=odd)
     assert set(gone.skull) == {wrong}
     assert set(gone.skin) == lost
     # Far from an average head, but not from where the patient's own sites place it.
-    unusual = missing_sites(skull, skin, [], pose, has_jaw=True, odd=set())
+    unusual = missing_sites(skull, skin, [], pose, has_jaw=True, odd={})
     assert not unusual.skull
     assert not unusual.skin
 

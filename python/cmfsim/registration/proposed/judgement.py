@@ -1,12 +1,11 @@
 """The expected error of a proposed landmark, doubts about it, and parts missing from the image."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
 
-from cmfsim.registration.proposed.definitions.groups import misfits
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.registration.proposed.shape_model.samples import CutPlane
 from cmfsim.registration.proposed.shape_model.site_covariance import SiteKey
@@ -30,9 +29,9 @@ AT_CUT = 3.0
 # The jaw below the lower incisors must be there as far down as this for its profile to be read,
 # average-head mm: to the deepest point, and to the foremost one of the chin.
 TO_FOLD, TO_CHIN = 18.0, 27.0
-# Correct sites of two real heads lie within 12 mm of where the others of their group put them in an
-# average head, wrong ones 16 mm and more: mm of the average head.
+# A site that all others place so far off is wrong, mm of the average head.
 IMPOSSIBLE = 15.0
+INCONSISTENT = "the point found there is inconsistent with the other sites"
 
 
 # Sites of the skull, on the same side, that others are found from: those of the skin are gone with
@@ -58,8 +57,7 @@ ABOVE_CHIN = ("subnasale", "labiale_superius", "labiale_inferius", "alare", "che
 class MissingSites:
     """Sites that were not found, with the reason.
 
-    misfits: mm. Sites of the skull that were found, but where the others of no average head put
-        them.
+    misfits: mm. How far off the sites of the skull are that all others place elsewhere.
     """
 
     skull: Mapping[str, str]
@@ -74,11 +72,11 @@ def missing_sites(
     pose: Pose,
     *,
     has_jaw: bool,
-    odd: Collection[SiteKey],
+    odd: Mapping[SiteKey, float],
 ) -> MissingSites:
     """The sites that are absent, that lie where the image ends, or that cannot be right.
 
-    odd: Kind and label of those that all others place elsewhere.
+    odd: mm. How far off those are that all others place elsewhere.
     """
     gone: dict[str, str] = {}
     for name in SKULL_LANDMARKS:
@@ -93,14 +91,10 @@ def missing_sites(
             if cut is not None:
                 gone[name] = f"{IMAGE_ENDS} ({cut.name} border)"
     _below_a_cut_chin(skull, cuts, pose, gone)
-    there = {name: place for name, place in skull.items() if name not in gone}
-    own = _own(there, pose)
-    # What is far from an average head, but fits the other sites, is an unusual head and stays.
-    off = {
-        kind: {n: away for n, away in found.items() if (kind, n) in odd}
-        for kind, found in misfits(own, _own(skin, pose)).items()
-    }
-    _impossible(off["skull"], gone)
+    impossible = {key: gap for key, gap in odd.items() if gap > IMPOSSIBLE * pose.size}
+    strange = {name: gap for (kind, name), gap in impossible.items() if kind == "skull"}
+    for name in strange:
+        gone.setdefault(name, INCONSISTENT)
     lost: dict[str, str] = {}
     for name in SKIN_LANDMARKS:
         if name not in skin:
@@ -109,22 +103,16 @@ def missing_sites(
             lost[name] = f"{IMAGE_ENDS} ({cut.name} border)"
         elif support := next((n for n in _support("skin", name) if n in gone), ""):
             lost[name] = gone[support]
-        elif name.startswith(ABOVE_CHIN) and off["skull"].get("pogonion", 0.0) > IMPOSSIBLE:
+        elif name.startswith(ABOVE_CHIN) and "pogonion" in strange:
             lost[name] = gone["pogonion"]
-    _impossible(off["skin"], lost)
-    strange = {name: size for name, size in off["skull"].items() if size > IMPOSSIBLE}
+        elif ("skin", name) in impossible:
+            lost[name] = INCONSISTENT
     return MissingSites(gone, lost, strange)
 
 
 def _own(points: Mapping[str, Floats], pose: Pose) -> dict[str, Floats]:
     """Points in the frame and size of the average head."""
     return {name: pose.into(point[None])[0] / pose.size for name, point in points.items()}
-
-
-def _impossible(off: Mapping[str, float], gone: dict[str, str]) -> None:
-    for name, distance in off.items():
-        if distance > IMPOSSIBLE:
-            gone.setdefault(name, "the point found there is inconsistent with the other sites")
 
 
 def _below_a_cut_chin(

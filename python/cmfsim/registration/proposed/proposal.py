@@ -238,12 +238,12 @@ def landmarks_from(
         for kind, points in (("skull", placed), ("skin", on_skin))
         for name, site in judged(points, pose, max(likeness)).items()
     }
-    odd = outliers(all_sites, DOUBTFUL).keys()
+    odd = outliers(all_sites, DOUBTFUL)
     gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None, odd=odd)
     evidence = JawEvidence("", ())
     if parts.lower is not None:
         edges = {name: place for name, place in found.skull.items() if name.startswith("_")}
-        strange = {n: size for n, size in gone.misfits.items() if n.startswith(JAW_SITES)}
+        strange = {n: m / pose.size for n, m in gone.misfits.items() if n.startswith(JAW_SITES)}
         evidence = jaw_evidence({**skull, **edges}, parts.lower, pose, strange)
     placed = {name: placed[name] for name in SKULL_LANDMARKS if name in placed.keys() - gone.skull}
     on_skin = {name: on_skin[name] for name in SKIN_LANDMARKS if name in on_skin.keys() - gone.skin}
@@ -332,7 +332,7 @@ def _best_sites(
     found, scores = [], []
     for pose in poses:
         found.append(_levelled_sites(parts, pose, average, build))
-        off = misfits({n: p for n, p in found[-1][1].skull.items() if n[0] != "_"}, {})["skull"]
+        off = misfits({n: p for n, p in found[-1][1].skull.items() if n[0] != "_"})
         if off and max(off.values()) < IMPOSSIBLE:
             return found[-1]
         scores.append(sum(min(off.get(n, IMPOSSIBLE), IMPOSSIBLE) for n in SKULL_LANDMARKS))

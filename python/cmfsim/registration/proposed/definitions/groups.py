@@ -1,4 +1,4 @@
-"""Whether sites lie among one another as in an average head: cranium, jaw and skin separately."""
+"""Whether sites of the skull lie among one another as in an average head: cranium and jaw."""
 
 from collections.abc import Mapping
 
@@ -19,24 +19,26 @@ FAR_JAW = 24.0
 OPENINGS = np.radians(np.arange(0.0, 36.0, 5.0))
 
 
-def misfits(skull: Mapping[str, Floats], skin: Mapping[str, Floats]) -> dict[str, dict[str, float]]:
+def misfits(skull: Mapping[str, Floats]) -> dict[str, float]:
     """How far each site lies from where the others of its group put it, average-head mm.
 
-    Groups are fitted to the average head by similarities that leave outliers out. Under "skull" and
-    "skin"; correct sites of two real heads lie within 12 mm. All sites of a jaw that is none have
-    the distance from the place of a closed one.
+    Cranium and jaw are fitted to the average head by similarities that leave outliers out; correct
+    sites of two real heads lie within 12 mm. All sites of a jaw that is none have the distance from
+    the place of a closed one.
     """
     upper = {n: p for n, p in skull.items() if not n.startswith(JAW_SITES)}
     lower = {n: p for n, p in skull.items() if n.startswith(JAW_SITES)}
     found: dict[str, float] = {}
-    of_cranium = _fit(upper, REFERENCE_PLACES["skull"])
+    of_cranium = _fit(upper)
     if of_cranium is not None:
         found.update(_distances(upper, REFERENCE_PLACES["skull"], of_cranium))
         away = _from_jaw(lower, of_cranium)
         if away and float(np.median(list(away.values()))) > FAR_JAW:
-            return {"skull": {**found, **away}, "skin": _own(skin, "skin")}
-    found.update(_own(lower, "skull"))
-    return {"skull": found, "skin": _own(skin, "skin")}
+            return {**found, **away}
+    of_jaw = _fit(lower)
+    if of_jaw is not None:
+        found.update(_distances(lower, REFERENCE_PLACES["skull"], of_jaw))
+    return found
 
 
 def jaw_distance(skull: Mapping[str, Floats]) -> float:
@@ -46,7 +48,7 @@ def jaw_distance(skull: Mapping[str, Floats]) -> float:
     """
     upper = {n: p for n, p in skull.items() if not n.startswith(JAW_SITES)}
     lower = {n: p for n, p in skull.items() if n.startswith(JAW_SITES)}
-    of_cranium = _fit(upper, REFERENCE_PLACES["skull"])
+    of_cranium = _fit(upper)
     if of_cranium is None or not lower:
         return 0.0
     return float(np.median([*_from_jaw(lower, of_cranium).values()]))
@@ -65,12 +67,6 @@ def _from_jaw(lower: Mapping[str, Floats], of_cranium: Similarity) -> dict[str, 
     return min(tried, key=lambda away: float(np.median([*away.values()])) if away else 0.0)
 
 
-def _own(sites: Mapping[str, Floats], kind: str) -> dict[str, float]:
-    reference = REFERENCE_PLACES[kind]
-    fit = _fit(sites, reference)
-    return {} if fit is None else _distances(sites, reference, fit)
-
-
 def _distances(
     sites: Mapping[str, Floats], reference: Mapping[str, Floats], fit: Similarity
 ) -> dict[str, float]:
@@ -82,8 +78,9 @@ def _distances(
     }
 
 
-def _fit(sites: Mapping[str, Floats], reference: Mapping[str, Floats]) -> Similarity | None:
+def _fit(sites: Mapping[str, Floats]) -> Similarity | None:
     """The similarity from sites to an average head: linear part, offset, scale."""
+    reference = REFERENCE_PLACES["skull"]
     names = [name for name in sites if name in reference]
     if len(names) < LEAST_SITES:
         return None
