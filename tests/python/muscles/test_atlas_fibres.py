@@ -7,7 +7,7 @@ import cmfsim
 import real_heads
 from benches.scenes.angles import angle_of_lines
 from cmfsim.muscles.template.bodyparts3d import atlas_course
-from cmfsim.muscles.template.bodyparts3d_parts import PAIRED_MUSCLES
+from cmfsim.muscles.template.fibre_lines import PAIRED_MUSCLES
 
 pytest.importorskip("meshio")
 

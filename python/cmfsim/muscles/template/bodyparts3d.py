@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io.landmarks import read_landmarks
 from cmfsim.io.meshes.surfaces import read_surface
-from cmfsim.muscles.template.bodyparts3d_parts import (
+from cmfsim.muscles.template.fibre_lines import (
     BONES,
     HASHES,
     MIDLINE_MUSCLES,
