@@ -24,13 +24,7 @@ from cmfsim.lab.virtual.mechanics.equilibrium import (
     EquilibriumOptions,
     find_equilibrium,
 )
-from cmfsim.lab.virtual.mechanics.lip_contact import (
-    ContactSum,
-    LipContact,
-    MouthSlit,
-    lips_of,
-    with_open_mouth,
-)
+from cmfsim.lab.virtual.mechanics.lip_contact import LipContact, MouthSlit, lips_of, with_open_mouth
 from cmfsim.lab.virtual.mechanics.muscle_field import muscle_field, skin_share, thickened
 from cmfsim.lab.virtual.operation import (
     Operation,
@@ -168,8 +162,8 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     stage("moving the bones")
     body = HyperelasticBody(nodes, tets, tissue)
     operation, lips = _operated(opened, drawn.slit, distances, segments, motions)
-    touching: Contact = operation.contact if lips is None else ContactSum((operation.contact, lips))
-    found = find_equilibrium(body, operation.held, operation.path, touching, options)
+    contacts: list[Contact] = [operation.contact, *([] if lips is None else [lips])]
+    found = find_equilibrium(body, operation.held, operation.path, contacts, options)
 
     stage("moving the skin")
     before = head.surface("skin", skin_spacing)
