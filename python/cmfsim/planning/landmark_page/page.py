@@ -1,16 +1,14 @@
 """The page of landmarks: its surfaces, sites and views, and its text."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cmfsim._core import Surface, __version__
+from cmfsim._core import __version__
+from cmfsim.planning.page.arrays import Arrays, PageContent, add_surface, framing, singles
 from cmfsim.planning.page.document import Document, document_text
-from cmfsim.surfaces.depth import distances
-from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import (
     SKIN_SITES,
@@ -84,22 +82,6 @@ class PageSite:
     placed_origin: str = "placed"
 
 
-@dataclass(frozen=True, eq=False)
-class LandmarkContent:
-    """The data from which a page of landmarks is written.
-
-    Attributes
-    ----------
-    values : mapping
-        Plain values, ready for JSON.
-    arrays : mapping of str to array
-        float32 and uint32.
-    """
-
-    values: Mapping[str, Any]
-    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-
-
 def landmark_content(
     case: str,
     surfaces: Mapping[str, SurfaceData],
@@ -109,7 +91,7 @@ def landmark_content(
     *,
     placed_std: float,
     built_for: str = "",
-) -> LandmarkContent:
+) -> PageContent:
     """The content of the page of a head.
 
     Parameters
@@ -128,9 +110,9 @@ def landmark_content(
     built_for : str
         The state of the case.
     """
-    arrays: dict[str, NDArray[Any]] = {
-        "site_points": _singles([site.point for site in sites]),
-        "site_covariance": _singles(covariance),
+    arrays: Arrays = {
+        "site_points": singles([site.point for site in sites]),
+        "site_covariance": singles(covariance),
     }
     average_surfaces, average_points = average
     values = {
@@ -150,9 +132,12 @@ def landmark_content(
         "good_error": GOOD_ERROR,
         "cleared_share": CLEARED_SHARE,
         "surface_reach": SURFACE_REACH,
-        **_framing(surfaces),
+        **framing(
+            np.concatenate([s.vertices for name, s in surfaces.items() if name != "skin"]),
+            SPAN_SHARE,
+        ),
     }
-    return LandmarkContent(values, arrays)
+    return PageContent(values, arrays)
 
 
 def _values(site: PageSite) -> dict[str, Any]:
@@ -182,10 +167,7 @@ def _part_of(name: str) -> str:
 
 
 def _packed(
-    surfaces: Mapping[str, SurfaceData],
-    most: Mapping[str, int],
-    prefix: str,
-    arrays: dict[str, NDArray[Any]],
+    surfaces: Mapping[str, SurfaceData], most: Mapping[str, int], prefix: str, arrays: Arrays
 ) -> list[dict[str, Any]]:
     """The surfaces of parts, simplified into arrays, with how far the drawn ones are off."""
     counts = {
@@ -196,25 +178,9 @@ def _packed(
     for number, (name, surface) in enumerate(surfaces.items()):
         part = _part_of(name)
         allowed = max(500, most[part] * len(surface.triangles) // counts[part])
-        drawn = simplified_surface(name, surface, allowed)
-        there = Surface(surface.vertices, surface.triangles)
-        away = distances(drawn.vertices, there)
-        arrays[f"{prefix}_{number}"] = _singles(drawn.vertices)
-        arrays[f"{prefix}_{number}_triangles"] = np.asarray(drawn.triangles, dtype=np.uint32)
-        found.append({"name": name, "part": part, "away": round(float(away.max()), 3)})
+        _, off = add_surface(arrays, f"{prefix}_{number}", name, surface, allowed)
+        found.append({"name": name, "part": part, "away": round(off, 3)})
     return found
-
-
-def _singles(rows: Any) -> NDArray[np.float32]:
-    return np.asarray(rows, dtype=np.float32)
-
-
-def _framing(surfaces: Mapping[str, SurfaceData]) -> dict[str, Any]:
-    """Where the picture looks, and how much it shows, mm: all bones."""
-    bones = [s.vertices for name, s in surfaces.items() if name != "skin"]
-    vertices = np.concatenate(bones)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return {"target": (0.5 * (low + high)).tolist(), "span": SPAN_SHARE * float((high - low).max())}
 
 
 def site_view(name: str) -> dict[str, float]:
@@ -224,7 +190,7 @@ def site_view(name: str) -> dict[str, float]:
     return {"azimuth": -azimuth if side == "_R" else azimuth, "elevation": elevation, "span": span}
 
 
-def landmark_page_text(content: LandmarkContent) -> str:
+def landmark_page_text(content: PageContent) -> str:
     """The text of a page of landmarks, which loads nothing and sends nothing.
 
     Raises

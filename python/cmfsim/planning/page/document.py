@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.planning.page.content import PageContent
+from cmfsim.planning.page.arrays import PageContent
 from cmfsim.values.language import language, script_texts, translated
 
 TYPES = ("float32", "float16", "uint32")
