@@ -86,10 +86,7 @@ def render_page(document: Document) -> str:
 
     It has no script but that of its view, which is allowed by its hash.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Jinja2, of the extra `report`, is not installed.
+    Raises `CaseError`: Jinja2, of the extra `report`, is not installed.
     """
     jinja2 = third_party("jinja2", "reports are made", "report")
     environment = jinja2.Environment(

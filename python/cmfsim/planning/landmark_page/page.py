@@ -57,20 +57,12 @@ SPAN_SHARE = 1.1
 class PageSite:
     """A landmark of the page.
 
-    Attributes
-    ----------
-    kind, name : str
-        "skull" or "skin", and the label.
-    point : (3,) float64, mm
-        Where it is, or for a missing site where the others place it.
-    state : SiteState
-        "filled" if it is missing.
-    why : str
-        Why it is missing; empty otherwise.
-    placed : (3,) float64, mm, or None
-        Where a person has placed or accepted it already.
-    placed_origin : str
-        "placed" or "accepted".
+    kind, name: "skull" or "skin", and the label.
+    point: (3,), mm. Where it is, or for a missing site where the others place it.
+    state: "filled" if it is missing.
+    why: Why it is missing; empty otherwise.
+    placed: (3,), mm, or None. Where a person has placed or accepted it already.
+    placed_origin: "placed" or "accepted".
     """
 
     kind: str
@@ -94,21 +86,13 @@ def landmark_content(
 ) -> PageContent:
     """The content of the page of a head.
 
-    Parameters
-    ----------
-    case : str
-        Its name.
-    surfaces : mapping of str to SurfaceData
-        Bones, and "skin" where there is one; LPS mm.
-    sites : sequence of PageSite
-    covariance : (3 n, 3 n) float64, mm²
-        Of the errors of their points: it says how sites follow one that is placed.
-    average : surfaces by part, landmarks by kind and label
-        The head in which the page shows where each site is.
-    placed_std : float, mm
-        How far a person's own point lies from the site, along each axis.
-    built_for : str
-        The state of the case.
+    case: Its name.
+    surfaces: Bones, and "skin" where there is one; LPS mm.
+    covariance: (3 n, 3 n), mm². Of the errors of their points: it says how sites follow one that is
+        placed.
+    average: The head in which the page shows where each site is.
+    placed_std: mm. How far a person's own point lies from the site, along each axis.
+    built_for: The state of the case.
     """
     arrays: Arrays = {
         "site_points": singles([site.point for site in sites]),
@@ -193,10 +177,7 @@ def site_view(name: str) -> dict[str, float]:
 def landmark_page_text(content: PageContent) -> str:
     """The text of a page of landmarks, which loads nothing and sends nothing.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Numbers that are not finite.
+    Raises `CaseError`: Numbers that are not finite.
 
     Examples
     --------
