@@ -13,6 +13,7 @@ import hashlib
 import html
 import json
 import re
+import shlex
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -281,7 +282,7 @@ def page_text(
     """
     values = {
         **content.values,
-        "case_file": _argument(case_file),
+        "case_file": shlex.quote(case_file),
         "exact_note": EXACT_NOTE,
         "is_served": is_served,
     }
@@ -304,9 +305,3 @@ def page_text(
             is_served=is_served,
         )
     )
-
-
-def _argument(name: str) -> str:
-    """A file name as a word of a shell, on Linux and macOS."""
-    plain = re.fullmatch(r"[A-Za-z0-9_./-]+", name) is not None and not name.startswith("-")
-    return name if plain else "'" + name.replace("'", "'\\''") + "'"
