@@ -13,13 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
-from cmfsim.phantom.parameters import FaceWarp, JawWarp
+from cmfsim.phantom.head import Drawn
+from cmfsim.phantom.parameters import JawWarp
 from cmfsim.phantom.shapes import REACH, Box, Level, Tube, smooth_curve, smooth_max
 from cmfsim.values.checks import Floats, as_rows, frozen
 
@@ -47,17 +48,6 @@ DENSE_STEPS = 3
 SOFTENING = 0.01
 
 
-class Tissue(Protocol):
-    """What muscles must know of the head that they lie in."""
-
-    @property
-    def warp(self) -> FaceWarp:
-        """From the person's space to the symmetric head."""
-
-    def skin_and_bone(self, x: Level, y: Level, z: Level) -> tuple[Level, Level]:
-        """The levels of the skin, and of all bones and teeth, in the symmetric head."""
-
-
 @dataclass(frozen=True, eq=False)
 class Muscle:
     """One muscle with its known fibres.
@@ -82,7 +72,7 @@ class Muscle:
     kind: str
     course: tuple[Floats, ...]
     tubes: tuple[Tube, ...] = field(repr=False)
-    tissue: Tissue = field(repr=False)
+    tissue: Drawn = field(repr=False)
 
     @property
     def origin(self) -> Floats:
@@ -200,7 +190,7 @@ def _closest_direction(line: Floats, points: Floats) -> tuple[Floats, Floats]:
     return best, along / np.linalg.norm(along, axis=1)[:, None]
 
 
-def make_muscles(tissue: Tissue) -> Mapping[str, Muscle]:
+def make_muscles(tissue: Drawn) -> Mapping[str, Muscle]:
     """All muscles of a person by name, on both sides."""
     lines = [_dense(line, course) for course in COURSES.values() for line in course.lines]
     lengths = [len(line) for line in lines]
@@ -231,7 +221,7 @@ def _dense(line: Sequence[Sequence[float]], course: Course) -> Floats:
     return dense[:-1] if course.closed else dense
 
 
-def _line(tissue: Tissue, tube: Tube, side: str, course: Course) -> Floats:
+def _line(tissue: Drawn, tube: Tube, side: str, course: Course) -> Floats:
     """A fibre line in the person's space."""
     points = tube.points
     mirror = points * np.array([-1.0, 1.0, 1.0])
@@ -243,7 +233,7 @@ def _line(tissue: Tissue, tube: Tube, side: str, course: Course) -> Floats:
     return frozen(tissue.warp.forward(points))
 
 
-def _strap(tissue: Tissue, rows: Floats, course: Course) -> Tube:
+def _strap(tissue: Drawn, rows: Floats, course: Course) -> Tube:
     """The tube along one line, flat towards the skin."""
     curve = smooth_curve(np.delete(rows, 3, axis=1), STEPS, closed=course.closed)
     points = curve[:, :3]
@@ -256,11 +246,11 @@ def _strap(tissue: Tissue, rows: Floats, course: Course) -> Tube:
     return Tube(points, normals, curve[:, 3], curve[:, 4])
 
 
-def _skin(tissue: Tissue) -> Field:
+def _skin(tissue: Drawn) -> Field:
     return lambda x, y, z: tissue.skin_and_bone(x, y, z)[0]
 
 
-def _placed(tissue: Tissue, points: Floats, place: Floats) -> Floats:
+def _placed(tissue: Drawn, points: Floats, place: Floats) -> Floats:
     """Course points placed between skin and bone, as their rows describe."""
     depth = np.where(place > 1.0, place, 0.0)
     share = np.where(place > 1.0, 0.0, place)
