@@ -421,7 +421,8 @@ def carried(
     if len(moves) != len(corners):
         raise CaseInputError(f"{len(moves)} displacements for {len(corners)} nodes")
     rows = as_index_rows("tets", tets, 4, len(corners), "nodes").astype(np.int64)
-    tree = _module("scipy.spatial").cKDTree(corners[rows].mean(axis=1))
+    spatial = third_party("scipy.spatial", "skins of virtual patients are made", "study")
+    tree = spatial.cKDTree(corners[rows].mean(axis=1))
     count = min(CANDIDATES, len(rows))
     near = tree.query(places, k=count)[1].reshape(len(places), count)
     best = np.full(len(places), -np.inf)
@@ -469,7 +470,7 @@ def scanned(
 
 def _averaging(triangles: NDArray[Any], n: int) -> Any:
     """The matrix that takes the mean over each vertex and its neighbours."""
-    sparse = _module("scipy.sparse")
+    sparse = third_party("scipy.sparse", "skins of virtual patients are made", "study")
     ends = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     ones = np.ones(len(ends))
     near = sparse.coo_array((ones, (ends[:, 0], ends[:, 1])), shape=(n, n)).tocsr()
@@ -487,7 +488,3 @@ def _normals(vertices: Floats, triangles: NDArray[Any]) -> Floats:
     length = np.linalg.norm(total, axis=1, keepdims=True)
     normals: Floats = total / np.maximum(length, np.finfo(np.float64).tiny)
     return normals
-
-
-def _module(name: str) -> Any:
-    return third_party(name, "skins of virtual patients are made", "study")
