@@ -1,11 +1,12 @@
 """Collects the texts that people read, as messages of GNU gettext: extract_texts.py [FILE.pot].
 
 Of the package's Python every text of several words, and in the rooms that show texts single words
-as well; of its pages' scripts those that are tagged _`…`; of their templates what stands between
-tags. Values become {0}, {1} …, and a comment states what they are.
+as well; of its tables some columns; of its pages' scripts those that are tagged _`…`; of their
+templates what stands between tags. Values become {0}, {1} …, and a comment states what they are.
 """
 
 import ast
+import csv
 import re
 import sys
 from collections.abc import Iterator
@@ -17,6 +18,8 @@ PACKAGE = ROOT / "python/cmfsim"
 SHOWN = ("report", "planning", "desk", "evaluation", "pictures", "cli", "values")
 PROSE = re.compile(r"[^\W\d_]{3,}[,.:;)]? +[(“\"]?[\w{]|\}[,.:;)]* +[a-z]{2,}")
 WORD = re.compile(r"(?!.*\w\.[a-z])(?=.*[^\W\d_]{2})[^\W\d_][^_=/{}<>\\]*")
+# Columns of tables that people read.
+TABLE_TEXTS = ("label", "norm", "source", "about")
 # What the finding table fills in.
 BLANK = re.compile(r"\{\w*(?:!r)?(?::[^}]*)?\}")
 SCRIPT_TEXT = re.compile(r"(?<![\w$])_`")
@@ -53,11 +56,15 @@ def found_texts() -> Iterator[Found]:
     """Every text of the package, with its values and its place."""
     for path in sorted(PACKAGE.rglob("*.*")):
         name = path.relative_to(PACKAGE).as_posix()
-        if path.suffix not in {".py", ".js", ".html"}:
+        if path.suffix not in {".py", ".js", ".html", ".csv"}:
             continue
         source = path.read_text(encoding="utf-8")
         if path.suffix == ".py":
             yield from _of_python(source, name)
+        elif path.suffix == ".csv":
+            rows = csv.DictReader(source.splitlines())
+            cells = (row[column] for row in rows for column in TABLE_TEXTS if row.get(column))
+            yield from ((c, [], name) for c in cells if PROSE.search(c) or WORD.fullmatch(c))
         elif path.suffix == ".js":
             for match in SCRIPT_TEXT.finditer(source):
                 text, values, _ = _template_literal(source, match.end())

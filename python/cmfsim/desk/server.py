@@ -26,7 +26,8 @@ from cmfsim.errors import CaseInputError, CmfsimError, LandmarkError
 from cmfsim.io import Case, read_landmark_file, replacing, write_landmarks
 from cmfsim.io.files.reading_writing import toml_module
 from cmfsim.pipeline.building.inputs import plan_key, read_placed_sites
-from cmfsim.planning.landmark_page import LandmarkContent, landmark_page_text
+from cmfsim.planning.landmark_page import landmark_page_text
+from cmfsim.planning.page import PageContent
 from cmfsim.planning.page.document import Document, document_text, shown_values
 from cmfsim.planning.server import SOLVE, LocalServer, RefusedError, Reply, solved_reply
 from cmfsim.values.case_parts import PROCEDURES
@@ -54,12 +55,8 @@ CHANGED = (
 def desk_server(session: Session, port: int | socket.socket = 0) -> LocalServer:
     """The server of a folder on the desk, which does not run yet.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Starlette or Uvicorn, of the extra `serve`, is not installed.
-    OSError
-        The port is taken.
+    Raises `CaseError`: Starlette or Uvicorn, of the extra `serve`, is not installed.
+    Raises `OSError`: The port is taken.
     """
     calls = Calls(session)
     pages: dict[str, Callable[[], Reply]] = {
@@ -440,4 +437,4 @@ def landmarks_text(session: Session) -> str:
     page = session.head.values["page"]
     sites = _with_placed(session, page["sites"])
     values = {**page, "sites": sites, "on_desk": True}
-    return landmark_page_text(LandmarkContent(values, session.head.arrays))
+    return landmark_page_text(PageContent(values, session.head.arrays))

@@ -13,16 +13,7 @@ from cmfsim.errors import CaseInputError, LandmarkError, LandmarkInputError, Reg
 from cmfsim.evaluation.regions import Matches, Skin, match_skins, skin_regions
 from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.registration import match_landmarks
-from cmfsim.values.checks import (
-    Floats,
-    as_indices,
-    as_positive,
-    as_rows,
-    brief,
-    check_one_of,
-    frozen,
-    plain,
-)
+from cmfsim.values.checks import Floats, as_indices, as_rows, brief, check_one_of, frozen, plain
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.surface_data import SurfaceData
@@ -73,11 +64,9 @@ class SkinComparison:
     n_covered, back_covered : int
         Vertices inside the mask that other skin covers, of the prediction and of the post-operative
         skin: they are not evaluated.
-    n_border, n_far : int
-        Excluded vertices: with a partner on the border of the post-operative skin; with a partner
-        beyond the limit.
-    back_border, back_far : int
-        The same in the other direction.
+    n_border, back_border : int
+        Excluded vertices, with a partner on the border of the other skin, where the distance
+        depends on where the scan was cut; in either direction.
     findings : tuple of Finding
     """
 
@@ -96,10 +85,8 @@ class SkinComparison:
     n_masked: int
     n_covered: int
     n_border: int
-    n_far: int
     back_covered: int
     back_border: int
-    back_far: int
     findings: tuple[Finding, ...]
 
     __repr__ = brief
@@ -190,10 +177,8 @@ class SkinComparison:
                 "masked": self.n_masked,
                 "covered": self.n_covered,
                 "border": self.n_border,
-                "far": self.n_far,
                 "covered_backward": self.back_covered,
                 "border_backward": self.back_border,
-                "far_backward": self.back_far,
             },
             "findings": [
                 {"severity": f.severity, "code": f.code, "what": f.what} for f in self.findings
@@ -209,8 +194,6 @@ def compare_skins(
     method: str | None = None,
     mask: Choice = None,
     regions: Mapping[str, ArrayLike] | None = None,
-    exclude_borders: bool = True,
-    max_distance: float | None = None,
 ) -> SkinComparison:
     """The distances of a predicted skin from the post-operative one.
 
@@ -231,11 +214,6 @@ def compare_skins(
         move; "face" takes the face by its landmarks. Default: all.
     regions : mapping of str to (n,) bool or (k,) indices, optional
         Regions to report separately. Default: `skin_regions` if the landmarks have the usual names.
-    exclude_borders : bool
-        Whether to exclude vertices whose partner lies on the border of the other skin, where the
-        distance depends on where the scan was cut.
-    max_distance : float, mm, optional
-        Vertices further apart are excluded and counted. Default: no limit.
 
     Raises
     ------
@@ -272,30 +250,15 @@ def compare_skins(
     if method is None:
         method = "closest" if landmarks is None else "landmarks"
     check_one_of("method", method, MATCHINGS)
-    if max_distance is not None:
-        as_positive("max_distance", max_distance)
     skin, other = Skin(simulated), Skin(postoperative)
     warps = _warps(landmarks) if method == "landmarks" else _Warps()
     names = landmarks[0] if landmarks is not None else None
     parts = _parts(skin, regions, names)
     asked = _chosen_vertices(mask, skin, parts)
     chosen, seen = _uncovered(skin, asked), ~other.covered()
-    matches = match_skins(
-        skin,
-        chosen,
-        other,
-        warp=warps.forth,
-        max_distance=max_distance,
-        exclude_borders=exclude_borders,
-    )
-    _check_matched(matches, int(chosen.sum()))
-    backward = _backward(
-        (other, seen),
-        (skin, chosen),
-        warp=warps.back,
-        limit=max_distance,
-        exclude_borders=exclude_borders,
-    )
+    matches = match_skins(skin, chosen, other, warp=warps.forth)
+    _check_matched(matches)
+    backward = _backward((other, seen), (skin, chosen), warp=warps.back)
     found = _findings(matches, int(chosen.sum()), warps.forth, skin.vertices[chosen])
     areas = skin.vertex_areas()
     return SkinComparison(
@@ -311,7 +274,6 @@ def compare_skins(
         share=float(areas[matches.vertices].sum() / areas.sum()),
         n_masked=int(len(asked) - asked.sum()),
         n_border=matches.n_border,
-        n_far=matches.n_far,
         findings=(*warps.findings, *found),
     )
 
@@ -345,12 +307,11 @@ def _warps(landmarks: tuple[Landmarks, Landmarks] | None) -> _Warps:
     return _Warps(ThinPlateSpline(ours, theirs), ThinPlateSpline(theirs, ours), findings)
 
 
-def _check_matched(matches: Matches, n_chosen: int) -> None:
+def _check_matched(matches: Matches) -> None:
     if not len(matches.vertices):
         raise RegistrationInputError(
-            f"none of {n_chosen} vertices has a partner: {matches.n_border} are matched to the "
-            f"border of the post-operative skin and {matches.n_far} are further away than the "
-            "limit; check that both are in one frame and unit (in a case: frame, units, aligned in "
+            f"all {matches.n_border} vertices are matched to the border of the post-operative "
+            "skin; check that both are in one frame and unit (in a case: frame, units, aligned in "
             "[postoperative]; aligned = false registers them), and the mask is on the scanned face"
         )
 
@@ -370,7 +331,6 @@ def _from_behind(matches: Matches, backward: Matches) -> dict[str, Any]:
         if len(signed)
         else None,
         "back_border": backward.n_border,
-        "back_far": backward.n_far,
     }
 
 
@@ -461,24 +421,14 @@ def _backward(
     evaluated: tuple[Skin, NDArray[np.bool_]],
     *,
     warp: ThinPlateSpline | None,
-    limit: float | None,
-    exclude_borders: bool,
 ) -> Matches:
     """Partners of the post-operative vertices on the evaluated part of the simulated skin."""
     (other, seen), (skin, chosen) = seen_part, evaluated
     part = skin if chosen.all() else skin.part(chosen)
     if part is None:
         none = np.zeros(0, dtype=np.int64)
-        return Matches(none, np.zeros((0, 3)), np.zeros(0), 0, 0)
-    # The border of a part of the skin is always left out: what lies beyond was masked.
-    return match_skins(
-        other,
-        seen,
-        part,
-        warp=warp,
-        max_distance=limit,
-        exclude_borders=exclude_borders or part is not skin,
-    )
+        return Matches(none, np.zeros((0, 3)), np.zeros(0), 0)
+    return match_skins(other, seen, part, warp=warp)
 
 
 def _findings(

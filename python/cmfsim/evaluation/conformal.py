@@ -10,13 +10,13 @@ with parameters k and n + 1 − k (Vovk 2012).
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.errors import CalibrationError
+from cmfsim.errors import CalibrationError, third_party
 from cmfsim.values.calibration import BandFactor
 from cmfsim.values.checks import as_floats, as_number
 
@@ -24,7 +24,6 @@ from cmfsim.values.checks import as_floats, as_number
 ROUNDING = 1e-9
 # Share of the distribution of the coverage between the ends of its interval.
 INTERVAL = 0.9
-BISECTIONS = 60
 
 
 def calibrate(scores: ArrayLike, coverage: float) -> BandFactor:
@@ -62,7 +61,8 @@ def calibrate(scores: ArrayLike, coverage: float) -> BandFactor:
         raise CalibrationError(f"score {values[bad]!r} is not a finite number from 0 on")
     rank = math.ceil((n + 1) * share - ROUNDING)
     ends = (0.5 * (1.0 - INTERVAL), 0.5 * (1.0 + INTERVAL))
-    low, high = (_bisected(lambda x: _at_least(rank, n, x), end) for end in ends)
+    special = third_party("scipy.special", "bands are calibrated", "report")
+    low, high = special.betaincinv(rank, n + 1 - rank, ends).tolist()
     return BandFactor(float(values[rank - 1]), n, rank, share, (low, high))
 
 
@@ -103,15 +103,10 @@ def covered_interval(factor: BandFactor, tests: int) -> tuple[int, int]:
     >>> fewest < 90 < most
     True
     """
-    a, b = factor.rank, factor.n + 1 - factor.rank
-    logs = [
-        math.lgamma(tests + 1) - math.lgamma(j + 1) - math.lgamma(tests - j + 1)
-        + _log_beta(j + a, tests - j + b) - _log_beta(a, b)
-        for j in range(tests + 1)
-    ]  # fmt: skip
-    sums = np.cumsum(np.exp(logs))
-    low, high = (int(np.searchsorted(sums, 0.5 * (1.0 + s * INTERVAL))) for s in (-1.0, 1.0))
-    return low, min(high, tests)
+    stats = third_party("scipy.stats", "coverage is compared", "report")
+    number = stats.betabinom(tests, factor.rank, factor.n + 1 - factor.rank)
+    low, high = number.ppf([0.5 * (1.0 - INTERVAL), 0.5 * (1.0 + INTERVAL)])
+    return int(low), int(high)
 
 
 def region_scores(
@@ -178,29 +173,3 @@ def _share(coverage: float) -> float:
             f"coverage is {share!r}: it must be above 0 and below 1 (90 % is 0.9)"
         )
     return share
-
-
-def _at_least(k: int, n: int, x: float) -> float:
-    """The probability of k or more of n, each with probability x; 0 < x < 1.
-
-    It is the distribution function of the beta distribution with parameters k and n + 1 − k at x.
-    """
-    logs = [
-        math.lgamma(n + 1) - math.lgamma(j + 1) - math.lgamma(n - j + 1)
-        + j * math.log(x) + (n - j) * math.log1p(-x)
-        for j in range(k, n + 1)
-    ]  # fmt: skip
-    return math.fsum(math.exp(value) for value in logs)
-
-
-def _bisected(rising: Callable[[float], float], value: float) -> float:
-    """Where a function that rises from 0 to 1 over 0 to 1 has a value."""
-    low, high = 0.0, 1.0
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if rising(middle) < value else (low, middle)
-    return 0.5 * (low + high)
-
-
-def _log_beta(a: float, b: float) -> float:
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)

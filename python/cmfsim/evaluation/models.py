@@ -122,7 +122,7 @@ class ModelComparison:
         }
 
 
-def compare_models(  # noqa: PLR0913 (options by name)
+def compare_models(
     preoperative: SurfaceData | Surface,
     predictions: Mapping[str, ArrayLike],
     postoperative: SurfaceData | Surface,
@@ -132,8 +132,6 @@ def compare_models(  # noqa: PLR0913 (options by name)
     mask: Choice = None,
     regions: Mapping[str, NDArray[np.bool_]] | None = None,
     thickening: Floats | None = None,
-    exclude_borders: bool = True,
-    max_distance: float | None = None,
 ) -> ModelComparison:
     """Comparison of several models with the post-operative skin, and with no change.
 
@@ -146,7 +144,7 @@ def compare_models(  # noqa: PLR0913 (options by name)
     postoperative : SurfaceData or Surface
     landmarks : (landmarks, landmarks), optional
         Of the *pre-operative* and of the post-operative skin; the first follow each prediction.
-    method, mask, exclude_borders, max_distance
+    method, mask
         As in `compare_skins`. Regions and the mask "face" are placed on the pre-operative skin, so
         that they contain the same vertices for every model.
     regions : mapping of str to (v,) bool, optional
@@ -173,7 +171,10 @@ def compare_models(  # noqa: PLR0913 (options by name)
     """
     if not predictions:
         raise CaseInputError("there is no prediction to compare")
-    skin, after = _core(preoperative), _core(postoperative)
+    skin, after = (
+        given if isinstance(given, Surface) else given.searched
+        for given in (preoperative, postoperative)
+    )
     moved = {NO_CHANGE: skin.vertices}
     for name, vertices in predictions.items():
         if as_text("model", name) == NO_CHANGE:
@@ -199,8 +200,6 @@ def compare_models(  # noqa: PLR0913 (options by name)
             method=method,
             mask=chosen,
             regions=parts,
-            exclude_borders=exclude_borders,
-            max_distance=max_distance,
         )
         for name, vertices in moved.items()
     }
@@ -258,12 +257,6 @@ def _carried(
         return dict(zip(first, there, strict=True)), second
     places = as_rows("landmarks", first, 3)
     return places + motion.displacement(places), second
-
-
-def _core(surface: SurfaceData | Surface) -> Surface:
-    if isinstance(surface, Surface):
-        return surface
-    return Surface(surface.vertices, surface.triangles, crease_angle=surface.crease_angle)
 
 
 @dataclass(frozen=True, eq=False)

@@ -282,11 +282,7 @@ class Skin:
     """A surface ready to be searched, with the border that it may have."""
 
     def __init__(self, surface: SurfaceData | Surface) -> None:
-        self.core = (
-            surface
-            if isinstance(surface, Surface)
-            else Surface(surface.vertices, surface.triangles, crease_angle=surface.crease_angle)
-        )
+        self.core = surface if isinstance(surface, Surface) else surface.searched
         self.vertices: Floats = self.core.vertices
         self.triangles: NDArray[np.int64] = self.core.triangles.astype(np.int64)
         border = np.sort(edges_of(self.triangles).border, axis=1)
@@ -364,24 +360,17 @@ class Matches:
     vertices: (k,) int64. Those that were kept.
     partners: (k, 3), mm.
     signed: (k,), mm. Distance to the partner; negative where the vertex lies behind the other skin.
-    n_border, n_far: Left out because the partner lies on the other skin's border; or too far away.
+    n_border: Left out because the partner lies on the other skin's border.
     """
 
     vertices: NDArray[np.int64]
     partners: Floats
     signed: Floats
     n_border: int
-    n_far: int
 
 
 def match_skins(
-    skin: Skin,
-    chosen: NDArray[np.bool_],
-    other: Skin,
-    *,
-    warp: ThinPlateSpline | None,
-    max_distance: float | None,
-    exclude_borders: bool,
+    skin: Skin, chosen: NDArray[np.bool_], other: Skin, *, warp: ThinPlateSpline | None
 ) -> Matches:
     """The partners of the chosen vertices on another skin.
 
@@ -398,17 +387,6 @@ def match_skins(
     if warp is not None:
         partners, _, triangles = other.core.closest(warp(places))
     apart = np.linalg.norm(places - partners, axis=1)
-    border = np.zeros(len(vertices), dtype=bool)
-    if exclude_borders:
-        border = other.at_border(partners, triangles)
-    far = np.zeros(len(vertices), dtype=bool)
-    if max_distance is not None:
-        far = ~border & (apart > max_distance)
-    kept = ~border & ~far
-    return Matches(
-        vertices[kept],
-        partners[kept],
-        np.where(behind, -apart, apart)[kept],
-        int(border.sum()),
-        int(far.sum()),
-    )
+    border = other.at_border(partners, triangles)
+    signed = np.where(behind, -apart, apart)
+    return Matches(vertices[~border], partners[~border], signed[~border], int(border.sum()))

@@ -280,7 +280,7 @@ class DistanceStatistics:
 
 
 def distance_statistics(
-    signed: ArrayLike, *, weights: ArrayLike | None = None, limits: tuple[float, ...] = LIMITS
+    signed: ArrayLike, *, weights: ArrayLike | None = None
 ) -> DistanceStatistics:
     """The figures of signed distances.
 
@@ -289,8 +289,6 @@ def distance_statistics(
     signed : (k,) float64, mm
     weights : (k,) float64, optional
         Weight of each distance, above 0, such as an area. Equal weights change nothing.
-    limits : tuple of float, mm
-        For the shares within.
 
     Raises
     ------
@@ -335,7 +333,7 @@ def distance_statistics(
         signed_mean=signed_mean,
         signed_std=math.sqrt(mean_of((values - signed_mean) ** 2)),
         within=MappingProxyType(
-            {float(limit): mean_of((sizes <= limit).astype(np.float64)) for limit in limits}
+            {float(limit): mean_of((sizes <= limit).astype(np.float64)) for limit in LIMITS}
         ),
         quartiles=(lower, upper),
         outliers=int(np.count_nonzero(sizes > upper + WHISKER * (upper - lower))),

@@ -24,13 +24,8 @@ class Blur:
     not cross the gap between lips, where nodes are separate. k rounds widen k times the variance of
     one, which is measured on the mesh.
 
-    Parameters
-    ----------
-    mesh : TetMesh
-    weights : (m,) float64
-        The share of muscle: where it is, the width of a round is measured.
-    width : float, mm
-        Standard deviation along each axis; rounded to a whole number of rounds.
+    weights: (m,). The share of muscle: where it is, the width of a round is measured.
+    width: mm. Standard deviation along each axis; rounded to a whole number of rounds.
     """
 
     def __init__(self, mesh: TetMesh, weights: Floats, width: float) -> None:
@@ -74,20 +69,11 @@ def blurred(
     the share blurred by that error. Constants mix linearly in the shares, so they are blurred
     alike. The fibre is the principal direction of the blurred Σ p a aᵀ.
 
-    Parameters
-    ----------
-    mesh : TetMesh
-    fraction : (m,) float64
-    fibre : (m, 3) float64
-        Unit vectors, zero where there is no muscle.
-    tissue : TissueData
-        Of each tet, made of both.
-    width : float, mm
-        Standard deviation of the blur along each axis; 0 for none.
-
-    Returns
-    -------
-    tuple of (m,) float64, (m, 3) float64 and TissueData
+    fraction: (m,).
+    fibre: (m, 3). Unit vectors, zero where there is no muscle.
+    tissue: Of each tet, made of both.
+    width: mm. Standard deviation of the blur along each axis; 0 for none.
+    Returns: tuple of (m,), (m, 3) and TissueData.
     """
     if width == 0.0 or not fraction.any():
         return fraction, fibre, tissue

@@ -226,7 +226,7 @@ LIP_BORDER = 0.8
 
 
 class Drawn(Protocol):
-    """What landmarks must know of the head."""
+    """What landmarks and muscles must know of the head."""
 
     @property
     def warp(self) -> FaceWarp:
@@ -237,6 +237,9 @@ class Drawn(Protocol):
 
     def unmoved_level(self, name: str, x: Level, y: Level, z: Level) -> Level:
         """The level before the jaw's map."""
+
+    def skin_and_bone(self, x: Level, y: Level, z: Level) -> tuple[Level, Level]:
+        """The levels of the skin, and of all bones and teeth, in the symmetric head."""
 
 
 def _first_hit(field: Field, starts: Floats, direction: Floats, length: float) -> Floats:

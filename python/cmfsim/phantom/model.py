@@ -9,19 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.phantom.grid import (
-    COUCH_FOAM,
-    COUCH_GAP,
-    COUCH_SHELL,
-    HOUNSFIELD,
-    Field,
-    add_couch,
-    add_metal,
-    level_grid,
-    level_surface,
-    mixed,
-    noisy,
-)
+from cmfsim.phantom.grid import HOUNSFIELD, Field, level_grid, level_surface, mixed, noisy
 from cmfsim.phantom.head import HEAD_BOX, find_skin_landmarks, find_skull_landmarks, skin_shape
 from cmfsim.phantom.muscles import Muscle, make_muscles
 from cmfsim.phantom.parameters import FaceWarp, HeadParameters, JawWarp, JawWarped
@@ -31,7 +19,6 @@ from cmfsim.phantom.skull import (
     brain_shape,
     cranium_shape,
     mandible_shape,
-    metal_pieces,
     teeth_shape,
 )
 from cmfsim.values.anatomy import Anatomy
@@ -373,13 +360,7 @@ class PhantomHead:
         return ImageData(labels, step, [axis[0] for axis in axes])
 
     def ct(
-        self,
-        spacing: ArrayLike = (1.0, 1.0, 1.0),
-        *,
-        noise: float = 12.0,
-        seed: int = 0,
-        metal: bool = False,
-        couch: bool = False,
+        self, spacing: ArrayLike = (1.0, 1.0, 1.0), *, noise: float = 12.0, seed: int = 0
     ) -> ImageData:
         """The head as a CT would show it, int16 HU, with partial volume at every surface.
 
@@ -392,20 +373,12 @@ class PhantomHead:
         noise : float, HU
             Standard deviation of the noise of a voxel, 0 or more.
         seed : int
-            Draws the noise and the streaks; the same seed gives the same image.
-        metal : bool
-            Whether four crowns are of metal, with streaks in their slices.
-        couch : bool
-            Whether the head lies on a couch.
+            Draws the noise; the same seed gives the same image.
         """
         noise = as_number("noise", noise)
         if noise < 0.0:
             raise CaseInputError(f"noise is {noise:g} HU: must be 0 or more")
         step, axes = self._grid(spacing)
-        if couch:
-            more = COUCH_GAP + COUCH_FOAM + 2.0 * COUCH_SHELL
-            beyond = axes[1][-1] + step[1] * np.arange(1.0, np.ceil(more / step[1]) + 1.0)
-            axes = (axes[0], np.concatenate([axes[1], beyond]), axes[2])
         level = self._levels(axes, LEAN_DEPTH + 2.0, ("brain",))
         width = float(np.cbrt(np.prod(step)))
         image = np.full(level["skin"].shape, HOUNSFIELD["air"], dtype=np.float32)
@@ -423,14 +396,6 @@ class PhantomHead:
         )
         for tissue, inside in layers:
             mixed(image, HOUNSFIELD[tissue], inside, width)
-        grid = (axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :])
-        if couch:
-            rows = np.flatnonzero((level["skin"] > 0.0).any(axis=(0, 2)))
-            add_couch(image, grid, float(axes[1][rows[-1]]))
-        if metal:
-            pieces = metal_pieces()
-            pieces[:, :3] = self.warp.forward(pieces[:, :3])
-            add_metal(image, grid, pieces, step, seed)
         return ImageData(noisy(image, noise, seed), step, [axis[0] for axis in axes])
 
 

@@ -1,162 +1,41 @@
 """The muscles of one person: straps along their courses, with the true fibre directions.
 
-Courses are those of the left side. Each fibre line is a list of rows x, y, z, place, half
-thickness, half width, in mm of the drawn head. Place says how the point is put into the tissue of
-the person at hand: up to 1 it is the fraction of the way from skin to bone (1: attached to bone),
-above 1 the depth below the skin in mm, and 0 leaves the point where it is. Origins come first.
-Courses after the usual textbooks of anatomy (Gray 1918; Netter); lengths and widths are round
-figures of adults.
+Courses are those of the left side, in courses.json. Each fibre line is a list of rows x, y, z,
+place, half thickness, half width, in mm of the drawn head. Place says how the point is put into the
+tissue of the person at hand: up to 1 it is the fraction of the way from skin to bone (1: attached
+to bone), above 1 the depth below the skin in mm, and 0 leaves the point where it is. Origins come
+first. Courses after the usual textbooks of anatomy (Gray 1918; Netter); lengths and widths are
+round figures of adults.
 """
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from types import MappingProxyType
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.phantom.grid import Field, gradient_at, to_surface
-from cmfsim.phantom.parameters import FaceWarp, JawWarp
+from cmfsim.phantom.head import Drawn
+from cmfsim.phantom.parameters import JawWarp
 from cmfsim.phantom.shapes import REACH, Box, Level, Tube, smooth_curve, smooth_max
 from cmfsim.values.checks import Floats, as_rows, frozen
-
-Row = tuple[float, float, float, float, float, float]
 
 
 class Course(NamedTuple):
     """How one muscle runs: kind, fibre lines, whether there are two, whether the lines close."""
 
     kind: str
-    lines: tuple[tuple[Row, ...], ...]
-    paired: bool = True
-    closed: bool = False
+    paired: bool
+    closed: bool
+    lines: Sequence[Sequence[Sequence[float]]]
 
 
-def _ring(
-    x: float, z: float, half_x: float, half_z: float, *, place: float, thick: float, wide: float
-) -> tuple[Row, ...]:
-    """Rows about an eye, from the inner corner over the upper lid."""
-    turns = (
-        (-1, 0), (-0.71, 0.71), (0, 1), (0.71, 0.71), (1, 0), (0.71, -0.71), (0, -1),
-        (-0.71, -0.71),
-    )  # fmt: skip
-    # The face falls back by 0.45 mm per mm towards the temple here.
-    return tuple(
-        (x + half_x * a, -84.0 + 0.45 * (half_x * a + 4.0), z + half_z * b, place, thick, wide)
-        for a, b in turns
-    )
-
-
-COURSES = MappingProxyType({
-    "masseter": Course("strap", (
-        ((52, -61, -7, 1, 3.0, 6), (54, -52, -28, 0.62, 4.0, 7), (49, -40, -57, 0.95, 3.0, 6)),
-        ((57, -53, -5, 1, 3.0, 6), (56, -43, -28, 0.62, 4.5, 7), (49, -31, -56, 0.95, 3.0, 7)),
-        ((61, -42, -3, 1, 3.0, 6), (57, -34, -26, 0.62, 4.5, 7), (50, -23, -48, 0.95, 3.0, 7)),
-    )),
-    "temporalis": Course("fan", (
-        ((52, -54, 60, 0.9, 1.6, 11), (56, -50, 40, 0.75, 2.8, 11), (56, -42, 14, 0, 3.4, 7),
-         (48, -36, -6, 0, 2.0, 3)),
-        ((60, -36, 74, 0.9, 1.6, 12), (62, -36, 48, 0.75, 2.8, 11), (57, -38, 14, 0, 3.4, 7),
-         (48, -36, -6, 0, 2.0, 3)),
-        ((66, -14, 78, 0.9, 1.6, 13), (66, -20, 50, 0.75, 2.8, 11), (57.5, -34, 14, 0, 3.4, 7),
-         (48, -35, -6, 0, 2.0, 3)),
-        ((69, 8, 72, 0.9, 1.6, 13), (68, -6, 42, 0.75, 2.8, 11), (57.5, -30, 13, 0, 3.4, 7),
-         (48, -34, -6, 0, 2.0, 3)),
-        ((70, 22, 54, 0.9, 1.6, 13), (68, 2, 32, 0.75, 2.8, 11), (57.5, -26, 12, 0, 3.4, 7),
-         (48, -34, -6, 0, 2.0, 3)),
-    )),
-    "medial_pterygoid": Course("strap", (
-        ((23, -40, -14, 0, 2.5, 6), (29, -34, -33, 0, 3.5, 7), (36, -29, -52, 0, 2.5, 7)),
-        ((23, -35, -12, 0, 2.5, 6), (29, -29, -30, 0, 3.5, 7), (36, -23, -48, 0, 2.5, 7)),
-    )),
-    "buccinator": Course("sheet", (
-        ((32, -50, -29, 0.95, 1.0, 4), (37, -64, -34, 0.85, 1.3, 5), (33, -75, -40, 0.8, 1.3, 4),
-         (28.5, -83, -43, 0.6, 1.2, 2)),
-        ((35, -44, -43, 0.9, 1.0, 5), (37, -62, -45, 0.85, 1.3, 5), (33, -75, -45, 0.8, 1.3, 4),
-         (28.5, -83, -45, 0.6, 1.2, 2)),
-        ((34, -50, -56, 0.95, 1.0, 4), (36, -64, -54, 0.85, 1.3, 5), (33, -75, -49, 0.8, 1.3, 4),
-         (28.5, -83, -46.5, 0.6, 1.2, 2)),
-    )),
-    "orbicularis_oris": Course("ring", (
-        ((0, -103, -32.5, 0.45, 1.5, 3.6), (10, -101, -33.2, 0.45, 1.5, 3.6),
-         (20, -94, -36.5, 0.45, 1.5, 3.4), (27, -87, -45, 0.5, 1.5, 2.6),
-         (21, -91, -53, 0.45, 1.5, 3.4), (11, -96, -56.5, 0.45, 1.5, 3.6),
-         (0, -98, -57.2, 0.45, 1.5, 3.6)),
-        ((0, -101, -39.5, 0.38, 1.5, 3.2), (9, -99, -39.6, 0.38, 1.5, 3.2),
-         (18, -93, -41.6, 0.4, 1.5, 2.6), (23.5, -88, -45, 0.5, 1.5, 2.2),
-         (17, -93, -48.8, 0.4, 1.5, 2.6), (9, -97, -50.6, 0.38, 1.5, 3.2),
-         (0, -99, -51, 0.38, 1.5, 3.2)),
-    ), paired=False),
-    "orbicularis_oculi": Course("ring", (
-        _ring(32, 18, 14.5, 8.5, place=2.0, thick=0.8, wide=3.0),
-        _ring(32.5, 18, 19, 14, place=2.4, thick=0.9, wide=3.2),
-        _ring(33, 18, 23, 19.5, place=2.6, thick=0.9, wide=3.4),
-    ), closed=True),
-    "zygomaticus_major": Course("strap", (
-        ((50, -66, -8, 1, 1.6, 3.4), (42, -75, -23, 0.4, 1.7, 3.2),
-         (29.5, -84, -43, 0.45, 1.5, 2.4)),
-    )),
-    "zygomaticus_minor": Course("strap", (
-        ((42, -72, -5, 1, 1.2, 2.4), (33, -82, -18, 0.4, 1.3, 2.4), (20, -94, -34, 0.35, 1.2, 2.2)),
-    )),
-    "levator_labii_superioris": Course("strap", (
-        ((29, -77, 0, 1, 1.2, 5.0), (24, -84, -14, 0.6, 1.3, 4.4), (15, -97, -33, 0.4, 1.2, 3.4)),
-    )),
-    "levator_labii_alaeque_nasi": Course("strap", (
-        ((9.5, -87, 16, 1, 1.0, 2.0), (14, -88, 2, 0.6, 1.1, 2.2), (19, -90, -14, 0.45, 1.1, 2.4),
-         (11, -99, -32, 0.35, 1.0, 2.4)),
-    )),
-    "levator_anguli_oris": Course("strap", (
-        ((25, -77, -13, 1, 1.3, 4.2), (28, -80, -28, 0.75, 1.5, 3.6),
-         (28.5, -84, -42, 0.6, 1.3, 2.4)),
-    )),
-    "depressor_anguli_oris": Course("fan", (
-        ((23, -76, -75, 0.9, 1.2, 4.0), (27, -81, -60, 0.4, 1.4, 3.4),
-         (28.5, -84, -47, 0.4, 1.3, 2.0)),
-        ((31, -68, -70, 0.9, 1.2, 4.0), (30, -78, -58, 0.4, 1.4, 3.4),
-         (29, -83.5, -47, 0.4, 1.3, 2.0)),
-    )),
-    "depressor_labii_inferioris": Course("strap", (
-        ((19, -80, -75, 0.95, 1.2, 4.4), (15, -89, -64, 0.6, 1.4, 4.4),
-         (9, -97, -54, 0.5, 1.2, 4.0)),
-    )),
-    "mentalis": Course("strap", (
-        ((5, -87, -62, 1, 2.4, 3.2), (6, -92, -72, 0.5, 2.8, 3.6), (6.5, -97, -78, 0.2, 2.0, 3.6)),
-    )),
-    "risorius": Course("strap", (
-        ((53, -54, -41, 0.3, 0.9, 4.6), (42, -70, -45, 0.35, 1.0, 4.0),
-         (29.5, -84, -45.5, 0.4, 1.0, 2.4)),
-    )),
-    "platysma": Course("sheet", (
-        ((12, -28, -116, 3, 1.0, 9), (13, -32, -98, 3, 1.0, 9), (14, -38, -84, 3, 1.0, 9),
-         (16, -48, -79, 3, 1.0, 9), (20, -68, -83, 3, 1.0, 8), (24, -84, -72, 3, 1.0, 6)),
-        ((26, -24, -116, 3, 1.0, 9), (26, -26, -97, 3, 1.0, 9), (27, -31, -82, 3, 1.0, 9),
-         (30, -41, -75, 3, 1.0, 9), (35, -60, -76, 3, 1.0, 8), (33, -76, -62, 3, 1.0, 6)),
-        ((38, -14, -116, 3, 1.0, 9), (37, -17, -95, 3, 1.0, 9), (38, -22, -80, 3, 1.0, 9),
-         (43, -30, -70, 3, 1.0, 9), (49, -44, -68, 3, 1.0, 8), (42, -68, -55, 3, 1.0, 6)),
-        ((47, 2, -116, 3, 1.0, 9), (46, -3, -95, 3, 1.0, 9), (46, -8, -80, 3, 1.0, 9),
-         (50, -17, -68, 3, 1.0, 9), (57, -28, -62, 3, 1.0, 8), (50, -58, -50, 3, 1.0, 6)),
-    )),
-    "frontalis": Course("sheet", (
-        ((8, -82, 92, 0.5, 1.2, 10), (8, -93, 70, 0.5, 1.3, 10), (8, -96, 47, 0.45, 1.2, 9)),
-        ((20, -79, 92, 0.5, 1.2, 10), (20, -90, 70, 0.5, 1.3, 10), (20, -95, 47, 0.45, 1.2, 9)),
-        ((32, -73, 90, 0.5, 1.2, 10), (33, -83, 68, 0.5, 1.3, 10), (33, -89, 46, 0.45, 1.2, 9)),
-        ((43, -65, 84, 0.5, 1.2, 8), (45, -74, 64, 0.5, 1.2, 9), (46, -79, 44, 0.45, 1.2, 8)),
-    )),
-    "procerus": Course("strap", (
-        ((0, -101, 12, 0.6, 0.9, 3.6), (0, -95, 28, 0.55, 1.1, 4.0), (0, -97, 47, 0.4, 1.0, 4.6)),
-    ), paired=False),
-    "nasalis": Course("strap", (
-        ((15, -86, -17, 0.95, 1.0, 2.6), (14, -93, -5, 0.5, 1.1, 3.4), (8.5, -99, 3, 0.5, 1.0, 3.6),
-         (0.5, -107, 6, 0.5, 0.9, 3.6)),
-    )),
-    "corrugator": Course("strap", (
-        ((6, -94, 41, 0.95, 1.2, 2.2), (17, -93, 44, 0.65, 1.3, 2.4), (30, -87, 48, 0.4, 0.9, 2.4)),
-    )),
-})  # fmt: skip
-
-
+_TABLE = json.loads(files(__package__).joinpath("courses.json").read_text(encoding="utf-8"))
+COURSES = MappingProxyType({name: Course(**entry) for name, entry in _TABLE.items()})
 # Muscle stays this far below the skin, mm.
 BELOW_SKIN = 0.6
 # Neighbouring straps of one muscle melt over this width, mm.
@@ -167,17 +46,6 @@ STEPS = 5
 DENSE_STEPS = 3
 # Distance within which a fibre line counts as met, relative to the mean length of the lines.
 SOFTENING = 0.01
-
-
-class Tissue(Protocol):
-    """What muscles must know of the head that they lie in."""
-
-    @property
-    def warp(self) -> FaceWarp:
-        """From the person's space to the symmetric head."""
-
-    def skin_and_bone(self, x: Level, y: Level, z: Level) -> tuple[Level, Level]:
-        """The levels of the skin, and of all bones and teeth, in the symmetric head."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +72,7 @@ class Muscle:
     kind: str
     course: tuple[Floats, ...]
     tubes: tuple[Tube, ...] = field(repr=False)
-    tissue: Tissue = field(repr=False)
+    tissue: Drawn = field(repr=False)
 
     @property
     def origin(self) -> Floats:
@@ -322,7 +190,7 @@ def _closest_direction(line: Floats, points: Floats) -> tuple[Floats, Floats]:
     return best, along / np.linalg.norm(along, axis=1)[:, None]
 
 
-def make_muscles(tissue: Tissue) -> Mapping[str, Muscle]:
+def make_muscles(tissue: Drawn) -> Mapping[str, Muscle]:
     """All muscles of a person by name, on both sides."""
     lines = [_dense(line, course) for course in COURSES.values() for line in course.lines]
     lengths = [len(line) for line in lines]
@@ -344,7 +212,7 @@ def make_muscles(tissue: Tissue) -> Mapping[str, Muscle]:
     return MappingProxyType(muscles)
 
 
-def _dense(line: tuple[Row, ...], course: Course) -> Floats:
+def _dense(line: Sequence[Sequence[float]], course: Course) -> Floats:
     """More rows, where all lie superficially: a sheet must follow the skin between them."""
     rows = np.array(line, dtype=np.float64)
     if course.kind != "sheet" and not (rows[:, 3] > 1.0).all():
@@ -353,7 +221,7 @@ def _dense(line: tuple[Row, ...], course: Course) -> Floats:
     return dense[:-1] if course.closed else dense
 
 
-def _line(tissue: Tissue, tube: Tube, side: str, course: Course) -> Floats:
+def _line(tissue: Drawn, tube: Tube, side: str, course: Course) -> Floats:
     """A fibre line in the person's space."""
     points = tube.points
     mirror = points * np.array([-1.0, 1.0, 1.0])
@@ -365,7 +233,7 @@ def _line(tissue: Tissue, tube: Tube, side: str, course: Course) -> Floats:
     return frozen(tissue.warp.forward(points))
 
 
-def _strap(tissue: Tissue, rows: Floats, course: Course) -> Tube:
+def _strap(tissue: Drawn, rows: Floats, course: Course) -> Tube:
     """The tube along one line, flat towards the skin."""
     curve = smooth_curve(np.delete(rows, 3, axis=1), STEPS, closed=course.closed)
     points = curve[:, :3]
@@ -378,11 +246,11 @@ def _strap(tissue: Tissue, rows: Floats, course: Course) -> Tube:
     return Tube(points, normals, curve[:, 3], curve[:, 4])
 
 
-def _skin(tissue: Tissue) -> Field:
+def _skin(tissue: Drawn) -> Field:
     return lambda x, y, z: tissue.skin_and_bone(x, y, z)[0]
 
 
-def _placed(tissue: Tissue, points: Floats, place: Floats) -> Floats:
+def _placed(tissue: Drawn, points: Floats, place: Floats) -> Floats:
     """Course points placed between skin and bone, as their rows describe."""
     depth = np.where(place > 1.0, place, 0.0)
     share = np.where(place > 1.0, 0.0, place)

@@ -9,7 +9,6 @@ import numpy as np
 
 from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.phantom.shapes import Blend, Box, Egg, Step, Tube, smooth_curve, turn_about
-from cmfsim.values.checks import Floats
 
 # Centre of the left condyle, mm: the mandible opens about the axis through both.
 CONDYLE = (50.0, -13.0, -5.0)
@@ -225,12 +224,6 @@ def teeth_shape(*, upper: bool) -> Blend:
         low = np.minimum(low, tooth.box.low)
         high = np.maximum(high, tooth.box.high)
     return Blend(tuple(steps), Box(tuple(low.tolist()), tuple(high.tolist())))
-
-
-def metal_pieces() -> Floats:
-    """Centre and half size of four crowns, (4, 4) mm: first upper molars, first upper premolars."""
-    half = [[24.5, -70.5, -39.0, 2.8], [27.5, -57.5, -39.0, 3.6]]
-    return np.array(half + [[-x, y, z, size] for x, y, z, size in half])
 
 
 def brain_shape() -> Egg:

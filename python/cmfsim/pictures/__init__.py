@@ -6,7 +6,6 @@ from cmfsim.pictures.anatomy import SKIN_COLOUR as SKIN_COLOUR
 from cmfsim.pictures.anatomy import picture_anatomy as picture_anatomy
 from cmfsim.pictures.anatomy import picture_muscles as picture_muscles
 from cmfsim.pictures.anatomy import picture_node_kinds as picture_node_kinds
-from cmfsim.pictures.anatomy import picture_segments as picture_segments
 from cmfsim.pictures.anatomy import segment_colours as segment_colours
 from cmfsim.pictures.canvas import Picture as Picture
 from cmfsim.pictures.charts import MODEL_COLOURS as MODEL_COLOURS

@@ -35,33 +35,6 @@ SEGMENT_COLOURS: Mapping[str, str] = MappingProxyType({
 OTHER_COLOURS = ("#76b7b2", "#b6992d", "#d37295", "#79706e", "#86bcb6", "#9d7660")
 
 
-def picture_segments(
-    path: AnyPath, segments: Sequence[BoneSegment], *, size: tuple[int, int] = SIZE
-) -> None:
-    """Writes a picture of bone segments in colours: from the front, the left front and the left.
-
-    path: Ends in `.png`.
-    size: pixels.
-    Raises `CaseError`: PyVista or OpenGL is missing, no segment, another ending.
-
-    Examples
-    --------
-    >>> import cmfsim.pictures
-    >>> cmfsim.pictures.picture_segments("segments.png", segments)  # doctest: +SKIP
-    """
-    if not segments:
-        raise CaseInputError("there is no segment to draw")
-    colours = segment_colours([s.name for s in segments])
-    corners = bounds([s.surface.vertices for s in segments])
-
-    def paint(plotter: Any, _: View) -> None:
-        for segment in segments:
-            add_bone(plotter, segment.surface, colours[segment.name])
-
-    views = tuple(View(name, name) for name in ("front", "left front", "left"))
-    draw(path, views, corners, size, paint, legend=list(colours.items()))
-
-
 def picture_anatomy(
     path: AnyPath,
     skin: SurfaceData,
@@ -213,7 +186,6 @@ def picture_muscles(
     skull: SurfaceData | None = None,
     *,
     fibres: bool = False,
-    size: tuple[int, int] = SIZE,
 ) -> None:
     """Writes a picture of muscles: in colours with their names, or with their fibres.
 
@@ -224,7 +196,6 @@ def picture_muscles(
     path: Ends in `.png`.
     skull: Drawn with them, such as the patient's bones.
     fibres: Whether to draw boxes and directions (Kim et al. 2010, Figure 2) instead of names.
-    size: pixels.
     Raises `CaseError`: PyVista or OpenGL is missing, no muscle, another ending.
     Raises `MeshError`: A muscle's surface that cannot be used for fibres.
 
@@ -263,7 +234,7 @@ def picture_muscles(
     if fibres:
         legend = [("muscle", MUSCLE_COLOUR), ("fibre direction", LINE_COLOUR)]
         legend += [("box", BOX_COLOUR), ("box of a sheet", SHEET_COLOUR)]
-    draw(path, views, corners, size, paint, legend=legend)
+    draw(path, views, corners, SIZE, paint, legend=legend)
 
 
 def add_bones(plotter: Any, skull: SurfaceData) -> Any:

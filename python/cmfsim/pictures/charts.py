@@ -21,16 +21,14 @@ OTHER_COLOURS = ("#8fae7a", "#b58db6", "#d9798b", "#6f6f6f")
 SUFFIXES = (".png", ".svg", ".pdf")
 # Error that is called acceptable in most of the literature, mm.
 ACCEPTABLE = 2.0
+# Of a chart, inches.
+HEIGHT = 4.5
 # Width of a group of boxes, of the distance between groups.
 GROUP = 0.8
 
 
 def chart_errors(
-    path: AnyPath,
-    errors: Mapping[str, Mapping[str, ArrayLike]],
-    *,
-    width: float = 8.0,
-    height: float = 4.5,
+    path: AnyPath, errors: Mapping[str, Mapping[str, ArrayLike]], *, width: float = 8.0
 ) -> None:
     """Writes a box plot of |distance|: a group for each patient or region, a box for each model.
 
@@ -41,7 +39,7 @@ def chart_errors(
     path: Ends in `.png`, `.svg` or `.pdf`.
     errors: mapping of str to mapping of str to (k,), mm, by patient (or region), then by model:
         signed distances or their sizes.
-    width, height: inches.
+    width: inches.
     Raises `CaseError`: matplotlib is missing, nothing to draw, NaN, another ending.
 
     Examples
@@ -64,7 +62,7 @@ def chart_errors(
                 raise CaseInputError(f"errors of {group}, {model} have shape {values.shape}: (k,)")
     others = iter(OTHER_COLOURS * (1 + len(models) // len(OTHER_COLOURS)))
     colours = {m: MODEL_COLOURS[m] if m in MODEL_COLOURS else next(others) for m in models}
-    write_figure(Path(path), (width, height), lambda figure: _draw(figure, groups, colours))
+    write_figure(Path(path), (width, HEIGHT), lambda figure: _draw(figure, groups, colours))
 
 
 def write_figure(

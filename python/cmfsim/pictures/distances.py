@@ -111,11 +111,7 @@ def picture_distances(
 
 
 def picture_distance_grid(
-    path: AnyPath,
-    faces: Mapping[str, Mapping[str, tuple[SurfaceData, ArrayLike]]],
-    *,
-    limit: float = DISTANCE_LIMIT,
-    cell: tuple[int, int] = CELL,
+    path: AnyPath, faces: Mapping[str, Mapping[str, tuple[SurfaceData, ArrayLike]]]
 ) -> None:
     """Writes a picture of signed distances on many faces: a row a patient, a column a model.
 
@@ -126,8 +122,6 @@ def picture_distance_grid(
     faces: mapping of str to mapping of str to (SurfaceData, (v,)), by patient, then by model: the
         predicted skin with the signed distances of its vertices, mm, masked where nothing was
         evaluated. A model that a patient lacks leaves its place empty.
-    limit: mm. Ends of the colour bar.
-    cell: pixels. Size of each face.
     Raises `CaseError`: PyVista or OpenGL is missing, no face, another number of distances than
         vertices, none to show, another ending.
 
@@ -139,7 +133,6 @@ def picture_distance_grid(
     ...     {"P1": {"H": (skin_h, errors_h), "M+S": (skin_ms, errors_ms)}},
     ... )  # doctest: +SKIP
     """
-    as_positive("limit", limit)
     models = list(dict.fromkeys(model for by_model in faces.values() for model in by_model))
     if not models:
         raise CaseInputError("there are no faces to draw")
@@ -158,13 +151,13 @@ def picture_distance_grid(
     def paint(plotter: Any, view: View) -> None:
         panel = panels[view.caption]
         if panel is not None:
-            distance_mesh(plotter, trimmed(*panel), limit)
+            distance_mesh(plotter, trimmed(*panel), DISTANCE_LIMIT)
         if view.caption == last:
             add_scale_bar(plotter, (0.87, 0.3), 5, "%+.1f")
 
     half = (1.0 + 2.0 * MARGIN) * half
     views = [View("front", caption) for caption in panels]
-    size = (cell[0] * len(models), cell[1] * len(faces))
+    size = (CELL[0] * len(models), CELL[1] * len(faces))
     box = np.array([-half, half])
     draw(path, views, box, size, paint, columns=len(models), words=(GRID_LEGEND,))
 
@@ -229,7 +222,7 @@ def _values(distances: ArrayLike, count: int) -> tuple[Floats, NDArray[np.bool_]
     return as_floats("distances", np.ma.filled(np.ma.asarray(distances, dtype=float), 0.0)), shown
 
 
-def band_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> Picture:
+def band_picture(prediction: Prediction) -> Picture:
     """The picture of half the width of a band, to be drawn later.
 
     It shows the right, the front and the left. Where no calibration case has data, the skin is
@@ -237,12 +230,10 @@ def band_picture(prediction: Prediction, *, size: tuple[int, int] = SIZE) -> Pic
     """
     if prediction.band is None:
         raise CaseInputError("the prediction has no band: use predict_with_band")
-    return partial(picture_half_width, skin=prediction.skin, band=prediction.band, size=size)
+    return partial(picture_half_width, skin=prediction.skin, band=prediction.band)
 
 
-def picture_half_width(
-    path: AnyPath, *, skin: SurfaceData, band: SkinBand, size: tuple[int, int]
-) -> None:
+def picture_half_width(path: AnyPath, *, skin: SurfaceData, band: SkinBand) -> None:
     """Writes a picture of half the width of a band; see `band_picture`."""
     half = band.half_width
     vertices = skin.vertices
@@ -265,7 +256,7 @@ def picture_half_width(
             add_scale_bar(plotter, (0.84, 0.27), 4, "%.1f")
 
     views = tuple(View(name, f"{name}   {words}") for name in ("right", "front", "left"))
-    draw(path, views, corners, size, paint, legend=legend)
+    draw(path, views, corners, SIZE, paint, legend=legend)
 
 
 def contacts_picture(upper: tuple[SurfaceData, Gaps], lower: tuple[SurfaceData, Gaps]) -> Picture:

@@ -176,9 +176,7 @@ def prediction_html(prediction: Prediction) -> str:
     return f'{lines}<img alt="prediction" src="data:image/png;base64,{data}">'
 
 
-def plan_picture(
-    patient: PatientModel, motions: Mapping[str, Any], *, size: tuple[int, int] = canvas.SIZE
-) -> canvas.Picture:
+def plan_picture(patient: PatientModel, motions: Mapping[str, Any]) -> canvas.Picture:
     """The picture of a plan, to be drawn later; `motions` as in a summary.
 
     Bone segments where they go, behind them where they were, and below each motion in words.
@@ -198,7 +196,6 @@ def plan_picture(
             if np.quantile(np.linalg.norm(vertices - surface.vertices, axis=1), 0.99) < STAYS
         ],
         words=plan_lines(plan),
-        size=size,
     )
 
 
@@ -209,7 +206,6 @@ def picture_motions(
     after: Mapping[str, SurfaceData],
     still: Sequence[str],
     words: Sequence[str],
-    size: tuple[int, int],
 ) -> None:
     """Writes a picture of segments of bone before and after; see `plan_picture`."""
     colours = segment_colours(list(before))
@@ -228,7 +224,7 @@ def picture_motions(
 
     views = tuple(canvas.View(name, name) for name in ("right", "front", "left"))
     legend = [*colours.items(), ("before", GHOST_COLOUR)]
-    canvas.draw(path, views, corners, size, paint, legend=legend, words=words)
+    canvas.draw(path, views, corners, canvas.SIZE, paint, legend=legend, words=words)
 
 
 # Pixels, even as films need it; pictures of the way, and how long each and both ends are seen, ms.

@@ -13,7 +13,7 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures import canvas
 from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
-from cmfsim.values.checks import AnyPath, Floats, as_positive
+from cmfsim.values.checks import AnyPath, Floats
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
@@ -85,18 +85,11 @@ def prediction_blocks(prediction: Prediction) -> Any:
 
 
 def view_parts(
-    parts: Sequence[ViewPart],
-    *,
-    title: str = "cmfsim",
-    unit: str = "mm",
-    screenshot: AnyPath | None = None,
-    size: tuple[int, int] = WINDOW,
+    parts: Sequence[ViewPart], *, title: str = "cmfsim", screenshot: AnyPath | None = None
 ) -> None:
     """Opens a window with surfaces that can be turned, shown and hidden, or writes a picture of it.
 
-    unit: Of the values, next to their colours.
     screenshot: Ends in `.png`: nothing is opened.
-    size: pixels.
     Raises `CaseError`: Nothing to show; PyVista, OpenGL or a screen is missing.
 
     Examples
@@ -114,7 +107,7 @@ def view_parts(
             "there is no screen for a window: write a picture instead (--screenshot FILE.png, or "
             'screenshot="FILE.png" in Python)'
         )
-    width, height = (int(as_positive("window size", n)) for n in size)
+    width, height = WINDOW
     pv = canvas.pyvista_module()
     canvas.check_can_draw("the window" if path is None else path.name)
     corners = canvas.bounds([part.surface.vertices for part in parts])
@@ -128,7 +121,7 @@ def view_parts(
             # A picture names what it shows; a window has a box for every part.
             named = [part for part in parts if part.shown or path is None]
             for part in parts:
-                _add(plotter, part, unit)
+                _add(plotter, part)
             for row, part in enumerate(named):
                 low = height - (row + 1) * ROW - LEFT
                 plotter.add_text(part.name, position=(LEFT + ROW, low), font_size=9, color="black")
@@ -162,7 +155,7 @@ def has_screen() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def _add(plotter: Any, part: ViewPart, unit: str) -> None:
+def _add(plotter: Any, part: ViewPart) -> None:
     shape = canvas.polydata(part.surface.vertices, part.surface.triangles)
     looks = {"smooth_shading": True, "ambient": 0.15, "opacity": part.opacity, "name": part.name}
     if part.values is None:
@@ -170,7 +163,7 @@ def _add(plotter: Any, part: ViewPart, unit: str) -> None:
     else:
         shape.point_data[part.name] = part.values
         top = max(float(np.max(part.values)), 1e-6)
-        bar = {"title": unit, "vertical": True, "fmt": "%.1f", "color": "black"}
+        bar = {"title": "mm", "vertical": True, "fmt": "%.1f", "color": "black"}
         plotter.add_mesh(
             shape,
             scalars=part.name,

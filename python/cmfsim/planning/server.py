@@ -65,9 +65,7 @@ NOT_FOUND = RefusedError(404, "not found")
 def check_token(given: str, token: str) -> None:
     """Refuses any token but that of this launch, in constant time.
 
-    Raises
-    ------
-    RefusedError
+    Raises `RefusedError`.
     """
     if not hmac.compare_digest(given.encode(), token.encode()):
         raise NOT_FOUND
@@ -76,18 +74,10 @@ def check_token(given: str, token: str) -> None:
 def check_headers(headers: Mapping[str, str], address: str, *, sends: bool) -> None:
     """Refuses requests that the page at this address did not send.
 
-    Parameters
-    ----------
-    headers : mapping of str to str
-        With names in lower case.
-    address : str
-        Host and port, such as "127.0.0.1:8765".
-    sends : bool
-        Whether the request sends something.
-
-    Raises
-    ------
-    RefusedError
+    headers: With names in lower case.
+    address: Host and port, such as "127.0.0.1:8765".
+    sends: Whether the request sends something.
+    Raises `RefusedError`.
     """
     if headers.get("host") != address:
         raise RefusedError(403, "wrong host")
@@ -110,10 +100,7 @@ def check_headers(headers: Mapping[str, str], address: str, *, sends: bool) -> N
 def plan_of_body(planning: PlanningModel, body: bytes) -> dict[str, Floats]:
     """The plan in a request: JSON with `motions`, 16 numbers for each segment in the page's order.
 
-    Raises
-    ------
-    RefusedError
-        Anything else; a motion that is not rigid, or longer than a metre.
+    Raises `RefusedError`: Anything else; a motion that is not rigid, or longer than a metre.
     """
     try:
         given = json.loads(body)["motions"]
@@ -149,13 +136,8 @@ def _are_numbers(given: object) -> bool:
 class Reply:
     """What a request is answered with.
 
-    Attributes
-    ----------
-    body : bytes
-    kind : str
-        Its media type.
-    headers : mapping of str to str
-        Besides `SAFE_HEADERS`.
+    kind: Its media type.
+    headers: Besides `SAFE_HEADERS`.
     """
 
     body: bytes
@@ -166,26 +148,12 @@ class Reply:
 class LocalServer:
     """A local server of pages, and of what they ask for.
 
-    Parameters
-    ----------
-    pages : mapping of str to callable
-        What GET is answered with, by the name behind the token; "" is the first page.
-    calls : mapping of str to callable
-        What POST of a body is answered with. It may raise `RefusedError` or a `CmfsimError`.
-    port : int or socket
-        0 picks a free one; or what `open_port` returned.
-
-    Attributes
-    ----------
-    url : str
-        Address of the first page, including the token of this launch.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Starlette or Uvicorn, of the extra `serve`, is not installed.
-    OSError
-        The port is taken.
+    pages: What GET is answered with, by the name behind the token; "" is the first page.
+    calls: What POST of a body is answered with. It may raise `RefusedError` or a `CmfsimError`.
+    port: 0 picks a free one; or what `open_port` returned.
+    url: Address of the first page, including the token of this launch.
+    Raises `CaseError`: Starlette or Uvicorn, of the extra `serve`, is not installed.
+    Raises `OSError`: The port is taken.
     """
 
     def __init__(
@@ -303,10 +271,7 @@ class _Line:
     async def turn(self) -> AsyncIterator[None]:
         """A context in which nothing else is solved.
 
-        Raises
-        ------
-        RefusedError
-            A newer plan came while this one waited.
+        Raises `RefusedError`: A newer plan came while this one waited.
         """
         if self._is_solving:
             if self._waiting is not None and not self._waiting.done():
@@ -422,12 +387,8 @@ def serve_planning(
 def open_port(port: int = 0) -> socket.socket:
     """A socket that holds a port of this machine; `LocalServer` takes it in place of a number.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Starlette or Uvicorn, of the extra `serve`, is not installed.
-    OSError
-        The port is taken, or may not be used.
+    Raises `CaseError`: Starlette or Uvicorn, of the extra `serve`, is not installed.
+    Raises `OSError`: The port is taken, or may not be used.
     """
     for name in ("starlette.applications", "uvicorn"):
         _module(name)

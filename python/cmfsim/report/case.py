@@ -63,28 +63,15 @@ def case_document(
 ) -> Document:
     """The report of a case.
 
-    Parameters
-    ----------
-    predictions : sequence of mapping
-        What `prediction.json` holds, one per model, all of one plan.
-    shown : str, optional
-        The model whose pictures are given, and whose figures stand at the top; the last if left
+    predictions: What `prediction.json` holds, one per model, all of one plan.
+    shown: The model whose pictures are given, and whose figures stand at the top; the last if left
         out.
-    evaluation : mapping, optional
-        What `metrics.json` holds.
-    pictures : mapping of str to bytes, optional
-        PNG files of the model that is shown, by name, those of `PICTURES` first.
-    figures : sequence of Figure
-        Plots of the evaluation.
-    view : (str, str), optional
-        Markup and script policy of a view of the model that is shown.
-    left_out : str
-        What does not belong to these predictions and is missing for that.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Predictions, or predictions and evaluation, that do not belong together.
+    evaluation: What `metrics.json` holds.
+    pictures: PNG files of the model that is shown, by name, those of `PICTURES` first.
+    figures: Plots of the evaluation.
+    view: (str, str). Markup and script policy of a view of the model that is shown.
+    left_out: What does not belong to these predictions and is missing for that.
+    Raises `CaseError`: Predictions, or predictions and evaluation, that do not belong together.
     """
     entry = _shown(predictions, shown)
     _check_together(predictions, evaluation)

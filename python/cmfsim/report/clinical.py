@@ -28,11 +28,7 @@ NORMS = (
 def clinical_sections(prediction: Values, contacts: Sequence[Figure] = ()) -> list[Section]:
     """The sections on measures and landmarks of `prediction.json`; none in that of older versions.
 
-    Parameters
-    ----------
-    prediction : mapping
-    contacts : sequence of Figure
-        The picture of the tooth rows' contacts, if there is one.
+    contacts: The picture of the tooth rows' contacts, if there is one.
     """
     found = prediction.get("clinical")
     if found is None:

@@ -38,13 +38,8 @@ class View:
 class Alert:
     """A message at the top of a report: one line, with the details collapsed below it.
 
-    Attributes
-    ----------
-    kind : str
-        "error", "warning" or "note".
-    line : str
-    details : tuple of str
-        Shown when the line is opened, and on paper.
+    kind: "error", "warning" or "note".
+    details: Shown when the line is opened, and on paper.
     """
 
     kind: str
@@ -64,19 +59,10 @@ class Section:
 class Document:
     """A whole report.
 
-    Attributes
-    ----------
-    title, subtitle : str
-    alerts : sequence of Alert
-        Above everything else.
-    facts_title : str
-        Whose figures the facts are.
-    links : mapping of str to str
-        Names of files in the same folder that belong to it, by what they are.
-    facts : mapping of str to str
-        The few figures that a reader looks for first.
-    sections : sequence of Section
-    footer : str
+    alerts: Above everything else.
+    facts_title: Whose figures the facts are.
+    links: Names of files in the same folder that belong to it, by what they are.
+    facts: The few figures that a reader looks for first.
     """
 
     title: str

@@ -1,6 +1,7 @@
 """A report as one self-contained HTML page, for browsers and print; labels of its figures."""
 
 import base64
+import csv
 import io
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,44 +21,17 @@ MEASURES: Mapping[str, str] = {
     "through landmarks",
 }
 
-# mm³ in a cm³, and one in a hundred.
-CUBIC, PERCENT = 1e-3, 100.0
-
-# Label and factor of each figure, by its key in the summary.
+# Label and factor of each figure, by its key in the summary: mm³ become cm³, shares percent.
 Labels = Mapping[str, tuple[str, float]]
 
-MESH: Labels = {
-    "n_nodes": ("nodes", 1),
-    "n_tets": ("tets", 1),
-    "mean_edge": ("mean edge, mm", 1.0),
-    "volume": ("volume, cm³", CUBIC),
-    "volume_error": ("volume relative to the tissue, %", PERCENT),
-    "boundary_error_mean": ("mean distance from the surface, mm", 1.0),
-    "boundary_error_max": ("largest distance from the surface, mm", 1.0),
-    "min_dihedral": ("smallest dihedral angle, °", 1.0),
-    "max_dihedral": ("largest dihedral angle, °", 1.0),
-    "edge_ratio": ("longest over shortest edge of the worst tet", 1.0),
-    "dropped_parts": ("removed bodies (too small)", 1),
-    "dropped_volume": ("volume of removed bodies, cm³", CUBIC),
-    "dropped_tets": ("poor tets removed at the surface", 1),
-}
-MUSCLES: Labels = {
-    "template": ("template", 1),
-    "smoothing": ("smoothing of the spline", 1.0),
-    "blur": ("blur of the shares of muscle, mm", 1.0),
-    "preset": ("constants of fat and muscle", 1),
-    "mixing": ("quantity mixed in a tet", 1),
-    "inside": ("inside test", 1),
-    "muscles": ("muscles", 1),
-    "muscle_volume": ("volume of all muscles in the tissue, cm³", CUBIC),
-    "muscle_tets": ("tets that contain muscle", 1),
-    "pairs": ("pairs of tet and muscle checked", 1),
-    "crossed": ("tets that a muscle's surface crosses", 1),
-    "samples": ("points in each of these", 1),
-    "samples_per_crossed_tet": ("points in each of these", 1),
-    "points": ("points in total", 1),
-    "seed": ("random seed of the points", 1),
-}
+
+def _labels(summary: str) -> Labels:
+    text = files("cmfsim.report").joinpath("labels.csv").read_text(encoding="utf-8")
+    rows = [row for row in csv.DictReader(text.splitlines()) if row["summary"] == summary]
+    return {row["key"]: (row["label"], float(row["factor"])) for row in rows}
+
+
+MESH, MUSCLES = _labels("mesh"), _labels("muscles")
 
 
 def labelled(values: Mapping[str, object], labels: Labels) -> dict[str, object]:
@@ -86,10 +60,7 @@ def render_page(document: Document) -> str:
 
     It has no script but that of its view, which is allowed by its hash.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Jinja2, of the extra `report`, is not installed.
+    Raises `CaseError`: Jinja2, of the extra `report`, is not installed.
     """
     jinja2 = third_party("jinja2", "reports are made", "report")
     environment = jinja2.Environment(

@@ -288,7 +288,6 @@ def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
     1.5 mm; a triangle as turned over if its normal turns by more than a right angle, and if it has
     at least 0.5 mm² before the operation.
 
-
     Examples
     --------
     >>> import cmfsim

@@ -255,6 +255,7 @@ def _plan_changes(
         left_out.append("execution of the plan: the plan was measured on the post-operative bones")
         return {}
     found = {}
+    sizes = [s.sd if s.unit == "mm" else np.radians(s.sd) for s in PLAN]
     for name, motion in scene.plan.items():
         if isinstance(motion, MovedSurface) or motion.shape != (4, 4):
             left_out.append(f"execution of the plan: {name} moves vertex by vertex")
@@ -263,20 +264,24 @@ def _plan_changes(
         if np.array_equal(motion, np.eye(4)) or not len(nodes):
             continue
         middle = scene.nodes[nodes].mean(axis=0)
-        found[name] = _rates(motion, motion[:3, :3] @ middle + motion[:3, 3])
+        found[name] = motion_rates(motion, motion[:3, :3] @ middle + motion[:3, 3], sizes)
     return found
 
 
-def _rates(matrix: Floats, middle: Floats) -> list[Floats]:
-    """The change of x ↦ R x + t by one sd of each of `PLAN`: shifts, and turns about `middle`."""
+def motion_rates(matrix: Floats, middle: Floats, sizes: ArrayLike) -> list[Floats]:
+    """The changes of x ↦ R x + t, (4, 4) each: shifts to the left, back, up, and turns about these.
+
+    middle: (3,), mm. What the turns leave in place, after the motion.
+    sizes: (6,), mm and radians.
+    """
     found = []
-    for number, source in enumerate(PLAN):
+    for number, size in enumerate(np.asarray(sizes, dtype=np.float64)):
         rate, axis = np.zeros((4, 4)), AXES[number % 3]
-        if source.unit == "mm":
-            rate[:3, 3] = source.sd * axis
+        if number < 3:
+            rate[:3, 3] = size * axis
         else:
             # ω × as a matrix: column j is ω × e_j.
-            turn = np.radians(source.sd) * np.cross(axis, AXES).T
+            turn = size * np.cross(axis, AXES).T
             rate[:3, :3] = turn @ matrix[:3, :3]
             rate[:3, 3] = turn @ (matrix[:3, 3] - middle)
         found.append(rate)

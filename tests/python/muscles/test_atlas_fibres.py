@@ -6,8 +6,7 @@ import pytest
 import cmfsim
 import real_heads
 from benches.scenes.angles import angle_of_lines
-from cmfsim.muscles.template.bodyparts3d import atlas_course
-from cmfsim.muscles.template.bodyparts3d_parts import PAIRED_MUSCLES
+from cmfsim.muscles.template.bodyparts3d import PAIRED_MUSCLES, atlas_course
 
 pytest.importorskip("meshio")
 

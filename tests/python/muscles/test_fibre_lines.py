@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.muscles.template.bodyparts3d_parts import fan_lines, lane_lines
+from cmfsim.muscles.template.fibre_lines import fan_lines, lane_lines
 
 
 def shell(height, corners, *, cells=24, thickness=2.0):

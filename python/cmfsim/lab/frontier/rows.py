@@ -14,7 +14,7 @@ from cmfsim.evaluation import SKIN_LANDMARKS, DistanceStatistics, distance_stati
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
 from cmfsim.surfaces.depth import distances
-from cmfsim.values.checks import Floats, as_floats, as_rows, plain
+from cmfsim.values.checks import Floats, Plain, as_floats, as_rows, in_files
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.table import csv_of
 
@@ -115,7 +115,7 @@ class Spread:
 
 
 @dataclass(frozen=True, eq=False)
-class FrontierRow:
+class FrontierRow(Plain):
     """The cost and the error of one choice.
 
     Attributes
@@ -123,6 +123,11 @@ class FrontierRow:
     choice : Choice
     is_base, is_reference : bool
         Whether it is the case's own choice, or the choice with which the others are compared.
+    on_front : bool
+        Whether no other row is as accurate (to 0.001 mm in the mean) in less time. The reference,
+        whose error is 0 by definition, is not a candidate.
+    failure : str
+        Why there is no prediction; empty if there is one.
     error : mapping of str to DistanceStatistics
         |u - u_ref|, mm, over the face, its regions and the whole skin; empty where it failed.
     build_wall, build_cpu : float or None, s
@@ -136,29 +141,24 @@ class FrontierRow:
     n_tets, n_unknowns : int or None
     details : mapping
         Residual, iterations and contact of the solution, seconds of each stage.
-    failure : str
-        Why there is no prediction; empty if there is one.
-    on_front : bool
-        Whether no other row is as accurate (to 0.001 mm in the mean) in less time. The reference,
-        whose error is 0 by definition, is not a candidate.
     """
 
     choice: Choice
     is_base: bool = False
     is_reference: bool = False
+    on_front: bool = False
+    failure: str = ""
     error: Mapping[str, DistanceStatistics] = field(default_factory=dict)
-    build_wall: float | None = None
-    build_cpu: float | None = None
-    solve_wall: Spread | None = None
-    solve_cpu: Spread | None = None
-    ratio: Spread | None = None
-    build_peak: float | None = None
-    solve_peak: float | None = None
+    build_wall: float | None = field(default=None, metadata=in_files("build_wall_s"))
+    build_cpu: float | None = field(default=None, metadata=in_files("build_cpu_s"))
+    solve_wall: Spread | None = field(default=None, metadata=in_files("solve_wall_s"))
+    solve_cpu: Spread | None = field(default=None, metadata=in_files("solve_cpu_s"))
+    ratio: Spread | None = field(default=None, metadata=in_files("solve_ratio"))
+    build_peak: float | None = field(default=None, metadata=in_files("build_peak_mb"))
+    solve_peak: float | None = field(default=None, metadata=in_files("solve_peak_mb"))
     n_tets: int | None = None
     n_unknowns: int | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
-    failure: str = ""
-    on_front: bool = False
 
     @property
     def total_wall(self) -> float | None:
@@ -174,50 +174,32 @@ class FrontierRow:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values with their unit in the name, as JSON holds them."""
-        return {
-            "choice": plain(self.choice),
-            "is_base": self.is_base,
-            "is_reference": self.is_reference,
-            "on_front": self.on_front,
-            "failure": self.failure,
-            "error": plain(self.error),
-            "total_wall_s": self.total_wall,
-            "build_wall_s": self.build_wall,
-            "build_cpu_s": self.build_cpu,
-            "solve_wall_s": plain(self.solve_wall),
-            "solve_cpu_s": plain(self.solve_cpu),
-            "solve_ratio": plain(self.ratio),
-            "build_peak_mb": self.build_peak,
-            "solve_peak_mb": self.solve_peak,
-            "n_tets": self.n_tets,
-            "n_unknowns": self.n_unknowns,
-            "details": dict(self.details),
-        }
+        return {**super().as_dict(), "total_wall_s": self.total_wall}
 
 
 @dataclass(frozen=True)
-class Frontier:
+class Frontier(Plain):
     """Error against run time of many ways to predict one face.
 
     Attributes
     ----------
     case : str
         The name of the case.
-    rows : tuple of FrontierRow
-        The base first, the reference last.
     n_points : int
         On the skin, at which predictions are compared.
     moved : float, mm
         Mean movement of these points in the reference.
     machine : mapping
         Processor, threads, versions, commit.
+    rows : tuple of FrontierRow
+        The base first, the reference last.
     """
 
     case: str
-    rows: tuple[FrontierRow, ...]
     n_points: int
-    moved: float
-    machine: Mapping[str, Any] = field(default_factory=dict)
+    moved: float = field(metadata=in_files("reference_movement_mm"))
+    machine: Mapping[str, Any]
+    rows: tuple[FrontierRow, ...]
 
     @property
     def base(self) -> FrontierRow:
@@ -234,16 +216,6 @@ class Frontier:
         """The rows that no other row beats, fastest first."""
         rows = [row for row in self.rows if row.on_front]
         return tuple(sorted(rows, key=lambda row: row.total_wall or 0.0))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
-        return {
-            "case": self.case,
-            "n_points": self.n_points,
-            "reference_movement_mm": self.moved,
-            "machine": dict(self.machine),
-            "rows": plain(self.rows),
-        }
 
     def csv(self) -> str:
         """One line for each row; an error column for each region's mean, mm."""

@@ -16,44 +16,12 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.files.reading_writing import replacing
-from cmfsim.lab.virtual.population import PATIENTS
+from cmfsim.lab.virtual.population import PATIENTS, template_text
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import as_positive
 from cmfsim.values.surface_data import SurfaceData
-
-CASE_TEXT = """\
-# A synthetic head: no patient. `cmfsim build case.toml` makes its model.
-format = "cmfsim-case"
-version = 1
-name = "phantom"
-
-[image]
-file = "ct.nrrd"
-
-[landmarks]
-skull = "skull.mrk.json"
-skin = "skin.mrk.json"
-
-[[osteotomies]]
-procedure = "le_fort_1"
-
-[[osteotomies]]
-procedure = "bsso"
-
-[plan.maxilla]                    # 5 mm forwards
-translation = [0, -5, 0]
-
-[plan.mandible_body]              # 3 mm backwards
-translation = [0, 3, 0]
-
-[mesh]
-edge_length = 4.0
-
-[output]
-folder = "out"
-"""
 
 
 def write_phantom_case(
@@ -87,7 +55,7 @@ def write_phantom_case(
     write_landmarks(folder / "skull.mrk.json", head.skull_landmarks)
     write_landmarks(folder / "skin.mrk.json", head.skin_landmarks)
     with replacing(folder / "case.toml") as file:
-        file.write(CASE_TEXT.encode())
+        file.write(template_text("phantom").encode())
     return folder / "case.toml"
 
 
@@ -119,53 +87,6 @@ NOTE = (
     "other muscles (in silico). Errors show how the models differ from it, not how accurate they "
     "are on patients."
 )
-CASE = """\
-{mark}
-# Change the plan, then run: cmfsim evaluate case.toml
-format = "cmfsim-case"
-version = 1
-name = "demo"
-note = "{note}"
-
-[surfaces]
-skin = "skin.ply"
-
-[surfaces.bones]
-cranium = "cranium.ply"
-mandible = "mandible.ply"
-
-# No [landmarks]: they are found automatically. To check them: cmfsim landmarks case.toml
-[[osteotomies]]
-procedure = "le_fort_1"
-
-[[osteotomies]]
-procedure = "bsso"
-
-[plan.maxilla]                    # P is backwards: -5 is 5 mm forwards
-translation = {maxilla}
-angle = {turn}
-axis = [1, 0, 0]
-centre = {centre}
-
-[plan.mandible_body]
-translation = {mandible}
-
-[muscles]
-template = "default"
-samples = 32
-
-[region]                          # the vault above the forehead does not move
-upper = {upper}
-
-[mesh]
-edge_length = {edge_length}
-
-[postoperative]
-skin = "after.ply"
-
-[output]
-folder = "out"
-"""
 
 
 def read_demo_truth() -> SurfaceData:
@@ -230,7 +151,7 @@ def _check_folder(folder: Path) -> None:
 
 def _case_text(head: PhantomHead, edge_length: float) -> str:
     centre = [round(float(x), 3) for x in head.skull_landmarks[MAXILLA.centre]]
-    return CASE.format(
+    return template_text("demo").format(
         mark=MARK,
         note=NOTE,
         maxilla=list(MAXILLA.translation),

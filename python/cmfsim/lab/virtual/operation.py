@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, signed_distance_image
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.lab.virtual.mechanics.equilibrium import penalty
 from cmfsim.values.anatomy import BoneSegment
-from cmfsim.values.checks import Floats, as_positive
+from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import decompose_motion, rigid_motion
 from cmfsim.values.scene import NodeKinds
@@ -31,14 +32,13 @@ class SmoothDistance:
     """The distance outside a bone, negative inside, twice continuously differentiable near it.
 
     level: Positive inside, about a distance near the surface.
-    relief: mm. Standard deviation of the Gaussian that the level is blurred with.
     """
 
-    def __init__(self, level: ImageData, relief: float = RELIEF) -> None:
+    def __init__(self, level: ImageData) -> None:
         ndimage = third_party("scipy.ndimage", "contact of virtual patients is found", "study")
         spacing = level.spacing
         values = level.values.astype(np.float64)
-        blurred = ndimage.gaussian_filter(values, as_positive("relief", relief) / spacing)
+        blurred = ndimage.gaussian_filter(values, RELIEF / spacing)
         self._spline = ndimage.spline_filter(-blurred, order=3, mode="mirror")
         self._origin, self._spacing = level.lowest, spacing
         self._sample = ndimage.map_coordinates
@@ -74,7 +74,6 @@ class BoneContact:
     area: (k,), mm². Boundary area around each.
     bones: At rest.
     motion: The rigid motion (4, 4) of each bone after a fraction of it, 0 to 1.
-    stiffness: MPa/mm.
     """
 
     points: Floats
@@ -82,7 +81,6 @@ class BoneContact:
     area: Floats
     bones: Mapping[str, SmoothDistance]
     motion: Mapping[str, Callable[[float], Floats]]
-    stiffness: float = STIFFNESS
 
     def __post_init__(self) -> None:
         rest = {name: np.minimum(b(self.points[self.nodes]), 0.0) for name, b in self.bones.items()}
@@ -107,16 +105,9 @@ class BoneContact:
         return back
 
     def energy(self, displacements: Floats, part: float) -> float:
-        """∫ ∫ pressure d(depth) d(area), N·mm.
-
-        The pressure is k d² / 2δ to the depth δ of its onset, from there k (d − δ/2).
-        """
-        total = 0.0
-        for d in self.depths(displacements, part).values():
-            shallow = d**3 / (6.0 * ONSET)
-            deep = 0.5 * (d - 0.5 * ONSET) ** 2 + ONSET**2 / 24.0
-            total += float(self.area @ np.where(d < ONSET, shallow, deep))
-        return self.stiffness * total
+        """∫ ∫ pressure d(depth) d(area), N·mm."""
+        depths = self.depths(displacements, part).values()
+        return STIFFNESS * sum(float(self.area @ penalty(d, ONSET)[0]) for d in depths)
 
     def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
         """The gradient of the energy, (n, 3) N, and the stiffness of each node, (n, 3, 3) N/mm.
@@ -133,12 +124,10 @@ class BoneContact:
             turn = self.motion[name](part)[:3, :3]
             normal = self.bones[name].slope(seen) @ turn.T
             bend = turn @ self.bones[name].curvature(seen) @ turn.T
-            weight, d = self.stiffness * self.area[touching], depth[touching]
-            pressing = np.where(d < ONSET, 0.5 * d**2 / ONSET, d - 0.5 * ONSET)
-            rise = weight * np.minimum(d / ONSET, 1.0)
-            at = self.nodes[touching]
+            weight, at = STIFFNESS * self.area[touching], self.nodes[touching]
+            _, pressing, rise = penalty(depth[touching], ONSET)
             force[at] -= (weight * pressing)[:, None] * normal
-            blocks[at] += rise[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            blocks[at] += (weight * rise)[:, None, None] * normal[:, :, None] * normal[:, None, :]
             values, axes = np.linalg.eigh(-(weight * pressing)[:, None, None] * bend)
             blocks[at] += (axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1)
         return force, blocks

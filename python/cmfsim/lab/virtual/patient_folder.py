@@ -20,7 +20,13 @@ from cmfsim.io.cases.cohorts import COHORT_FORMAT
 from cmfsim.io.files.reading_writing import replacing
 from cmfsim.io.files.summaries import kept_record, write_record
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
-from cmfsim.lab.virtual.population import DRAWN, PATIENTS, VirtualPatient, patient_named
+from cmfsim.lab.virtual.population import (
+    DRAWN,
+    PATIENTS,
+    VirtualPatient,
+    patient_named,
+    template_text,
+)
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth, scanned
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.values.checks import Floats, as_positive, as_whole
@@ -47,33 +53,6 @@ COHORT = "cohort.toml"
 # The case with the operation as it was carried out, where it departs from the plan; and the cohort
 # of these.
 EXECUTED = "executed.toml"
-CASE_BEGIN = """\
-# Virtual patient {name} ({label}), in silico: no patient.
-{what}
-format = "cmfsim-case"
-version = 1
-name = "{name}-in-silico"
-
-[image]
-file = "{place}ct.nrrd"
-
-[landmarks]
-skull = "{place}skull.mrk.json"
-skin = "{place}skin.mrk.json\""""
-CASE_END = """
-
-[mesh]
-edge_length = {edge_length:g}
-
-[muscles]
-
-[postoperative]
-skin = "{truth}skin.ply"
-landmarks = "{truth}skin.mrk.json"
-
-[output]
-folder = "out"
-"""
 
 
 def virtual_patients(
@@ -328,7 +307,7 @@ def case_text(
         if executed is None
         else "# Its plan is what the operation did: errors are those of the tissue alone."
     )
-    lines = [CASE_BEGIN.format(name=patient.name, label=patient.label, what=what, place=place)]
+    lines = [""]
     for procedure in patient.osteotomies:
         lines += ["", "[[osteotomies]]", f'procedure = "{procedure}"']
     for segment, move in patient.plan.items():
@@ -341,7 +320,15 @@ def case_text(
             centre = [round(float(x), 3) for x in skull[move.centre]]
             lines += [f"angle = {move.angle}", f"axis = {list(move.axis)}"]
             lines.append(f"centre = {centre}   # {move.centre}")
-    return "\n".join(lines) + CASE_END.format(edge_length=edge_length, truth=truth)
+    return template_text("patient").format(
+        name=patient.name,
+        label=patient.label,
+        what=what,
+        place=place,
+        tables="\n".join(lines),
+        edge_length=edge_length,
+        truth=truth,
+    )
 
 
 def patient_settings(

@@ -1,8 +1,11 @@
 """The virtual patients P1 to P6 and those drawn at random, with their operations."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib.resources import files
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -171,89 +174,35 @@ class VirtualPatient:
         return f"D{self.number - DRAWN:03d}" if self.number > DRAWN else f"P{self.number}"
 
 
-_BOTH_JAWS = ("le_fort_1", "bsso")
-_WITH_CHIN = ("le_fort_1", "bsso", "genioplasty")
+def _file(name: str) -> str:
+    return files(__package__).joinpath("cases", name).read_text(encoding="utf-8")
+
+
+def template_text(name: str) -> str:
+    """The text of a case file of a synthetic head: "demo" and "patient" have fields to fill in."""
+    return _file(f"{name}.txt")
+
+
+def _tuples(entry: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in entry.items()}
+
+
+def _person_of(entry: dict[str, Any]) -> VirtualPatient:
+    """A patient of people.json."""
+    plan = {segment: Relocation(**_tuples(move)) for segment, move in entry["plan"].items()}
+    made = {"parameters": HeadParameters(**entry["parameters"]), "plan": plan}
+    return VirtualPatient(**{**_tuples(entry), **made})
+
+
 # People and motions are our own: of the kind and size of the paper's four patients, not its data.
 # Lips are 2 mm apart and teeth 2.5 mm, as in a patient who is scanned at rest.
 # P5 and P6 have lips 2 mm apart too: an open mandible widens `lip_gap`. In P5 the mouth closes and
 # the lower lip goes behind the upper one: turned about the incisors, the mandible rises half as far
 # at the molars. P6 has vertical excess: the maxilla goes up and the mandible follows, turning about
 # its condyles; its motion is that turn, written about infradentale.
-_PEOPLE = (
-    VirtualPatient(
-        1, "MxA, MSB",
-        HeadParameters(
-            face_height=1.02, nose_length=1.0, chin_projection=2.0, mandible_advance=3.0,
-            lip_gap=2.0, bite_gap=2.5,
-        ),
-        0.85, 1.2, _BOTH_JAWS,
-        {
-            "maxilla": Relocation((0.0, -5.0, 0.5), 2.0),
-            "mandible_body": Relocation((0.0, 3.5, 0.5), centre="infradentale"),
-        },
-    ),
-    VirtualPatient(
-        2, "MxA, MA",
-        HeadParameters(
-            scale=0.94, face_height=0.96, nose_projection=2.0, lip_fullness=1.15,
-            chin_projection=-2.5, mandible_advance=-3.0, fat_thickness=1.5, jaw_width=0.96,
-            lip_gap=2.0, bite_gap=2.5,
-        ),
-        1.2, 0.8, _BOTH_JAWS,
-        {
-            "maxilla": Relocation((0.0, -3.0, 0.0), 3.0),
-            "mandible_body": Relocation((0.0, -6.0, 0.0), -2.0, centre="infradentale"),
-        },
-    ),
-    VirtualPatient(
-        3, "MxSB, MSB",
-        HeadParameters(
-            scale=1.04, nose_length=-1.5, lip_fullness=1.2, fat_thickness=3.0, jaw_width=1.04,
-            lip_gap=2.0, bite_gap=2.5,
-        ),
-        1.1, 1.0, _BOTH_JAWS,
-        {
-            "maxilla": Relocation((0.0, 3.0, 2.5), 1.5),
-            "mandible_body": Relocation((0.0, 2.5, 2.0), centre="infradentale"),
-        },
-    ),
-    VirtualPatient(
-        4, "MxA, MSB, G",
-        HeadParameters(
-            face_height=1.05, nose_projection=-1.0, lip_fullness=0.9, fat_thickness=0.5,
-            asymmetry=3.0, mandible_advance=2.0, chin_projection=-2.0, lip_gap=2.0, bite_gap=2.5,
-        ),
-        0.9, 0.9, _WITH_CHIN,
-        {
-            "maxilla": Relocation((-1.0, -4.0, 0.5), -2.0, (0.0, 0.0, 1.0)),
-            "mandible_body": Relocation((-2.0, 2.5, 0.5), -2.0, (0.0, 0.0, 1.0), "infradentale"),
-            "chin": Relocation((-3.0, -1.5, 1.0), -2.0, (0.0, 0.0, 1.0), "infradentale"),
-        },
-    ),
-    VirtualPatient(
-        5, "MSB, bite closed",
-        HeadParameters(
-            face_height=1.03, nose_projection=1.0, mandible_advance=5.0, lip_gap=1.1, bite_gap=6.0,
-        ),
-        0.9, 1.1, ("bsso",),
-        {"mandible_body": Relocation((0.0, 4.0, 4.5), -3.4, centre="infradentale")},
-        separate_lips=True,
-    ),
-    VirtualPatient(
-        6, "Mx up, autorotation",
-        HeadParameters(
-            face_height=1.06, nose_length=1.0, lip_fullness=1.1, chin_projection=-1.0,
-            fat_thickness=1.0, lip_gap=1.2, bite_gap=5.0,
-        ),
-        1.1, 0.85, ("le_fort_1",),
-        {
-            "maxilla": Relocation((0.0, -1.0, 4.0), 1.0),
-            "mandible": Relocation((0.0, -4.15, 7.2), -5.35, centre="infradentale"),
-        },
-        separate_lips=True,
-    ),
-)  # fmt: skip
-PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType({p.number: p for p in _PEOPLE})
+PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
+    {entry["number"]: _person_of(entry) for entry in json.loads(_file("people.json"))}
+)
 
 
 def patient_named(number: int) -> VirtualPatient:

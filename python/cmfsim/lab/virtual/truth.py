@@ -24,13 +24,7 @@ from cmfsim.lab.virtual.mechanics.equilibrium import (
     EquilibriumOptions,
     find_equilibrium,
 )
-from cmfsim.lab.virtual.mechanics.lip_contact import (
-    ContactSum,
-    LipContact,
-    MouthSlit,
-    lips_of,
-    with_open_mouth,
-)
+from cmfsim.lab.virtual.mechanics.lip_contact import LipContact, MouthSlit, lips_of, with_open_mouth
 from cmfsim.lab.virtual.mechanics.muscle_field import muscle_field, skin_share, thickened
 from cmfsim.lab.virtual.operation import (
     Operation,
@@ -168,8 +162,8 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     stage("moving the bones")
     body = HyperelasticBody(nodes, tets, tissue)
     operation, lips = _operated(opened, drawn.slit, distances, segments, motions)
-    touching: Contact = operation.contact if lips is None else ContactSum((operation.contact, lips))
-    found = find_equilibrium(body, operation.held, operation.path, touching, options)
+    contacts: list[Contact] = [operation.contact, *([] if lips is None else [lips])]
+    found = find_equilibrium(body, operation.held, operation.path, contacts, options)
 
     stage("moving the skin")
     before = head.surface("skin", skin_spacing)
@@ -427,7 +421,8 @@ def carried(
     if len(moves) != len(corners):
         raise CaseInputError(f"{len(moves)} displacements for {len(corners)} nodes")
     rows = as_index_rows("tets", tets, 4, len(corners), "nodes").astype(np.int64)
-    tree = _module("scipy.spatial").cKDTree(corners[rows].mean(axis=1))
+    spatial = third_party("scipy.spatial", "skins of virtual patients are made", "study")
+    tree = spatial.cKDTree(corners[rows].mean(axis=1))
     count = min(CANDIDATES, len(rows))
     near = tree.query(places, k=count)[1].reshape(len(places), count)
     best = np.full(len(places), -np.inf)
@@ -475,7 +470,7 @@ def scanned(
 
 def _averaging(triangles: NDArray[Any], n: int) -> Any:
     """The matrix that takes the mean over each vertex and its neighbours."""
-    sparse = _module("scipy.sparse")
+    sparse = third_party("scipy.sparse", "skins of virtual patients are made", "study")
     ends = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     ones = np.ones(len(ends))
     near = sparse.coo_array((ones, (ends[:, 0], ends[:, 1])), shape=(n, n)).tocsr()
@@ -493,7 +488,3 @@ def _normals(vertices: Floats, triangles: NDArray[Any]) -> Floats:
     length = np.linalg.norm(total, axis=1, keepdims=True)
     normals: Floats = total / np.maximum(length, np.finfo(np.float64).tiny)
     return normals
-
-
-def _module(name: str) -> Any:
-    return third_party(name, "skins of virtual patients are made", "study")

@@ -10,10 +10,13 @@ the vertex to the brow. Frame LPS.
 """
 
 import hashlib
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,16 +24,7 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.io.landmarks import read_landmarks
 from cmfsim.io.meshes.surfaces import read_surface
-from cmfsim.muscles.template.bodyparts3d_parts import (
-    BONES,
-    HASHES,
-    MIDLINE_MUSCLES,
-    PAIRED_MUSCLES,
-    TEETH,
-    MusclePair,
-    fan_lines,
-    lane_lines,
-)
+from cmfsim.muscles.template.fibre_lines import fan_lines, lane_lines
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.registration import side_vectors
 from cmfsim.surfaces.checks import SurfaceReport, check_surface
@@ -42,6 +36,20 @@ from cmfsim.values.musculature import MuscleSurface, as_landmarks
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData, joined_surface
 
+
+class MusclePair(NamedTuple):
+    """A muscle on either side: its name without side, its kind, its parts on the right and left."""
+
+    name: str
+    kind: str
+    right: str
+    left: str
+
+
+# Of each part that makes the template, its id (FMA), our name and kind, and its file's hash.
+PARTS = json.loads(files(__package__).joinpath("bodyparts3d.json").read_text(encoding="utf-8"))
+PAIRED_MUSCLES = tuple(MusclePair(name, *entry) for name, entry in PARTS["paired"].items())
+HASHES: Mapping[str, str] = PARTS["hashes"]
 # Vertices that the tip of temporalis is the mean of; its tendon ends broadly.
 TIP_VERTICES = 20
 # Share of buccinator's vertices that its hind and its front end are the means of.
@@ -149,7 +157,7 @@ def import_bodyparts3d(
             concepts[name] = (part.concept,)
             findings += _renamed(part.findings, name)
         findings += mirrored
-    for name, kind, concept in MIDLINE_MUSCLES:
+    for name, (kind, concept) in PARTS["midline"].items():
         say(name)
         part = _part(folder, concept)
         muscles.append(MuscleSurface(name, "both", part.surface, kind))
@@ -158,7 +166,7 @@ def import_bodyparts3d(
     findings.append(_EXCHANGED_NAMES)
     say("bones")
     # Flat triangles would keep others from measuring distances to it.
-    bones = (*BONES, *TEETH)
+    bones = (*PARTS["bones"], *PARTS["teeth"])
     skull = [clean_surface(read_surface(folder / f"{concept}.obj")) for concept in bones]
     return MuscleTemplate(
         name="bodyparts3d",

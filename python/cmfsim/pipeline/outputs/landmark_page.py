@@ -4,12 +4,8 @@ from pathlib import Path
 
 from cmfsim.io import replacing
 from cmfsim.pipeline.proposing import GivenSites, ProposedHead, head_distribution
-from cmfsim.planning.landmark_page import (
-    LandmarkContent,
-    PageSite,
-    landmark_content,
-    landmark_page_text,
-)
+from cmfsim.planning.landmark_page import PageSite, landmark_content, landmark_page_text
+from cmfsim.planning.page import PageContent
 from cmfsim.registration.proposed.shape_model.site_covariance import PLACED_STD, SiteDistribution
 from cmfsim.registration.proposed.template_head import average_head
 from cmfsim.values.proposed_landmarks import ProposedLandmarks, SiteState
@@ -19,7 +15,7 @@ PAGE_FILE = "landmarks.html"
 
 def head_content(
     name: str, head: ProposedHead, placed: GivenSites | None = None, *, built_for: str = ""
-) -> LandmarkContent:
+) -> PageContent:
     """The content of the page of a head.
 
     name: Of the case.
@@ -77,7 +73,7 @@ def _sites(
     return sites
 
 
-def write_landmark_page(path: Path, content: LandmarkContent) -> int:
+def write_landmark_page(path: Path, content: PageContent) -> int:
     """The size in bytes of a page of landmarks, written to a file in one step.
 
     Raises `CaseError`: Numbers that are not finite.

@@ -13,13 +13,14 @@ registered to the cranium.
 
 import contextlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import rigid_fit
 from cmfsim.errors import RegistrationError
-from cmfsim.planning.face_measures.definitions import Measure
+from cmfsim.planning.face_measures.definitions import Measure, measures_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, profile_sites
 
@@ -57,33 +58,10 @@ FORMULAS: Mapping[str, tuple[Callable[[Floats, Floats, Floats, Floats], float], 
     "across": (_across, "across {0}–{1}, from {3} to {2}; positive in front or above"),
 }
 # Steiner: Am J Orthod 39:729–755; Downs: Am J Orthod 34:812–840; Jacobson: Am J Orthod 67:125–138.
-_STEINER, _DOWNS, _JACOBSON = "Steiner 1953", "Downs 1948", "Jacobson 1975"
-_WITS = "men −1.2 ± 1.9, women −0.1 ± 1.8"
 CEPHALOMETRIC_MEASURES = tuple(
-    Measure(key, label, unit, formula, tuple(sites.split()),
-            FORMULAS[formula][1].format(*sites.split()), norm, source)
-    for key, label, unit, formula, sites, norm, source in (
-        ("sna", "SNA", "°", "turn", "N S N A", "82", _STEINER),
-        ("snb", "SNB", "°", "turn", "N S N B", "80", _STEINER),
-        ("anb", "ANB", "°", "turn", "N B N A", "2", _STEINER),
-        ("wits", "Wits", "mm", "along", "OP-back OP-front A B", _WITS, _JACOBSON),
-        ("convexity", "Convexity N-A-Pog", "°", "turn", "A Pog N A", "0 ± 5.1", _DOWNS),
-        ("facial_angle", "Facial angle", "°", "turn", "FH-front FH-back N Pog",
-         "87.8 ± 3.6", _DOWNS),
-        ("mandibular_plane", "Mandibular plane to FH", "°", "turn", "Go Me FH-back FH-front",
-         "21.9 ± 3.2", _DOWNS),
-        ("sn_gogn", "Mandibular plane to SN", "°", "turn", "Go Gn S N", "32", _STEINER),
-        ("occlusal_plane", "Occlusal plane to FH", "°", "turn",
-         "OP-back OP-front FH-back FH-front", "9.3 ± 3.8", _DOWNS),
-        ("u1_na", "U1 to NA", "°", "turn", "N A U1R U1", "22", _STEINER),
-        ("u1_na_mm", "U1 to NA", "mm", "across", "N A U1 N", "4", _STEINER),
-        ("l1_nb", "L1 to NB", "°", "turn", "L1R L1 B N", "25", _STEINER),
-        ("l1_nb_mm", "L1 to NB", "mm", "across", "N B L1 N", "4", _STEINER),
-        ("l1_mp", "L1 to mandibular plane", "°", "turn", "L1R L1 Me Go", "91.4 ± 3.8", _DOWNS),
-        ("interincisal", "Interincisal angle", "°", "turn", "U1 U1R L1 L1R",
-         "135.4 ± 5.8", _DOWNS),
-    )
-)  # fmt: skip
+    replace(measure, about=FORMULAS[measure.formula][1].format(*measure.sites))
+    for measure in measures_of("cephalometry")
+)
 
 
 def cephalometry(

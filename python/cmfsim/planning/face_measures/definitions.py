@@ -1,13 +1,16 @@
-"""Definitions of the measures: a formula and the sites to which it applies.
+"""Definitions of the measures, in measures.csv: a formula and the sites to which it applies.
 
 Angles are those between three points in space. The E-line (Ricketts 1968) runs from the tip of the
 nose to the chin; distances from it are taken in the sagittal plane, positive in front. Heights are
 differences along S. The facial thirds and the chin-throat length follow Legan and Burstone (1980).
 """
 
+import csv
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -79,72 +82,19 @@ FORMULAS: Mapping[str, Callable[..., float]] = MappingProxyType(
     {"angle": _angle, "in_front": _in_front, "distance": _distance, "height": _height}
 )
 
-MEASURES = (
-    Measure(
-        "nasolabial_angle", "Nasolabial angle", "°", "angle",
-        ("columella", "subnasale", "labiale_superius"),
-        "at subnasale, between columella and labiale superius", "102 ± 8",
-        "Legan and Burstone 1980",
-    ),
-    Measure(
-        "mentolabial_angle", "Mentolabial angle", "°", "angle",
-        ("labiale_inferius", "sublabiale", "pogonion"),
-        "at sublabiale, between labiale inferius and pogonion",
-    ),
-    Measure(
-        "convexity_angle", "Facial convexity", "°", "angle", ("glabella", "subnasale", "pogonion"),
-        "at subnasale, between glabella and pogonion; 180° is straight", "168 ± 4",
-        "Legan and Burstone 1980",
-    ),
-    Measure(
-        "upper_lip_to_e_line", "Upper lip to E-line", "mm", "in_front",
-        ("labiale_superius", "pronasale", "pogonion"),
-        "labiale superius in front of the line from pronasale to pogonion",
-    ),
-    Measure(
-        "lower_lip_to_e_line", "Lower lip to E-line", "mm", "in_front",
-        ("labiale_inferius", "pronasale", "pogonion"),
-        "labiale inferius in front of the line from pronasale to pogonion",
-    ),
-    Measure(
-        "incisor_show", "Incisor show", "mm", "height", ("stomion_superius", "upper_incisor"),
-        "height of the upper lip's edge above the edge of the upper incisors", "2 ± 2",
-        "Legan and Burstone 1980",
-    ),
-    Measure(
-        "interlabial_gap", "Interlabial gap", "mm", "height", ("upper_lip_edge", "lower_lip_edge"),
-        "height from the edge of the lower lip to that of the upper lip", "2 ± 2",
-        "Legan and Burstone 1980",
-    ),
-    Measure(
-        "middle_third", "Middle third", "mm", "height", ("glabella", "subnasale"),
-        "height from subnasale to glabella",
-    ),
-    Measure(
-        "lower_third", "Lower third", "mm", "height", ("subnasale", "menton"),
-        "height from menton to subnasale",
-    ),
-    Measure(
-        "upper_lip_length", "Upper lip length", "mm", "height", ("subnasale", "stomion_superius"),
-        "height from stomion superius to subnasale",
-    ),
-    Measure(
-        "lower_lip_and_chin", "Lower lip and chin", "mm", "height", ("stomion_inferius", "menton"),
-        "height from menton to stomion inferius",
-    ),
-    Measure(
-        "chin_throat_length", "Chin–throat length", "mm", "distance", ("menton", "cervical_point"),
-        "from menton to the cervical point",
-    ),
-    Measure(
-        "nasal_width", "Width of the nose", "mm", "distance", ("alare_L", "alare_R"),
-        "between the alaria",
-    ),
-    Measure(
-        "mouth_width", "Width of the mouth", "mm", "distance", ("cheilion_L", "cheilion_R"),
-        "between the corners of the mouth",
-    ),
-)  # fmt: skip
+
+def measures_of(group: str) -> tuple[Measure, ...]:
+    """The measures of a group of measures.csv, in its order."""
+    text = files(__package__).joinpath("measures.csv").read_text(encoding="utf-8")
+    rows = [dict[str, Any](row) for row in csv.DictReader(text.splitlines())]
+    return tuple(
+        Measure(**{**row, "sites": tuple(row["sites"].split())})
+        for row in rows
+        if row.pop("group") == group
+    )
+
+
+MEASURES = measures_of("face")
 
 
 def measure_sites(places: Mapping[str, Floats]) -> dict[str, float | None]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.planning.face_measures.cephalometry import FORMULAS, OCCLUSAL, head_axes, occlusal_plane
-from cmfsim.planning.face_measures.definitions import Measure
+from cmfsim.planning.face_measures.definitions import measures_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, profile_sites, tooth_of
@@ -36,24 +36,7 @@ FOUND_MOLARS = {
     for tooth in ("U6", "L6")
     for side in ("left", "right")
 }
-OCCLUSAL_MEASURES = (
-    Measure("overjet", "Overjet", "mm", "along", ("OP-back", "OP-front", "U1", "L1"),
-            "along the occlusal plane, from L1 to U1; positive in front"),
-    Measure("overbite", "Overbite", "mm", "across", ("OP-back", "OP-front", "L1", "U1"),
-            "across the occlusal plane, from U1 up to L1"),
-    Measure("upper_midline", "Upper midline", "mm", "left", ("U1",),
-            "upper dental midline to the left of the midsagittal plane", "0"),
-    Measure("lower_midline", "Lower midline", "mm", "left", ("L1",),
-            "lower dental midline to the left of the midsagittal plane", "0"),
-    Measure("cant", "Cant of the upper molars", "°", "cant", ("U6",),
-            "line between the upper molars in the view from the front; positive: left side up",
-            "0"),
-    *(Measure(f"molar_{side}", f"Molar relation, {side}", "mm", "molar", ("U6", "L6"),
-              "upper first molar in front of where it lies in class I, along the occlusal plane; "
-              "± 1.5 mm where the molars were found on the crowns",
-              "0 ± 2: class I; above: II, below: III", "Angle 1899")
-      for side in ("left", "right")),
-)  # fmt: skip
+OCCLUSAL_MEASURES = measures_of("occlusion")
 # Beyond these a bite or a face is not wanted, mm and degrees: overjets and open bites in great need
 # of treatment, grades 4 and 5 (Brook and Shaw 1989, Eur J Orthod 11:309–320; reverse overjets and
 # open bites of grade 4); midlines that laypersons notice (Kokich, Kiyak and Shapiro 1999, J Esthet

@@ -233,32 +233,19 @@ def _deepest(part: Floats) -> int:
     return int(np.argmax(away[:, 2] * dy - away[:, 1] * dz))
 
 
-def _stomion_superius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
-    upper, _ = _lips(profile, known)
-    lowest: Floats = upper[np.argmin(upper[:, 2] + LIP_DEPTH * upper[:, 1])]
-    return lowest
-
-
-def _stomion_inferius(profile: Floats, known: Mapping[str, Floats]) -> Floats:
-    _, lower = _lips(profile, known)
-    highest: Floats = lower[np.argmax(lower[:, 2] - LIP_DEPTH * lower[:, 1])]
-    return highest
+def _stomia(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+    """The edges of both lips."""
+    upper, lower = _lips(profile, known)
+    lowest = np.argmin(upper[:, 2] + LIP_DEPTH * upper[:, 1])
+    return upper[lowest], lower[np.argmax(lower[:, 2] - LIP_DEPTH * lower[:, 1])]
 
 
 def _open(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
     """The edges of lips that are open."""
-    upper, lower = _stomion_superius(profile, known), _stomion_inferius(profile, known)
+    upper, lower = _stomia(profile, known)
     if np.linalg.norm(upper - lower) < LEAST_GAP:
         raise LandmarkInputError("the lips are closed, and joined in this model")
     return upper, lower
-
-
-def _upper_lip_edge(profile: Floats, known: Mapping[str, Floats]) -> Floats:
-    return _open(profile, known)[0]
-
-
-def _lower_lip_edge(profile: Floats, known: Mapping[str, Floats]) -> Floats:
-    return _open(profile, known)[1]
 
 
 def _sublabiale(profile: Floats, known: Mapping[str, Floats]) -> Floats:
@@ -271,8 +258,8 @@ def _sublabiale(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     return fold
 
 
-def _below_pogonion(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, int]:
-    """The profile from pogonion down, and the index of menton, its lowest point under the chin."""
+def _menton(profile: Floats, known: Mapping[str, Floats]) -> Floats:
+    """The profile from menton down, the lowest point under the chin."""
     part = profile[_at(profile, known, "pogonion") :]
     under = np.flatnonzero(part[:, 1] <= part[0, 1] + MENTON_BEHIND)
     # Ends where the profile first leaves the chin.
@@ -280,19 +267,12 @@ def _below_pogonion(profile: Floats, known: Mapping[str, Floats]) -> tuple[Float
     lowest = int(under[np.argmin(part[under, 2])])
     if lowest in (0, len(part) - 1):
         raise LandmarkInputError("the skin ends at the chin")
-    return part, lowest
-
-
-def _menton(profile: Floats, known: Mapping[str, Floats]) -> Floats:
-    part, lowest = _below_pogonion(profile, known)
-    menton: Floats = part[lowest]
-    return menton
+    return part[lowest:]
 
 
 def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     """The point between chin and neck furthest above the line that connects them."""
-    part, lowest = _below_pogonion(profile, known)
-    throat = part[lowest:]
+    throat = _menton(profile, known)
     throat = throat[throat[:, 2] >= throat[0, 2] - THROAT_BELOW]
     if throat[0, 2] - throat[:, 2].min() < LEAST_THROAT:
         raise LandmarkInputError(
@@ -308,11 +288,11 @@ def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 _FINDERS: Mapping[str, Callable[[Floats, Mapping[str, Floats]], Floats]] = {
     "glabella": _glabella,
     "columella": _columella,
-    "stomion_superius": _stomion_superius,
-    "stomion_inferius": _stomion_inferius,
-    "upper_lip_edge": _upper_lip_edge,
-    "lower_lip_edge": _lower_lip_edge,
+    "stomion_superius": lambda profile, known: _stomia(profile, known)[0],
+    "stomion_inferius": lambda profile, known: _stomia(profile, known)[1],
+    "upper_lip_edge": lambda profile, known: _open(profile, known)[0],
+    "lower_lip_edge": lambda profile, known: _open(profile, known)[1],
     "sublabiale": _sublabiale,
-    "menton": _menton,
+    "menton": lambda profile, known: _menton(profile, known)[0],
     "cervical_point": _cervical_point,
 }

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_planning.targets import CarriedPoints, Target, Wish, wish_of
 from cmfsim.planning.replanning import PlanningModel
+from cmfsim.planning.replanning.expected_error import moving_segments
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
 from cmfsim.values.prediction import Prediction
@@ -327,8 +328,7 @@ class _Space:
 
     def __init__(self, planning: PlanningModel, search: FaceSearch) -> None:
         reference = planning.reference
-        moving = [n for n, m in reference.items() if not np.array_equal(m, np.eye(4))]
-        named = list(search.segments or moving or planning.segments)
+        named = list(search.segments or moving_segments(planning))
         for name in (*named, *search.follows, *search.follows.values()):
             if name not in planning.segments:
                 known = ", ".join(planning.segments)

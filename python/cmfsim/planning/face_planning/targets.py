@@ -11,6 +11,7 @@ from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
 from cmfsim.planning.replanning import Motions, PlanningModel
+from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats, as_positive, as_rows, keep
 from cmfsim.values.skin_motion import attachment
 from cmfsim.values.surface_data import SurfaceData, used_nodes
@@ -254,8 +255,10 @@ def _surface_wish(planning: PlanningModel, target: SurfaceTarget) -> Wish:
     before = planning.skin_before.vertices
     chosen = np.flatnonzero(np.abs(planning.columns.matrix).max(axis=(1, 2)) > MOVES)
     points = before[chosen[:: max(1, len(chosen) // int(target.points))]]
-    surface = Surface(target.surface.vertices, target.surface.triangles)
-    kept = points[_has_partner(surface, _border_points(target.surface), points)]
+    surface = target.surface.searched
+    # Where a face was cut off.
+    border = np.unique(edges_of(target.surface.triangles.astype(np.int64)).border)
+    kept = points[_has_partner(surface, target.surface.vertices[border], points)]
     if not len(kept):
         raise CaseInputError(
             f"the desired surface is more than {MOST_APART:g} mm from the face: both must be in "
@@ -277,12 +280,3 @@ def _has_partner(surface: Surface, rim: Floats, points: Floats) -> NDArray[np.bo
         from_rim = [float(np.linalg.norm(rim - place, axis=1).min()) for place in closest]
         near &= np.array(from_rim) > BORDER
     return near
-
-
-def _border_points(surface: SurfaceData) -> Floats:
-    """The vertices on the border of a surface, where a face was cut off."""
-    triangles = surface.triangles.astype(np.int64)
-    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    rim: Floats = surface.vertices[np.unique(unique[count == 1])]
-    return rim

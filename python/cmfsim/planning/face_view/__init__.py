@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.planning.page.content import framing
+from cmfsim.planning.page.arrays import Arrays, add_surface, framing
 from cmfsim.planning.page.document import view_markup
-from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import SurfaceData
@@ -35,7 +34,7 @@ def face_view(parts: Parts, colours: NDArray[np.uint8] | None = None) -> tuple[s
     parts: As `read_parts` has them: "skin" and "bones", each with its vertices after the operation.
     colours: Of the vertices of the skin.
     """
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays: Arrays = {}
     shown: list[dict[str, Any]] = []
     bones = parts.get("bones", {})
     count = sum(len(surface.triangles) for surface, _ in bones.values())
@@ -61,7 +60,7 @@ def face_view(parts: Parts, colours: NDArray[np.uint8] | None = None) -> tuple[s
     values: dict[str, Any] = {
         "parts": shown,
         "most": max(1.0, float(np.ceil(2.0 * moved.max()) / 2.0)),
-        **framing(skin, np.flatnonzero(moved > STAYS)),
+        **framing(skin.vertices[moved > STAYS] if (moved > STAYS).any() else skin.vertices),
     }
     values["span"] *= ROUND_ABOUT
     return view_markup(
@@ -69,17 +68,13 @@ def face_view(parts: Parts, colours: NDArray[np.uint8] | None = None) -> tuple[s
     )
 
 
-def _pack(
-    arrays: dict[str, NDArray[Any]], name: str, surface: SurfaceData, after: Floats, most: int
-) -> SurfaceData:
+def _pack(arrays: Arrays, name: str, surface: SurfaceData, after: Floats, most: int) -> SurfaceData:
     """The surface in fewer triangles, added with how each vertex moves."""
-    fewer = simplified_surface(name, surface, most)
+    key = f"part_{len(arrays) // 3}"
+    fewer, _ = add_surface(arrays, key, name, surface, most)
     shift = after - surface.vertices
     if fewer is not surface:
         shift = carried_points(surface, shift, fewer.vertices)
-    key = f"part_{len(arrays) // 3}"
-    arrays[key] = fewer.vertices.astype(np.float32)
-    arrays[f"{key}_triangles"] = fewer.triangles.astype(np.uint32)
     # Half precision: 0.004 mm on 8 mm.
     arrays[f"{key}_shift"] = shift.astype(np.float16)
     return fewer

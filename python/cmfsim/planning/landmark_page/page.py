@@ -1,16 +1,16 @@
 """The page of landmarks: its surfaces, sites and views, and its text."""
 
+import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cmfsim._core import Surface, __version__
+from cmfsim._core import __version__
+from cmfsim.planning.page.arrays import Arrays, PageContent, add_surface, framing, singles
 from cmfsim.planning.page.document import Document, document_text
-from cmfsim.surfaces.depth import distances
-from cmfsim.surfaces.levels import simplified_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import (
     SKIN_SITES,
@@ -22,31 +22,10 @@ from cmfsim.values.landmark_sites import (
 from cmfsim.values.proposed_landmarks import CLEARED_SHARE, GOOD_ERROR, SURFACE_REACH, SiteState
 from cmfsim.values.surface_data import SurfaceData
 
+_VIEWS = files(__package__).joinpath("views.csv").read_text(encoding="utf-8").splitlines()
 # Degrees as in camera.js (azimuth 0 from the front, 90 from the patient's left; elevation 90 from
 # above), and the height of the picture, mm. Of pairs, the view of the left one.
-MIDLINE = (35.0, 5.0, 110.0)
-VIEWS: dict[str, tuple[float, float, float]] = {
-    "menton": (20.0, -35.0, 110.0),
-    "subnasale": (35.0, -15.0, 90.0),
-    "labiale_superius": (25.0, 0.0, 90.0),
-    "labiale_inferius": (25.0, 0.0, 90.0),
-    "frontal_eminence": (25.0, 10.0, 150.0),
-    "supraorbital": (15.0, -5.0, 110.0),
-    "suborbital": (15.0, 15.0, 110.0),
-    "inferior_malar": (30.0, -15.0, 110.0),
-    "lateral_orbit": (60.0, 5.0, 110.0),
-    "zygomatic_arch": (65.0, -15.0, 120.0),
-    "supraglenoid": (80.0, -10.0, 120.0),
-    "gonion": (75.0, -10.0, 130.0),
-    "supra_m2": (55.0, -5.0, 110.0),
-    "occlusal_line": (60.0, 0.0, 120.0),
-    "sub_m2": (60.0, -5.0, 110.0),
-    "exocanthion": (25.0, 0.0, 90.0),
-    "endocanthion": (15.0, 0.0, 90.0),
-    "alare": (25.0, -10.0, 90.0),
-    "cheilion": (25.0, 0.0, 90.0),
-}
-
+VIEWS = {row.pop("site"): {k: float(v) for k, v in row.items()} for row in csv.DictReader(_VIEWS)}
 # Triangles that the page draws of the skull, of a jaw and of the skin: about 2 MB together.
 MOST_TRIANGLES: Mapping[str, int] = {"cranium": 60_000, "mandible": 24_000, "skin": 40_000}
 # And of the average head that shows where a site is.
@@ -59,20 +38,12 @@ SPAN_SHARE = 1.1
 class PageSite:
     """A landmark of the page.
 
-    Attributes
-    ----------
-    kind, name : str
-        "skull" or "skin", and the label.
-    point : (3,) float64, mm
-        Where it is, or for a missing site where the others place it.
-    state : SiteState
-        "filled" if it is missing.
-    why : str
-        Why it is missing; empty otherwise.
-    placed : (3,) float64, mm, or None
-        Where a person has placed or accepted it already.
-    placed_origin : str
-        "placed" or "accepted".
+    kind, name: "skull" or "skin", and the label.
+    point: (3,), mm. Where it is, or for a missing site where the others place it.
+    state: "filled" if it is missing.
+    why: Why it is missing; empty otherwise.
+    placed: (3,), mm, or None. Where a person has placed or accepted it already.
+    placed_origin: "placed" or "accepted".
     """
 
     kind: str
@@ -84,22 +55,6 @@ class PageSite:
     placed_origin: str = "placed"
 
 
-@dataclass(frozen=True, eq=False)
-class LandmarkContent:
-    """The data from which a page of landmarks is written.
-
-    Attributes
-    ----------
-    values : mapping
-        Plain values, ready for JSON.
-    arrays : mapping of str to array
-        float32 and uint32.
-    """
-
-    values: Mapping[str, Any]
-    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-
-
 def landmark_content(
     case: str,
     surfaces: Mapping[str, SurfaceData],
@@ -109,28 +64,20 @@ def landmark_content(
     *,
     placed_std: float,
     built_for: str = "",
-) -> LandmarkContent:
+) -> PageContent:
     """The content of the page of a head.
 
-    Parameters
-    ----------
-    case : str
-        Its name.
-    surfaces : mapping of str to SurfaceData
-        Bones, and "skin" where there is one; LPS mm.
-    sites : sequence of PageSite
-    covariance : (3 n, 3 n) float64, mm²
-        Of the errors of their points: it says how sites follow one that is placed.
-    average : surfaces by part, landmarks by kind and label
-        The head in which the page shows where each site is.
-    placed_std : float, mm
-        How far a person's own point lies from the site, along each axis.
-    built_for : str
-        The state of the case.
+    case: Its name.
+    surfaces: Bones, and "skin" where there is one; LPS mm.
+    covariance: (3 n, 3 n), mm². Of the errors of their points: it says how sites follow one that is
+        placed.
+    average: The head in which the page shows where each site is.
+    placed_std: mm. How far a person's own point lies from the site, along each axis.
+    built_for: The state of the case.
     """
-    arrays: dict[str, NDArray[Any]] = {
-        "site_points": _singles([site.point for site in sites]),
-        "site_covariance": _singles(covariance),
+    arrays: Arrays = {
+        "site_points": singles([site.point for site in sites]),
+        "site_covariance": singles(covariance),
     }
     average_surfaces, average_points = average
     values = {
@@ -150,9 +97,12 @@ def landmark_content(
         "good_error": GOOD_ERROR,
         "cleared_share": CLEARED_SHARE,
         "surface_reach": SURFACE_REACH,
-        **_framing(surfaces),
+        **framing(
+            np.concatenate([s.vertices for name, s in surfaces.items() if name != "skin"]),
+            SPAN_SHARE,
+        ),
     }
-    return LandmarkContent(values, arrays)
+    return PageContent(values, arrays)
 
 
 def _values(site: PageSite) -> dict[str, Any]:
@@ -182,10 +132,7 @@ def _part_of(name: str) -> str:
 
 
 def _packed(
-    surfaces: Mapping[str, SurfaceData],
-    most: Mapping[str, int],
-    prefix: str,
-    arrays: dict[str, NDArray[Any]],
+    surfaces: Mapping[str, SurfaceData], most: Mapping[str, int], prefix: str, arrays: Arrays
 ) -> list[dict[str, Any]]:
     """The surfaces of parts, simplified into arrays, with how far the drawn ones are off."""
     counts = {
@@ -196,41 +143,22 @@ def _packed(
     for number, (name, surface) in enumerate(surfaces.items()):
         part = _part_of(name)
         allowed = max(500, most[part] * len(surface.triangles) // counts[part])
-        drawn = simplified_surface(name, surface, allowed)
-        there = Surface(surface.vertices, surface.triangles)
-        away = distances(drawn.vertices, there)
-        arrays[f"{prefix}_{number}"] = _singles(drawn.vertices)
-        arrays[f"{prefix}_{number}_triangles"] = np.asarray(drawn.triangles, dtype=np.uint32)
-        found.append({"name": name, "part": part, "away": round(float(away.max()), 3)})
+        _, off = add_surface(arrays, f"{prefix}_{number}", name, surface, allowed)
+        found.append({"name": name, "part": part, "away": round(off, 3)})
     return found
-
-
-def _singles(rows: Any) -> NDArray[np.float32]:
-    return np.asarray(rows, dtype=np.float32)
-
-
-def _framing(surfaces: Mapping[str, SurfaceData]) -> dict[str, Any]:
-    """Where the picture looks, and how much it shows, mm: all bones."""
-    bones = [s.vertices for name, s in surfaces.items() if name != "skin"]
-    vertices = np.concatenate(bones)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return {"target": (0.5 * (low + high)).tolist(), "span": SPAN_SHARE * float((high - low).max())}
 
 
 def site_view(name: str) -> dict[str, float]:
     """The azimuth, elevation (degrees) and height (mm) of the picture that shows a site."""
     side = name[-2:] if name.endswith(("_L", "_R")) else ""
-    azimuth, elevation, span = VIEWS.get(name.removesuffix(side), MIDLINE)
-    return {"azimuth": -azimuth if side == "_R" else azimuth, "elevation": elevation, "span": span}
+    view = VIEWS.get(name.removesuffix(side), VIEWS["other"])
+    return {**view, "azimuth": -view["azimuth"]} if side == "_R" else view
 
 
-def landmark_page_text(content: LandmarkContent) -> str:
+def landmark_page_text(content: PageContent) -> str:
     """The text of a page of landmarks, which loads nothing and sends nothing.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Numbers that are not finite.
+    Raises `CaseError`: Numbers that are not finite.
 
     Examples
     --------

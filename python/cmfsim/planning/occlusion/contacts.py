@@ -24,10 +24,7 @@ TOUCH = 0.2
 def signed_gaps(points: ArrayLike, surface: SurfaceData) -> Floats:
     """Distance of points from a closed surface, (n,) mm: negative inside.
 
-    Parameters
-    ----------
-    points : (n, 3) float64, mm
-    surface : SurfaceData
+    points: (n, 3), mm.
     """
     places = as_rows("points", points, 3)
     gaps = distances(places, surface.searched)
@@ -106,10 +103,7 @@ def contact_map(upper: ToothRow, lower: ToothRow) -> ContactMap:
 def planned_contacts(patient: PatientModel) -> ContactMap:
     """The contacts of the tooth rows of a patient, as planned.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The case has no tooth rows, or doubtful ones.
+    Raises `CaseError`: The case has no tooth rows, or doubtful ones.
     """
     plan, rows = patient.scene.plan, patient_rows(patient)
     return contact_map(*(row.moved(rigid_of(plan.get(row.segment))) for row in rows))

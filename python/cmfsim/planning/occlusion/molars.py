@@ -54,10 +54,7 @@ class _Unrolled:
 def first_molars(row: ToothRow) -> dict[str, Floats | str]:
     """The middle of the first molar's crown, (3,) mm, by side, "L" or "R"; or why there is none.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) The bone has no teeth.
+    Raises `CaseError`: The bone has no teeth.
     """
     if row not in _FOUND:
         unrolled, widths = _unrolled(row), WIDTHS[row.arch.jaw]

@@ -1,13 +1,11 @@
 """The content of a planning page: surfaces, operator, sites, errors and band, as plain values."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cmfsim._core import Surface, __version__
+from cmfsim._core import __version__
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.planning.face_measures import (
     MEASURES,
@@ -23,6 +21,7 @@ from cmfsim.planning.face_measures.occlusion import (
     missing_for_occlusion,
     occlusal_terms,
 )
+from cmfsim.planning.page.arrays import Arrays, PageContent, add_surface, framing, indices, singles
 from cmfsim.planning.page.row_overlap import row_overlap
 from cmfsim.planning.page.segment_points import segment_points
 from cmfsim.planning.replanning import (
@@ -33,8 +32,7 @@ from cmfsim.planning.replanning import (
     PlanningModel,
     segment_boxes,
 )
-from cmfsim.surfaces.depth import barycentric, distances
-from cmfsim.surfaces.levels import simplified_surface
+from cmfsim.surfaces.depth import barycentric
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.prediction import Prediction
@@ -55,27 +53,6 @@ LARGE_TURN, LARGE_SHIFT = 0.5, 30.0
 PROFILE_DEPTH = 60.0
 # Pairs of the skin that jaw surgery does not move: they place the plane of the mirror image.
 EYES = ("exocanthion", "endocanthion")
-# How much of the height of the face a picture shows, and the least, mm.
-SPAN_SHARE, LEAST_SPAN = 1.15, 60.0
-
-
-@dataclass(frozen=True, eq=False)
-class PageContent:
-    """The data from which a page is written.
-
-    Attributes
-    ----------
-    values : mapping
-        Plain values, ready for JSON.
-    arrays : mapping of str to array
-        float32, float16 and uint32.
-    findings : tuple of Finding
-        Findings on what was simplified or omitted.
-    """
-
-    values: Mapping[str, Any]
-    arrays: Mapping[str, NDArray[Any]]
-    findings: tuple[Finding, ...] = field(default=())
 
 
 def page_content(
@@ -124,17 +101,15 @@ def page_content(
             f"the skin has {count} nodes, but a page can have at most {MOST_NODES}: use a larger "
             "edge_length in [mesh], or --edge-length"
         )
-    face = _fewer("face", patient.face or skin, FACE_TRIANGLES, findings)
     sites = face_sites(patient)
-    arrays: dict[str, NDArray[Any]] = {
-        "nodes": _singles(skin.vertices),
-        "skin_triangles": _indices(skin.triangles),
-        "face": _singles(face.vertices),
-        "face_triangles": _indices(face.triangles),
+    arrays: Arrays = {"nodes": singles(skin.vertices), "skin_triangles": indices(skin.triangles)}
+    whole = patient.face or skin
+    face = _fewer(arrays, "face", "face", whole, FACE_TRIANGLES, findings=findings)
+    arrays |= {
         **_operator(planning, reference),
         **_carried("face", skin, face.vertices),
         **_carried("site", skin, _rows(sites.skin.values())),
-        "sites": _singles(_rows(sites.skin.values())),
+        "sites": singles(_rows(sites.skin.values())),
     }
     bones = _bones(planning, arrays, findings)
     band_values, band_arrays = band_content(band)
@@ -160,43 +135,33 @@ def page_content(
         "correction": _correction(planning),
         "band": band_values,
         "midplane": _midplane(planning.patient.landmarks.get("skin", {})),
-        **framing(skin, arrays["active"]),
+        **framing(skin.vertices[arrays["active"]] if len(arrays["active"]) else skin.vertices),
     }
     return PageContent(values, arrays, tuple(findings))
-
-
-def _singles(rows: Any) -> NDArray[np.float32]:
-    return np.asarray(rows, dtype=np.float32)
-
-
-def _indices(rows: Any) -> NDArray[np.uint32]:
-    return np.asarray(rows, dtype=np.uint32)
 
 
 def _rows(places: Any) -> Floats:
     return np.array([*places], dtype=np.float64).reshape(-1, 3)
 
 
-def _fewer(name: str, surface: SurfaceData, most: int, findings: list[Finding]) -> SurfaceData:
-    """The surface, simplified with a finding where it has more triangles than are drawn."""
-    count = len(surface.triangles)
-    if count <= most:
-        return surface
-    fewer = simplified_surface(name, surface, most)
-    there = Surface(surface.vertices, surface.triangles)
-    away = float(distances(fewer.vertices, there).max())
-    findings.append(
-        Finding(
-            "page-simplified",
-            f"{name} has {count} triangles; the page draws it with "
-            f"{len(fewer.triangles)}, at most {away:.2f} mm away",
-            where=name,
+def _fewer(
+    arrays: Arrays, key: str, name: str, surface: SurfaceData, most: int, *, findings: list[Finding]
+) -> SurfaceData:
+    """The surface added to arrays, with a finding where it has more triangles than are drawn."""
+    fewer, off = add_surface(arrays, key, name, surface, most)
+    if fewer is not surface:
+        findings.append(
+            Finding(
+                "page-simplified",
+                f"{name} has {len(surface.triangles)} triangles; the page draws it with "
+                f"{len(fewer.triangles)}, at most {off:.2f} mm away",
+                where=name,
+            )
         )
-    )
     return fewer
 
 
-def _operator(planning: PlanningModel, reference: Prediction) -> dict[str, NDArray[Any]]:
+def _operator(planning: PlanningModel, reference: Prediction) -> Arrays:
     """The columns of the nodes that move, in half precision, and the reference in single.
 
     After the columns of the segments come the shapes of the correction, in fours as the product
@@ -220,11 +185,11 @@ def _operator(planning: PlanningModel, reference: Prediction) -> dict[str, NDArr
     with np.errstate(over="ignore"):
         half = rows.astype(np.float16)
     return {
-        "correction_plans": _singles(_solved_plans(correction)),
-        "correction_weights": _singles(weights),
-        "active": _indices(active),
+        "correction_plans": singles(_solved_plans(correction)),
+        "correction_weights": singles(weights),
+        "active": indices(active),
         "columns": half,
-        "reference_shift": _singles(reference.skin_displacements[active]),
+        "reference_shift": singles(reference.skin_displacements[active]),
     }
 
 
@@ -249,15 +214,15 @@ def _correction(planning: PlanningModel) -> dict[str, Any] | None:
     }
 
 
-def _carried(part: str, skin: SurfaceData, points: Floats) -> dict[str, NDArray[Any]]:
+def _carried(part: str, skin: SurfaceData, points: Floats) -> Arrays:
     """How points are attached to the skin, as in `carried_points` of a prediction."""
     found = attachment(skin.searched, points)
     corners = skin.vertices[skin.triangles[found.triangles]]
     return {
-        f"{part}_triangle": _indices(found.triangles),
-        f"{part}_barycentric": _singles(barycentric(corners, found.closest)),
-        f"{part}_offset": _singles(found.places - found.closest),
-        f"{part}_share": _singles(found.share),
+        f"{part}_triangle": indices(found.triangles),
+        f"{part}_barycentric": singles(barycentric(corners, found.closest)),
+        f"{part}_offset": singles(found.places - found.closest),
+        f"{part}_share": singles(found.share),
     }
 
 
@@ -281,7 +246,7 @@ def _segments(planning: PlanningModel) -> list[dict[str, Any]]:
 
 
 def _bones(
-    planning: PlanningModel, arrays: dict[str, NDArray[Any]], findings: list[Finding]
+    planning: PlanningModel, arrays: Arrays, findings: list[Finding]
 ) -> list[dict[str, Any]]:
     """All bones, including those that stay; each is simplified by the same ratio."""
     segments = planning.patient.segments
@@ -289,9 +254,7 @@ def _bones(
     found: list[dict[str, Any]] = []
     for number, segment in enumerate(segments):
         most = max(LEAST_BONE, BONE_TRIANGLES * counts[number] // sum(counts))
-        surface = _fewer(segment.name, segment.surface, most, findings)
-        arrays[f"bone_{number}"] = _singles(surface.vertices)
-        arrays[f"bone_{number}_triangles"] = _indices(surface.triangles)
+        _fewer(arrays, f"bone_{number}", segment.name, segment.surface, most, findings=findings)
         moves = segment.name in planning.segments
         found.append(
             {
@@ -384,9 +347,7 @@ def occlusal_measures(
     return found
 
 
-def _profile(
-    planning: PlanningModel, face: SurfaceData, arrays: dict[str, NDArray[Any]]
-) -> dict[str, Any]:
+def _profile(planning: PlanningModel, face: SurfaceData, arrays: Arrays) -> dict[str, Any]:
     try:
         profile = midline_profile(face, planning.patient.landmarks.get("skin", {}))
     except LandmarkInputError as error:
@@ -395,8 +356,8 @@ def _profile(
         return {"has_profile": False, "profile_absent": str(error)}
     # Without scalp and neck, which would make the drawing small.
     shown = profile.points[:, 1] <= profile.points[:, 1].min() + PROFILE_DEPTH
-    arrays["profile_ends"] = _indices(profile.ends[shown])
-    arrays["profile_share"] = _singles(profile.share[shown])
+    arrays["profile_ends"] = indices(profile.ends[shown])
+    arrays["profile_share"] = singles(profile.share[shown])
     return {"has_profile": True, "profile_absent": ""}
 
 
@@ -414,13 +375,13 @@ def _target_bite(planning: PlanningModel) -> dict[str, Any] | None:
     }
 
 
-def _teeth(planning: PlanningModel, arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
+def _teeth(planning: PlanningModel, arrays: Arrays) -> dict[str, Any]:
     try:
         rows = row_overlap(planning.patient)
     except CaseInputError as error:
         return {"occlusion": None, "occlusion_absent": str(error)}
-    arrays["occlusion_points"] = _singles(rows.points)
-    arrays["occlusion_depth"] = _singles(rows.depth.values)
+    arrays["occlusion_points"] = singles(rows.points)
+    arrays["occlusion_depth"] = singles(rows.depth.values)
     number = {name: index for index, name in enumerate(planning.segments)}
     return {
         "occlusion": {
@@ -444,18 +405,7 @@ def _midplane(landmarks: Mapping[str, Floats]) -> dict[str, list[float]] | None:
     return {"point": (0.5 * (left + right)).tolist(), "normal": normal.tolist()}
 
 
-def framing(skin: SurfaceData, active: NDArray[Any]) -> dict[str, Any]:
-    """Where the picture looks, and how much it shows, mm: what moves, and some of the head."""
-    vertices = skin.vertices
-    moving = vertices[active] if len(active) else vertices
-    low, high = moving.min(axis=0), moving.max(axis=0)
-    return {
-        "target": (0.5 * (low + high)).tolist(),
-        "span": max(LEAST_SPAN, SPAN_SHARE * float((high - low).max())),
-    }
-
-
-def band_content(band: PlanBand | None) -> tuple[dict[str, Any] | None, dict[str, NDArray[Any]]]:
+def band_content(band: PlanBand | None) -> tuple[dict[str, Any] | None, Arrays]:
     """Values and arrays of a band; none where the page has no band.
 
     Rates in half precision change a half-width by 0.01 mm at most.
@@ -472,7 +422,7 @@ def band_content(band: PlanBand | None) -> tuple[dict[str, Any] | None, dict[str
         }
         for name in known.regions
     ]
-    arrays: dict[str, NDArray[Any]] = {
+    arrays: Arrays = {
         "band_still": band.still.astype(np.float32),
         "band_shift": band.shift.astype(np.float32),
         "band_rates": band.rates.astype(np.float16),

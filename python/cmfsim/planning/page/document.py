@@ -13,6 +13,7 @@ import hashlib
 import html
 import json
 import re
+import shlex
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.planning.page.content import PageContent
+from cmfsim.planning.page.arrays import PageContent
 from cmfsim.values.language import language, script_texts, translated
 
 TYPES = ("float32", "float16", "uint32")
@@ -59,23 +60,14 @@ VIEW = """<style>@style@</style>
 class Document:
     """The parts of a page.
 
-    Attributes
-    ----------
-    title, facts, footer : str
-    stage, panel, picture : str
-        What the drawing, the fields next to it and the picture itself are, for screen readers.
-    made_for : str
-        The state of the case.
-    values : mapping
-        Plain values, ready for JSON.
-    arrays : mapping of str to array
-        float32, float16 and uint32.
-    package : str
-        The package that has the first script, and a style of its own, besides the shared ones.
-    main : str
-        The first script.
-    is_served : bool
-        Whether the page asks the program that serves it; otherwise it makes no connection.
+    stage, panel, picture: What the drawing, the fields next to it and the picture itself are, for
+        screen readers.
+    made_for: The state of the case.
+    values: Plain values, ready for JSON.
+    arrays: float32, float16 and uint32.
+    package: The package that has the first script, and a style of its own, besides the shared ones.
+    main: The first script.
+    is_served: Whether the page asks the program that serves it; otherwise it makes no connection.
     """
 
     title: str
@@ -95,10 +87,7 @@ class Document:
 def document_text(document: Document) -> str:
     """The text of a page.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Numbers that are not finite; scripts that cannot be joined.
+    Raises `CaseError`: Numbers that are not finite; scripts that cannot be joined.
     """
     texts = ("title", "facts", "footer", "stage", "panel", "picture")
     packages = tuple(dict.fromkeys((SHARED, document.package)))
@@ -186,11 +175,8 @@ def _template(name: str) -> str:
 def joined_scripts(modules: Mapping[str, str], main: str = MAIN) -> str:
     """The first module and those that it imports as one script, each after those that it needs.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Modules import each other in a circle, or one that is not there; two
-        define the same name.
+    Raises `CaseError`: Modules import each other in a circle, or one that is not there; two define
+        the same name.
     """
     order: list[str] = []
 
@@ -243,10 +229,7 @@ def _json_in_html(values: Mapping[str, object]) -> str:
 def packed_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[str, list[dict[str, Any]]]:
     """The text of arrays, and where each of them starts: `name`, `type`, `shape`, `start`.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A number that is not finite, or too large for its precision.
+    Raises `CaseError`: A number that is not finite, or too large for its precision.
     """
     table: list[dict[str, Any]] = []
     block = bytearray()
@@ -299,7 +282,7 @@ def page_text(
     """
     values = {
         **content.values,
-        "case_file": _argument(case_file),
+        "case_file": shlex.quote(case_file),
         "exact_note": EXACT_NOTE,
         "is_served": is_served,
     }
@@ -322,9 +305,3 @@ def page_text(
             is_served=is_served,
         )
     )
-
-
-def _argument(name: str) -> str:
-    """A file name as a word of a shell, on Linux and macOS."""
-    plain = re.fullmatch(r"[A-Za-z0-9_./-]+", name) is not None and not name.startswith("-")
-    return name if plain else "'" + name.replace("'", "'\\''") + "'"

@@ -24,14 +24,9 @@ MOST_POINTS, MARGIN, SPACING = 4000, 8.0, 1.0
 class RowOverlap:
     """The lower row's points and the depth inside the upper row's bone.
 
-    Attributes
-    ----------
-    upper, lower : str
-        The segments that bear them; a segment that the plan does not move stays.
-    points : (n, 3) float64, mm
-        Of the lower crowns, before the operation.
-    depth : ImageData
-        Depth inside the upper row's bone, mm, up to `MARGIN`; 0 outside of it.
+    upper, lower: The segments that bear them; a segment that the plan does not move stays.
+    points: (n, 3), mm. Of the lower crowns, before the operation.
+    depth: Depth inside the upper row's bone, mm, up to `MARGIN`; 0 outside of it.
     """
 
     upper: str
@@ -42,10 +37,7 @@ class RowOverlap:
     def passing(self, plan: Mapping[str, ArrayLike]) -> float:
         """How deep the lower row reaches into the upper one under a plan, mm; 0 where it does not.
 
-        Parameters
-        ----------
-        plan : mapping of str to (4, 4) float64, mm
-            Segments that it does not name stay.
+        plan: mapping of str to (4, 4), mm. Segments that it does not name stay.
         """
         up = np.asarray(plan.get(self.upper, np.eye(4)), dtype=np.float64)
         low = np.asarray(plan.get(self.lower, np.eye(4)), dtype=np.float64)

@@ -18,7 +18,7 @@ from cmfsim._core import Solution, Surface
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.replanning.model import Motions, PlanColumns, PlanningModel
 from cmfsim.solving.models import model_scene
-from cmfsim.solving.rates import ACCURACY, scene_parts, tissue_load
+from cmfsim.solving.rates import ACCURACY, motion_rates, scene_parts, tissue_load
 from cmfsim.solving.simulation import scene_plan
 from cmfsim.values.calibration import TISSUE, Source
 from cmfsim.values.checks import Floats
@@ -31,8 +31,6 @@ from cmfsim.values.skin_band import SkinBand
 MODULI = ("fat modulus", "muscle modulus along", "muscle modulus across")
 # Numbers of a segment: the shift of its centre, mm, and its rotation vector, radians.
 NUMBERS = 6
-# Unit rotation vectors as matrices: ω × e_j in column j.
-TURNS = np.array([np.cross(axis, np.eye(3)).T for axis in np.eye(3)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,13 +182,5 @@ def _unit_rates(planning: PlanningModel) -> list[dict[str, Floats]]:
     for name, centre in zip(planning.columns.segments, planning.columns.centres, strict=True):
         matrix = planning.reference[name]
         middle = matrix[:3, :3] @ centre + matrix[:3, 3]
-        for axis in np.eye(3):
-            rate = np.zeros((4, 4))
-            rate[:3, 3] = axis
-            found.append({name: rate})
-        for turn in TURNS:
-            rate = np.zeros((4, 4))
-            rate[:3, :3] = turn @ matrix[:3, :3]
-            rate[:3, 3] = turn @ (matrix[:3, 3] - middle)
-            found.append({name: rate})
+        found += [{name: rate} for rate in motion_rates(matrix, middle, np.ones(NUMBERS))]
     return found

@@ -9,7 +9,7 @@ from cmfsim import HeadParameters, make_head
 from cmfsim.errors import CaseInputError
 from cmfsim.lab.virtual.mechanics.body import FAT, HyperelasticBody, HyperelasticTissue
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions, find_equilibrium
-from cmfsim.lab.virtual.mechanics.lip_contact import ContactSum, Lip, LipContact, MouthSlit
+from cmfsim.lab.virtual.mechanics.lip_contact import Lip, LipContact, MouthSlit
 
 SIDE = 6.0
 
@@ -161,8 +161,7 @@ def test_blocks_pressed_together_share_the_strain_and_meet_at_equal_pressure(cel
     way = np.zeros((len(held), 3))
     way[len(bottom) :, 2] = -1.2
     options = EquilibriumOptions(steps=3, tolerance=1e-3, loose=0.03)
-    both = ContactSum((wall, contact))
-    found = find_equilibrium(body, held, lambda part: part * way, both, options)
+    found = find_equilibrium(body, held, lambda part: part * way, [wall, contact], options)
     u = found.displacements
     lambda_, mu = FAT.spencer()[:2]
     modulus = (lambda_ + 2.0 * mu) / SIDE
@@ -228,7 +227,7 @@ def test_lips_that_leave_each_other_do_not_pull():
     way = np.zeros((len(held), 3))
     way[nodes[held, 2] > SIDE, 2] = 1.0
     options = EquilibriumOptions(steps=1, tolerance=1e-6, loose=1e-3)
-    u = find_equilibrium(body, held, lambda part: part * way, contact, options).displacements
+    u = find_equilibrium(body, held, lambda part: part * way, [contact], options).displacements
     assert np.abs(u[lower.nodes]).max() < 1e-6
     assert contact.penetration(u) < 1e-6
 

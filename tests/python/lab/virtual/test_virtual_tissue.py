@@ -245,7 +245,7 @@ def test_small_motions_go_to_the_linear_solution_linearly():
         motion = cmfsim.rigid_motion((size, 0.0, 0.5 * size))
         move = np.zeros((len(held), 3))
         move[len(low) :] = motion[:3, 3]
-        found = find_equilibrium(body, held, lambda part, m=move: part * m, None, TIGHT)
+        found = find_equilibrium(body, held, lambda part, m=move: part * m, options=TIGHT)
         linear = solver.solve({"bone": motion}).displacements
         apart.append(np.abs(found.displacements - linear).max() / size)
     assert apart[0] < 0.05
@@ -261,7 +261,7 @@ def test_patch_of_large_strain_is_uniform_with_the_stress_of_the_law():
     stretch = np.array([[0.3, 0.1, 0.0], [0.0, -0.1, 0.05], [0.1, 0.0, 0.2]])
     held = on_border(nodes)
     move = nodes @ stretch.T
-    found = find_equilibrium(body, held, lambda part: part * move[held], None, TIGHT)
+    found = find_equilibrium(body, held, lambda part: part * move[held], options=TIGHT)
     assert np.abs(found.displacements - move).max() < 1e-8
     assert found.residual < 1e-10
 
@@ -276,7 +276,7 @@ def test_confined_compression_takes_the_force_of_the_closed_form():
     held = on_border(nodes)
     move = np.zeros_like(nodes)
     move[:, 2] = (s - 1.0) * nodes[:, 2]
-    found = find_equilibrium(body, held, lambda part: part * move[held], None, TIGHT)
+    found = find_equilibrium(body, held, lambda part: part * move[held], options=TIGHT)
     lambda_, mu = FAT.spencer()[:2]
     expected = 100.0 * (lambda_ + 2.0 * mu) * (s - 1.0)
     top = np.flatnonzero(nodes[:, 2] > 10.0 - 1e-9)
@@ -298,7 +298,7 @@ def test_a_body_turned_with_its_bones_keeps_its_shape():
         return nodes[held] @ matrix[:3, :3].T + matrix[:3, 3] - nodes[held]
 
     options = EquilibriumOptions(steps=4, tolerance=1e-9, loose=1e-3)
-    found = find_equilibrium(body, held, path, None, options)
+    found = find_equilibrium(body, held, path, options=options)
     whole = motion(1.0)
     rigid = nodes @ whole[:3, :3].T + whole[:3, 3] - nodes
     assert np.abs(found.displacements - rigid).max() < 1e-6
@@ -316,7 +316,7 @@ def test_forces_balance_and_work_is_stored():
     way[len(low) :] = [2.0, 0.5, 1.0]
 
     def at(size: float):
-        return find_equilibrium(body, held, lambda part: part * size * way, None, TIGHT)
+        return find_equilibrium(body, held, lambda part: part * size * way, options=TIGHT)
 
     found, step = at(1.0), 1e-4
     forces = body.forces(found.displacements)
@@ -358,7 +358,7 @@ def pressed_cube(shift: float):
     contact = BoneContact(nodes, bottom, area, {"bone": SmoothDistance(half_space())}, motion)
     options = EquilibriumOptions(steps=2, tolerance=1e-8, loose=1e-3)
     found = find_equilibrium(
-        body, top, lambda part: np.zeros((len(top), 3)) * part, contact, options
+        body, top, lambda part: np.zeros((len(top), 3)) * part, [contact], options
     )
     return found.displacements, contact, body, bottom
 

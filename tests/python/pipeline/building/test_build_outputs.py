@@ -273,11 +273,11 @@ def test_without_opengl_there_is_a_model_and_a_warning(ready, ellipsoids, before
 
 DRAWING = """
 import cmfsim
-from cmfsim.pictures import picture_segments
+from cmfsim.pictures import picture_anatomy
 surface = cmfsim.SurfaceData([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3]])
 level = cmfsim.ImageData([[[0.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 0.0]]], (1, 1, 1))
 try:
-    picture_segments(PATH, [cmfsim.BoneSegment("a", level, surface)], size=(60, 40))
+    picture_anatomy(PATH, surface, [cmfsim.BoneSegment("a", level, surface)], size=(60, 40))
 except cmfsim.CaseError as error:
     print(error)
 """

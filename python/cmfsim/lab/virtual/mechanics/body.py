@@ -304,7 +304,7 @@ class HyperelasticBody:
         if len(tissue.mu) != len(rows):
             raise CaseInputError(f"tissue of {len(tissue.mu)} tets for a mesh of {len(rows)}")
         self.nodes, self.tets, self.tissue = points, rows, tissue
-        skfem = _module("skfem")
+        skfem = third_party("skfem", "virtual patients are solved", "study")
         mesh = skfem.MeshTet(
             np.ascontiguousarray(points.T), np.ascontiguousarray(rows.T), sort_t=False
         )
@@ -397,7 +397,7 @@ class HyperelasticBody:
         if added is not None:
             middle = middle + added
         data = np.concatenate([middle, upper, upper.transpose(0, 2, 1)])
-        sparse = _module("scipy.sparse")
+        sparse = third_party("scipy.sparse", "virtual patients are solved", "study")
         return sparse.bsr_array(
             (data[self._order], self._columns, self._starts), shape=(3 * n, 3 * n)
         )
@@ -415,7 +415,3 @@ def _between_nodes(tangent: Floats, shapes: Floats) -> Floats:
 def _virtual_work(v: Any, w: Any) -> Any:
     """P : ∇v, the virtual work of the stress."""
     return np.einsum("ij...,ij...->...", w["stress"], v.grad)
-
-
-def _module(name: str) -> Any:
-    return third_party(name, "virtual patients are solved", "study")

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import pairwise
@@ -51,22 +51,17 @@ class Contact(Protocol):
         """Further stiffness, between nodes: (3n, 3n) scipy BSR, N/mm, or None."""
 
 
-class NoContact:
-    """No contact."""
+def penalty(depth: Floats, onset: float) -> tuple[Floats, Floats, Floats]:
+    """Energy, pressure and stiffness of contact at a depth, mm, for a final stiffness of 1.
 
-    def energy(self, displacements: Floats, part: float) -> float:
-        """Nothing."""
-        del displacements, part
-        return 0.0
-
-    def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
-        """Nothing."""
-        del part
-        return np.zeros_like(displacements), np.zeros((*displacements.shape, 3))
-
-    def coupling(self, displacements: Floats, part: float) -> None:
-        """Nothing."""
-        del displacements, part
+    The pressure is d² / 2δ to the depth δ of its onset, from there d − δ/2.
+    """
+    d, is_shallow = depth, depth < onset
+    energy = np.where(
+        is_shallow, d**3 / (6.0 * onset), 0.5 * (d - 0.5 * onset) ** 2 + onset**2 / 24.0
+    )
+    pressure = np.where(is_shallow, 0.5 * d**2 / onset, d - 0.5 * onset)
+    return energy, pressure, np.minimum(d / onset, 1.0)
 
 
 @dataclass(frozen=True)
@@ -113,7 +108,7 @@ def find_equilibrium(
     body: HyperelasticBody,
     held: NDArray[Any],
     path: Callable[[float], Floats],
-    contact: Contact | None = None,
+    contacts: Sequence[Contact] = (),
     options: EquilibriumOptions | None = None,
 ) -> Equilibrium:
     """The equilibrium of a body whose held nodes have moved along a path.
@@ -124,7 +119,7 @@ def find_equilibrium(
         its index).
     Raises `CaseError`: PyAMG or scikit-fem is not installed.
     """
-    return _Search(body, held, path, contact or NoContact(), options or EquilibriumOptions()).run()
+    return _Search(body, held, path, contacts, options or EquilibriumOptions()).run()
 
 
 class _Search:
@@ -135,10 +130,10 @@ class _Search:
         body: HyperelasticBody,
         held: NDArray[Any],
         path: Callable[[float], Floats],
-        contact: Contact,
+        contacts: Sequence[Contact],
         options: EquilibriumOptions,
     ) -> None:
-        self.body, self.path, self.contact, self.options = body, path, contact, options
+        self.body, self.path, self.contacts, self.options = body, path, contacts, options
         self.held = held.astype(np.int64)
         self.free = np.setdiff1d(np.arange(len(body.nodes)), self.held)
         self.linear = _LinearSolver(body.nodes[self.free])
@@ -170,17 +165,20 @@ class _Search:
         )
 
     def _energy(self, u: Floats, part: float) -> float:
-        return self.body.energy(u) + self.contact.energy(u, part)
+        return self.body.energy(u) + sum(contact.energy(u, part) for contact in self.contacts)
 
     def _forces(self, u: Floats, part: float) -> tuple[Floats, Floats]:
-        force, stiffness = self.contact.forces(u, part)
+        force, stiffness = np.zeros_like(u), np.zeros((*u.shape, 3))
+        for contact in self.contacts:
+            pushing, stiffening = contact.forces(u, part)
+            force, stiffness = force + pushing, stiffness + stiffening
         return self.body.forces(u) + force, stiffness
 
     def _stiffness(self, added: Floats, part: float, *, convex: bool) -> Any:
         """Stiffness of tissue and contact; `added` is the second result of `_forces`."""
         matrix = self.body.stiffness(self.u, added, convex=convex)
-        coupling = self.contact.coupling(self.u, part)
-        return matrix if coupling is None else matrix + coupling
+        found = (contact.coupling(self.u, part) for contact in self.contacts)
+        return sum((coupling for coupling in found if coupling is not None), start=matrix)
 
     def _advance(self, part: float, target: float) -> None:
         """Predicts the state at the target along the tangent."""

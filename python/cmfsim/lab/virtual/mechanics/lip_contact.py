@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, signed_distance_image
 from cmfsim.errors import CaseInputError, third_party
-from cmfsim.lab.virtual.mechanics.equilibrium import Contact
+from cmfsim.lab.virtual.mechanics.equilibrium import penalty
 from cmfsim.phantom import PhantomHead
 from cmfsim.phantom.parameters import JawWarp
 from cmfsim.phantom.skull import UPPER_ARCH
@@ -247,7 +247,7 @@ class LipContact:
     """Two lips that push each other apart, without friction.
 
     The nodes of each lip are pushed out of the other with half the pressure, so that neither lip is
-    the master. Pressure depends on depth as in `BoneContact`, but is higher.
+    the master.
 
     points: (n, 3), mm. All nodes at rest, where the lips do not penetrate each other.
     stiffness: MPa/mm.
@@ -287,10 +287,7 @@ class LipContact:
         del part
         total = 0.0
         for touch in self._touches(displacements):
-            d, onset = touch.depth, self.onset
-            shallow = d**3 / (6.0 * onset)
-            deep = 0.5 * (d - 0.5 * onset) ** 2 + onset**2 / 24.0
-            total += 0.5 * float(touch.area @ np.where(d < onset, shallow, deep))
+            total += 0.5 * float(touch.area @ penalty(touch.depth, self.onset)[0])
         return self.stiffness * total
 
     def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
@@ -305,9 +302,7 @@ class LipContact:
 
     def _pressing(self, touch: _Touch) -> Floats:
         """Half of the contact force on each node, (c,) N: the other lip adds its half."""
-        d, onset = touch.depth, self.onset
-        pressure = np.where(d < onset, 0.5 * d**2 / onset, d - 0.5 * onset)
-        return 0.5 * self.stiffness * touch.area * pressure
+        return 0.5 * self.stiffness * touch.area * penalty(touch.depth, self.onset)[1]
 
     def coupling(self, displacements: Floats, part: float) -> Any:
         """∂ forces / ∂ displacements, (3n, 3n) N/mm, with the closest feature of each node frozen.
@@ -317,7 +312,7 @@ class LipContact:
         del part
         rows, columns, data = [], [], []
         for touch in self._touches(displacements):
-            rise = 0.5 * self.stiffness * touch.area * np.minimum(touch.depth / self.onset, 1.0)
+            rise = 0.5 * self.stiffness * touch.area * penalty(touch.depth, self.onset)[2]
             along = rise[:, None, None] * touch.normal[:, :, None] * touch.normal[:, None, :]
             lever = self._pressing(touch) / np.maximum(touch.depth, np.finfo(np.float64).tiny)
             along += lever[:, None, None] * touch.swing
@@ -474,26 +469,3 @@ def _block_matrix(rows: NDArray[np.int64], columns: NDArray[np.int64], data: Flo
     np.add.at(blocks, place.reshape(-1), data)
     starts = np.searchsorted(key // n, np.arange(n + 1))
     return sparse.bsr_array((blocks, key % n, starts), shape=(3 * n, 3 * n))
-
-
-@dataclass(frozen=True, eq=False)
-class ContactSum:
-    """One or more contacts together."""
-
-    contacts: tuple[Contact, ...]
-
-    def energy(self, displacements: Floats, part: float) -> float:
-        """Sum of the energies, N·mm."""
-        return sum(contact.energy(displacements, part) for contact in self.contacts)
-
-    def forces(self, displacements: Floats, part: float) -> tuple[Floats, Floats]:
-        """Sums of the forces, N, and of the nodes' stiffness, N/mm."""
-        found = [contact.forces(displacements, part) for contact in self.contacts]
-        force, blocks = (np.asarray(sum(parts)) for parts in zip(*found, strict=True))
-        return force, blocks
-
-    def coupling(self, displacements: Floats, part: float) -> Any:
-        """Sum of the couplings; None if no contact couples nodes."""
-        found = [contact.coupling(displacements, part) for contact in self.contacts]
-        coupled = [matrix for matrix in found if matrix is not None]
-        return sum(coupled[1:], start=coupled[0]) if coupled else None

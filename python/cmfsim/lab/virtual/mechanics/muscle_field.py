@@ -145,7 +145,6 @@ def _level(muscle: Muscle, asked: Floats, room: float) -> Floats:
     `asked` (t, p, 3) lies in the symmetric head, all places of a tet within `room` mm of its first.
     Only segments that come near a tet are asked.
     """
-    level: Floats | None = None
     middles = asked[:, 0]
     levels: list[Floats] = []
     for tube in muscle.tubes:
