@@ -53,10 +53,10 @@ def found_texts() -> Iterator[Found]:
     """Every text of the package, with its values and its place."""
     for path in sorted(PACKAGE.rglob("*.*")):
         name = path.relative_to(PACKAGE).as_posix()
-        if path.suffix not in {".py", ".js", ".html"}:
+        if path.suffix not in {".py", ".json", ".js", ".html"}:
             continue
         source = path.read_text(encoding="utf-8")
-        if path.suffix == ".py":
+        if path.suffix in {".py", ".json"}:
             yield from _of_python(source, name)
         elif path.suffix == ".js":
             for match in SCRIPT_TEXT.finditer(source):
