@@ -53,10 +53,12 @@ def found_texts() -> Iterator[Found]:
     """Every text of the package, with its values and its place."""
     for path in sorted(PACKAGE.rglob("*.*")):
         name = path.relative_to(PACKAGE).as_posix()
-        if path.suffix not in {".py", ".json", ".js", ".html"}:
+        is_table = path.suffix == ".json" and name.startswith(SHOWN)
+        if path.suffix not in {".py", ".js", ".html"} and not is_table:
             continue
         source = path.read_text(encoding="utf-8")
-        if path.suffix in {".py", ".json"}:
+        if path.suffix == ".py" or is_table:
+            # JSON of texts and numbers reads as Python.
             yield from _of_python(source, name)
         elif path.suffix == ".js":
             for match in SCRIPT_TEXT.finditer(source):
