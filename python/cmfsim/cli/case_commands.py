@@ -170,20 +170,21 @@ def build(options: argparse.Namespace) -> int:
 def case_of(options: argparse.Namespace) -> Case:
     """The case given to a command, with the changes given on the command line."""
     case = Case.load(options.case)
-    if options.edge_length is not None:
+    given = vars(options)
+    if (edge_length := given.get("edge_length")) is not None:
         low, high = EDGE_LENGTHS
-        if not low <= options.edge_length <= high:
+        if not low <= edge_length <= high:
             raise CaseInputError(
-                f"--edge-length is {options.edge_length:g}: must be at least {low:g} and at most "
+                f"--edge-length is {edge_length:g}: must be at least {low:g} and at most "
                 f"{high:g} mm"
             )
-        mesh = dataclasses.replace(case.mesh, edge_length=options.edge_length)
+        mesh = dataclasses.replace(case.mesh, edge_length=edge_length)
         case = dataclasses.replace(case, mesh=mesh)
-    if getattr(options, "plan", None) is not None:
+    if given.get("plan") is not None:
         case = case.with_plan(options.plan)
-    if options.output is not None:
+    if (output := given.get("output")) is not None:
         # A link that the user names is followed, and the folder it leads to is printed.
-        output = options.output.resolve() if options.output.is_symlink() else options.output
+        output = output.resolve() if output.is_symlink() else output
         case = dataclasses.replace(case, output=output)
     return case
 
