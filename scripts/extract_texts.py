@@ -17,6 +17,8 @@ PACKAGE = ROOT / "python/cmfsim"
 SHOWN = ("report", "planning", "desk", "evaluation", "pictures", "cli", "values")
 PROSE = re.compile(r"[^\W\d_]{3,}[,.:;)]? +[(“\"]?[\w{]|\}[,.:;)]* +[a-z]{2,}")
 WORD = re.compile(r"(?!.*\w\.[a-z])(?=.*[^\W\d_]{2})[^\W\d_][^_=/{}<>\\]*")
+# Words in names of files, which nobody is shown.
+WORDS_OF_FILES = frozenset({"drafting/part_words.json"})
 # What the finding table fills in.
 BLANK = re.compile(r"\{\w*(?:!r)?(?::[^}]*)?\}")
 SCRIPT_TEXT = re.compile(r"(?<![\w$])_`")
@@ -53,7 +55,7 @@ def found_texts() -> Iterator[Found]:
     """Every text of the package, with its values and its place."""
     for path in sorted(PACKAGE.rglob("*.*")):
         name = path.relative_to(PACKAGE).as_posix()
-        is_table = path.suffix == ".json" and name.startswith(SHOWN)
+        is_table = path.suffix == ".json" and name not in WORDS_OF_FILES
         if path.suffix not in {".py", ".js", ".html"} and not is_table:
             continue
         source = path.read_text(encoding="utf-8")
