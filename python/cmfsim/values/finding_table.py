@@ -21,12 +21,15 @@ class FindingKind:
 
     severity: "error", "warning" or "note"; several joined by " or " where it depends on the size.
     meaning, why, fix: The fact, its effect on the result, and what to do.
+    several: What several findings have in common, on one line; empty: the worst of them stands for
+        all.
     """
 
     severity: str
     meaning: str
     why: str
     fix: str
+    several: str = ""
 
 
 def filled(text: str, facts: Mapping[str, object]) -> str:
