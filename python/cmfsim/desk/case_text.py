@@ -55,10 +55,7 @@ def open_questions(text: str) -> list[dict[str, Any]]:
 def answered(text: str, line: int, toml: str) -> str:
     """The text with one question answered by TOML; by nothing, the line goes.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) There is no such question; the answer is not one value of TOML.
+    Raises `CaseError`: There is no such question; the answer is not one value of TOML.
     """
     asked = {question["line"]: question for question in open_questions(text)}
     if line not in asked:
@@ -91,13 +88,9 @@ def with_tables(
 ) -> str:
     """The text with other tables in place of some; comments in and below those stay.
 
-    Parameters
-    ----------
-    text : str
-    is_replaced : callable
-        Whether a table goes, by its path and its rows as text.
-    tables : mapping of str to sequence of str
-        The rows of new ones, by their head; they stand where the first one stood, or at the end.
+    is_replaced: Whether a table goes, by its path and its rows as text.
+    tables: The rows of new ones, by their head; they stand where the first one stood, or at the
+        end.
     """
     new = [row for head, rows in tables.items() for row in ("", head, *rows)]
     kept: list[str] = []
@@ -180,10 +173,7 @@ def with_plan(
 def read_as(text: str, file: Path, changed: Sequence[str], before: str) -> Case:
     """The case that a changed text describes, after checks that nothing else has changed.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) It is no valid case; another table reads as something else.
+    Raises `CaseError`: It is no valid case; another table reads as something else.
     """
     try:
         old, new = (toml_module().loads(given) for given in (before, text))

@@ -37,19 +37,10 @@ def cut_preview(
 ) -> dict[str, Any]:
     """What procedures cut: planes as polygons, pieces as half spaces, handles, and problems.
 
-    Parameters
-    ----------
-    cuts : mapping of str to mapping of str to float
-        The options of each procedure that differ from its defaults.
-    landmarks : mapping of str to (3,) float64, mm
-        Of the skull.
-    bones : mapping of str to (v, 3) float64, mm
-        The vertices of each bone.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) An unknown procedure or option, or a value out of its range.
+    cuts: The options of each procedure that differ from its defaults.
+    landmarks: mapping of str to (3,), mm, of the skull.
+    bones: mapping of str to (v, 3), mm. The vertices of each bone.
+    Raises `CaseError`: An unknown procedure or option, or a value out of its range.
     """
     shown: dict[str, Any] = {"planes": [], "pieces": [], "handles": [], "problems": []}
     # What every bone that is left was cut from.

@@ -54,12 +54,8 @@ CHANGED = (
 def desk_server(session: Session, port: int | socket.socket = 0) -> LocalServer:
     """The server of a folder on the desk, which does not run yet.
 
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Starlette or Uvicorn, of the extra `serve`, is not installed.
-    OSError
-        The port is taken.
+    Raises `CaseError`: Starlette or Uvicorn, of the extra `serve`, is not installed.
+    Raises `OSError`: The port is taken.
     """
     calls = Calls(session)
     pages: dict[str, Callable[[], Reply]] = {

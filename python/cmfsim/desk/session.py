@@ -41,13 +41,8 @@ KINDS: Mapping[str, tuple[str, Mapping[str, float]]] = {
 class Session:
     """A folder on the desk: its case file, and what was made of it since the launch.
 
-    Attributes
-    ----------
-    case_file : Path
-    made : dict of str to Answer
-        What "set_up", "open_head", "compute" and "report" gave.
-    reported : str
-        The text of the case file of which the report is.
+    made: What "set_up", "open_head", "compute" and "report" gave.
+    reported: The text of the case file of which the report is.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -103,10 +98,7 @@ class Session:
     def start(self, kind: str) -> None:
         """Starts a work, whose answer is kept in `made`.
 
-        Raises
-        ------
-        RefusedError
-            Another one runs.
+        Raises `RefusedError`: Another one runs.
         """
         with self._asking:
             self._refuse_busy()
@@ -146,10 +138,7 @@ class Session:
     def ask(self, function: str, **arguments: Any) -> Answer:
         """The answer of the worker to a short question.
 
-        Raises
-        ------
-        RefusedError
-            It is at work.
+        Raises `RefusedError`: It is at work.
         """
         with self._asking:
             self._refuse_busy()

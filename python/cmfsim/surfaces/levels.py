@@ -34,18 +34,11 @@ _MADE: WeakKeyDictionary[ImageData, Future[SurfaceData]] = WeakKeyDictionary()
 class SurfaceOptions:
     """Options of the surface of a level.
 
-    Attributes
-    ----------
-    max_triangles : int
-        Surfaces with more are decimated (quadrics; Garland and Heckbert 1997) to about this many.
-    smoothing : int
-        Rounds of Taubin smoothing (1995), which take away the steps of the voxels and keep the
-        volume; 0 for none.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Fewer than 100 triangles, rounds below 0 or above 100.
+    max_triangles: Surfaces with more are decimated (quadrics; Garland and Heckbert 1997) to about
+        this many.
+    smoothing: Rounds of Taubin smoothing (1995), which take away the steps of the voxels and keep
+        the volume; 0 for none.
+    Raises `CaseError`: Fewer than 100 triangles, rounds below 0 or above 100.
     """
 
     max_triangles: int = 30_000
@@ -65,23 +58,10 @@ def surface_of_level(
 
     Marching cubes (Lewiner 2003, scikit-image), smoothed, and decimated where it is too fine.
 
-    Parameters
-    ----------
-    name : str
-        Of the bone, for messages.
-    level : ImageData
-        Positive inside.
-    options : SurfaceOptions, optional
-
-    Returns
-    -------
-    SurfaceData
-        Outward normals, mm.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A level without an inside; scikit-image is missing.
+    name: Of the bone, for messages.
+    level: Positive inside.
+    Returns: Outward normals, mm.
+    Raises `CaseError`: A level without an inside; scikit-image is missing.
     """
     options = options or SurfaceOptions()
     values = level.single
@@ -220,18 +200,9 @@ def _without_slits(
 def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> SurfaceData:
     """The surface with about as many triangles as wanted, open where it was (Garland 1997).
 
-    Parameters
-    ----------
-    name : str
-        For messages.
-    surface : SurfaceData
-    max_triangles : int
-        A surface that has no more is given back as it is.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Nothing is left of the surface.
+    name: For messages.
+    max_triangles: A surface that has no more is given back as it is.
+    Raises `CaseError`: Nothing is left of the surface.
     """
     if len(surface.triangles) <= max_triangles:
         return surface
