@@ -124,12 +124,6 @@ class Text:
         self.lines.append(f"{key} = {value}  # {clean(question)}")
         self.lines += [f"#   {clean(choice)}" for choice in choices]
 
-    def matrix(self, rows: Sequence[Sequence[float]], lead: str = "") -> None:
-        """A 4 × 4 matrix with every digit; `lead` makes it a comment."""
-        self.lines.append(f"{lead}matrix = [")
-        self.lines += [f"{lead}  [{', '.join(repr(float(v)) for v in row)}]," for row in rows]
-        self.lines.append(f"{lead}]")
-
     def __str__(self) -> str:
         """The text of the file."""
         return "\n".join(self.lines) + "\n"

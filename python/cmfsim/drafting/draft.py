@@ -33,6 +33,7 @@ from cmfsim.drafting.written import (
     surface_path,
     unaccounted,
 )
+from cmfsim.io.cases.case_tables import matrix_rows
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.proposed_landmarks import ProposedSite
 
@@ -409,7 +410,7 @@ def _write_motion(text: Text, name: str, motion: motions.DraftMotion) -> None:
         for key, value in motion.typed.items():
             text.value(key, value, TYPED_UNITS[key])
     elif motion.matrix is not None:
-        text.matrix(motion.matrix.tolist(), lead)
+        text.lines += [f"{lead}{row}" for row in matrix_rows(motion.matrix)]
     elif motion.transform and not motion.question:
         text.value("transform", motion.transform)
 

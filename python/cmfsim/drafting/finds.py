@@ -9,7 +9,7 @@ import numpy as np
 
 from cmfsim.drafting.roles import NameRole, name_role
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.images.dicom_series import dicom_places
+from cmfsim.io.images.dicom_series import dicom_places, is_marked
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.images.segmentations import NAMES_FILE, are_labels, read_labels
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file
@@ -47,8 +47,6 @@ OURS = ("prediction.json", "build.json", "metrics.json", "cmfsim-scene.mrml")
 NOT_UTF8 = "its name is not UTF-8, so a case file cannot name it: rename it"
 NOT_HERE = "is a link to a file that is not here: fetch it (with DataLad: datalad get)"
 SEEN = "is a link to a folder that holds this one, or that was read already"
-# What a DICOM file holds after its preamble.
-PREAMBLE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +240,9 @@ def listing(folder: Path) -> Listing:
         kind = next((paths for endings, paths in kinds if name.endswith(endings)), None)
         if kind is not None:
             kind.append(path)
-        elif path.suffix.lower() in NO_SLICES or not (path.parent in dicom or _is_dicom(path)):
+        elif path.suffix.lower() in NO_SLICES or not (
+            path.parent in dicom or (os.access(path, os.R_OK) and is_marked(path))
+        ):
             names = path.name == NAMES_FILE
             found.skip(path, "it has names of labels" if names else "no case reads such files")
         else:
@@ -299,14 +299,6 @@ def _is_utf8(name: str) -> bool:
     except UnicodeEncodeError:
         return False
     return True
-
-
-def _is_dicom(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(PREAMBLE + 4)[PREAMBLE:] == b"DICM"
-    except OSError:
-        return False
 
 
 def surface_find(path: Path, label: str) -> SurfaceFind:
