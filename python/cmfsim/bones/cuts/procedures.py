@@ -19,10 +19,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure
+from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure, free_cut
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.registration.closest import robust_similarity
 from cmfsim.registration.proposed.shape_model.site_covariance import placed_distribution
+from cmfsim.values.case_parts import CaseOsteotomy
 from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, SKULL_LANDMARKS, is_lower_site
@@ -207,6 +208,16 @@ def place_procedure(
     if kind == "le_fort_1" and "height" not in (options or {}):
         findings = (*findings, *_small_head(given, chosen["height"]))
     return Procedure(kind, cuts, chosen, (*estimated, *findings))
+
+
+def placed_cut(cut: CaseOsteotomy, landmarks: Mapping[str, ArrayLike]) -> Procedure:
+    """A cut of a case: its procedure placed from skull landmarks, or its plane."""
+    if cut.procedure is not None:
+        return place_procedure(cut.procedure, landmarks, cut.options)
+    plane = cut.plane
+    if plane is None or cut.bone is None or cut.name is None:  # checked by `CaseOsteotomy`
+        raise AssertionError(cut)
+    return free_cut(cut.bone, cut.name, (CuttingPlane(plane.point, plane.normal),))
 
 
 def _small_head(points: Mapping[str, Floats], height: float) -> Iterator[Finding]:
