@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from cmfsim import _core
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.surfaces.checks import areas_volumes, has_three_corners
+from cmfsim.surfaces.topology import loops_of
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, Indices, as_number, as_positive
 from cmfsim.values.image_data import ImageData
@@ -188,12 +190,7 @@ def _without_slits(
     same = np.arange(len(points))
     same[centred] = centred[first[back.reshape(-1)]]
     joined = same[triangles]
-    kept = (
-        (joined[:, 0] != joined[:, 1])
-        & (joined[:, 1] != joined[:, 2])
-        & (joined[:, 2] != joined[:, 0])
-    )
-    used, left = used_nodes(joined[kept])
+    used, left = used_nodes(joined[has_three_corners(joined)])
     return left, points[used]
 
 
@@ -229,7 +226,8 @@ def _closed(points: Floats, corners: Indices) -> tuple[Floats, NDArray[np.int64]
     lone = ~np.isin(edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0])
     centres: list[Floats] = []
     fans: list[tuple[int, int, int]] = []
-    for loop in _loops(edges[lone][:, ::-1]):
+    borders = edges[lone][:, ::-1]
+    for loop in loops_of(borders, sorted(borders[:, 0].tolist()))[0]:
         centre = n + len(centres)
         centres.append(points[loop].mean(axis=0))
         fans += [(a, b, centre) for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
@@ -243,32 +241,7 @@ def _half_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
-def _loops(edges: NDArray[np.int64]) -> list[list[int]]:
-    """Directed border edges as loops that pass each of their vertices once."""
-    onward: dict[int, list[int]] = {}
-    for a, b in edges.tolist():
-        onward.setdefault(a, []).append(b)
-    loops = []
-    for start in sorted(onward):
-        while onward[start]:
-            path, place = [start], {start: 0}
-            while onward.get(path[-1]):
-                after = onward[path[-1]].pop()
-                if after in place:
-                    # The part since the last visit is a loop by itself.
-                    cut = place[after]
-                    loops.append(path[cut:])
-                    for vertex in path[cut + 1 :]:
-                        del place[vertex]
-                    path = path[: cut + 1]
-                else:
-                    place[after] = len(path)
-                    path.append(after)
-    return loops
-
-
 def _outward(points: Floats, triangles: NDArray[np.int64]) -> Indices:
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    volume = float(np.einsum("na,na->", a, np.cross(b, c))) / 6.0
+    volume = float(areas_volumes(points, triangles)[1].sum())
     corners = triangles if volume > 0.0 else triangles[:, ::-1]
     return cast("Indices", corners.astype(np.uint32))

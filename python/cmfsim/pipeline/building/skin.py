@@ -31,7 +31,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.patient_model import LiftedTissue
 from cmfsim.values.scene import NODE_KINDS, NodeKinds
-from cmfsim.values.surface_data import SurfaceData, triangle_areas, used_nodes
+from cmfsim.values.surface_data import SurfaceData, area_vectors, triangle_areas, used_nodes
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 
 # Held nodes that a body needs: three hold it unless they are in line.
@@ -125,11 +125,9 @@ def find_seam(
 
 def _upwards(surface: SurfaceData) -> SurfaceData:
     """The surface, turned if its normals look down."""
-    vertices, triangles = surface.vertices, surface.triangles
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    if float(np.cross(b - a, c - a)[:, 2].sum()) >= 0.0:
+    if float(area_vectors(surface.vertices, surface.triangles)[:, 2].sum()) >= 0.0:
         return surface
-    return replace(surface, triangles=triangles[:, ::-1])
+    return replace(surface, triangles=surface.triangles[:, ::-1])
 
 
 def separated_at_seam(mesh: TetMesh, kinds: NodeKinds, body: Integers, seam: LipSeam) -> Held:
