@@ -120,8 +120,7 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from cmfsim.cli.case_commands import print_findings  # noqa: PLC0415 (loads numpy)
-    from cmfsim.cli.terminal import FindingsError, print_text  # noqa: PLC0415 (loads numpy)
+    from cmfsim.cli.terminal import FindingsError, print_findings, print_text  # noqa: PLC0415 (loads numpy)
 
     try:
         return int(options.run(options))

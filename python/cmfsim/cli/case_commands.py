@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
@@ -23,11 +23,11 @@ from cmfsim.cli.terminal import (
     argument,
     columns,
     escaped,
-    in_colour,
+    print_findings,
     print_json,
     print_text,
 )
-from cmfsim.doctor import Examination, examine, findings_text
+from cmfsim.doctor import Examination, examine
 from cmfsim.drafting import CASE_FILE, init_case, read_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
@@ -233,13 +233,6 @@ def _plan_values(found: Examination) -> dict[str, Any]:
 
 def _has_errors(findings: Sequence[Finding]) -> bool:
     return any(finding.severity == "error" for finding in findings)
-
-
-def print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
-    """Wrapped and coloured on a terminal; one line per part in a pipe."""
-    width = columns() if stream.isatty() else 0
-    text = findings_text(findings, colour=in_colour(stream), width=width, escape=escaped)
-    print_text(text, file=stream)
 
 
 SURFACES = (".stl", ".ply", ".obj", ".vtp")
