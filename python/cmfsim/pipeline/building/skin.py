@@ -22,7 +22,7 @@ from cmfsim.pipeline.building.case_checks import CaseLipContact, Head
 from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.surfaces.depth import barycentric, distances
-from cmfsim.surfaces.levels import SurfaceOptions, contact_surface, surface_of_level
+from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.surfaces.topology import Integers, connected_labels, edges_of, tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.case_parts import UNITS
@@ -248,18 +248,11 @@ def _obstacles(
             mine = ids[(nearest == number) & (away[number] <= REACH)]
             if not len(mine):
                 continue
-            whole = _sheet(segment, walls)
+            whole = walls.of(segment)
             surface = whole if lip == jaw else _on_teeth(whole, bones)
             if surface is not None:
                 found.append(ObstacleData(mine, segment.name, surface))
     return found
-
-
-def _sheet(segment: BoneSegment, walls: CaseContacts) -> SurfaceData:
-    """The contact sheet of a segment, else the blurred bone."""
-    if segment.name in walls.sheets:
-        return walls.sheets[segment.name].surface
-    return contact_surface(segment)
 
 
 def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | None:
