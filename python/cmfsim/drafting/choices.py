@@ -4,51 +4,16 @@ import os
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
-from cmfsim.drafting.finds import HU_AIR, ImageFind, LandmarkFind, SurfaceFind
+from cmfsim.drafting.finds import HU_AIR, ImageFind, LandmarkFind, SurfaceFind, Taken
 from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
 # Characters of a line before its comment goes to lines of its own.
 WIDTH = 100
-
-
-@dataclass(frozen=True)
-class Taken:
-    """How a file, or a node of a scene, was interpreted.
-
-    Attributes
-    ----------
-    label : str
-        Its path, or its scene and node.
-    taken_for : str
-        Such as "skin" or "motion of maxilla"; "not used"; empty if this is undecided.
-    why : str
-    unit, frame : str
-        If they apply.
-    question : bool
-        Whether a person has to decide something about it.
-    paths : tuple of Path
-        The files that it is about, where its label does not name each.
-    """
-
-    label: str
-    taken_for: str
-    why: str
-    unit: str = ""
-    frame: str = ""
-    question: bool = False
-    paths: tuple[Path, ...] = ()
-
-    def as_dict(self) -> dict[str, object]:
-        """Plain values, ready for JSON."""
-        own = ("taken_for", "unit", "frame", "why", "question")
-        values = {"file": self.label, **{name: getattr(self, name) for name in own}}
-        return {**values, "files": [p.name for p in self.paths]} if self.paths else values
 
 
 def clean(text: str) -> str:

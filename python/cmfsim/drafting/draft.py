@@ -9,16 +9,8 @@ from typing import Any
 import numpy as np
 
 from cmfsim.drafting import motions
-from cmfsim.drafting.choices import (
-    Anatomy,
-    Taken,
-    Text,
-    choose_images,
-    choose_landmarks,
-    legible,
-    quoted,
-)
-from cmfsim.drafting.finds import Gathered, ImageFind, LandmarkFind
+from cmfsim.drafting.choices import Anatomy, Text, choose_images, choose_landmarks, legible, quoted
+from cmfsim.drafting.finds import Gathered, ImageFind, LandmarkFind, Taken
 from cmfsim.drafting.roles import MOVING
 from cmfsim.drafting.surfaces import choose_surfaces
 from cmfsim.drafting.written import (

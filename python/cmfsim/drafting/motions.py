@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cmfsim.drafting.choices import Anatomy, Taken, quoted
-from cmfsim.drafting.finds import LooseMotion, OtherFind, SurfaceFind, TransformFind
+from cmfsim.drafting.choices import Anatomy, quoted
+from cmfsim.drafting.finds import LooseMotion, OtherFind, SurfaceFind, Taken, TransformFind
 from cmfsim.drafting.roles import MOVING, safe_key
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.slicer.transforms import is_itk_file, motion_in_lps, read_transform_file

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.drafting.choices import SAMPLES, TURN, Anatomy, Question, Taken
-from cmfsim.drafting.finds import SurfaceFind
+from cmfsim.drafting.choices import SAMPLES, TURN, Anatomy, Question
+from cmfsim.drafting.finds import SurfaceFind, Taken
 from cmfsim.drafting.roles import JAWS_OF_TEETH, MOVING, safe_key
 from cmfsim.meshing.levels import signed_level
 from cmfsim.surfaces.depth import distances

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.drafting.choices import Anatomy, Images, Marks, Question, Taken, Text, quoted
-from cmfsim.drafting.finds import EXTRACTED, Gathered, ImageFind, LandmarkFind, SurfaceFind
+from cmfsim.drafting.choices import Anatomy, Images, Marks, Question, Text, quoted
+from cmfsim.drafting.finds import EXTRACTED, Gathered, ImageFind, LandmarkFind, SurfaceFind, Taken
 from cmfsim.drafting.motions import Plan
 from cmfsim.drafting.roles import safe_key
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError
