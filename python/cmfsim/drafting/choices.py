@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cmfsim.drafting.finds import HU_AIR, ImageFind, LandmarkFind, SurfaceFind, Taken
+from cmfsim.drafting.finds import HU_AIR, ImageFind, LandmarkFind, SurfaceFind, Taken, unused
 from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
@@ -131,7 +131,7 @@ def choose_images(found: Sequence[ImageFind]) -> Images:
         if not why and find.modality not in {"", "CT"}:
             why = f"its header says {find.modality}, which is not a CT"
         if why:
-            images.taken.append(Taken(find.label, "not used", why))
+            images.taken.append(unused(find.label, why))
         elif not find.role.is_after:
             before.append(find)
         elif images.after is None:
@@ -139,7 +139,7 @@ def choose_images(found: Sequence[ImageFind]) -> Images:
             why = f"by its name; {_said(find)}"
             images.taken.append(Taken(find.label, "CT after the operation", why))
         else:
-            images.taken.append(Taken(find.label, "not used", "a second CT after the operation"))
+            images.taken.append(unused(find.label, "a second CT after the operation"))
     if len(before) == 1:
         images.ct = before[0]
         _check_values(images, before[0])
@@ -227,7 +227,7 @@ def choose_landmarks(found: Sequence[LandmarkFind], box: Floats | None) -> Marks
     for find in found:
         kind, why = _kind(find)
         if not kind:
-            marks.taken.append(Taken(find.label, "not used", why))
+            marks.taken.append(unused(find.label, why))
         else:
             kinds.setdefault(kind, []).append(find)
     for kind, finds in kinds.items():
@@ -235,8 +235,7 @@ def choose_landmarks(found: Sequence[LandmarkFind], box: Floats | None) -> Marks
             setattr(marks, kind, finds[0])
             marks.taken += [_taken(find, kind) for find in finds[:1]]
             marks.taken += [
-                Taken(find.label, "not used", f"a second set of landmarks ({kind})")
-                for find in finds[1:]
+                unused(find.label, f"a second set of landmarks ({kind})") for find in finds[1:]
             ]
             continue
         names = " or ".join(find.label for find in finds)

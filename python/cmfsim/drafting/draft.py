@@ -217,9 +217,9 @@ def _taken(draft: Draft) -> list[Taken]:
     if draft.marks.after is not None and not _has_any_after(draft):
         marks = _without(marks, draft.marks.after, "there is no face after the operation")
     others = [
-        Taken(o.label, "not used", o.why, paths=o.paths)
-        for o in (*draft.found.others, *draft.plan.others)
-        if not o.paths or not set(o.paths) <= set(draft.found.names)
+        other
+        for other in (*draft.found.others, *draft.plan.others)
+        if not other.paths or not set(other.paths) <= set(draft.found.names)
     ]
     others += [
         Taken(draft.found.shown(path), "names of labels", "nnU-Net writes them next to its labels")

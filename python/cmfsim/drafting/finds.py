@@ -178,13 +178,9 @@ class Taken:
         return {**values, "files": [p.name for p in self.paths]} if self.paths else values
 
 
-@dataclass(frozen=True)
-class OtherFind:
+def unused(label: str, why: str, paths: tuple[Path, ...] = ()) -> Taken:
     """What is not used, and why; files of one kind in one folder may share an entry."""
-
-    label: str
-    why: str
-    paths: tuple[Path, ...] = ()
+    return Taken(label, "not used", why, paths=paths)
 
 
 @dataclass
@@ -207,7 +203,7 @@ class Gathered:
     landmarks: list[LandmarkFind] = field(default_factory=list)
     transforms: list[TransformFind] = field(default_factory=list)
     loose: list[LooseMotion] = field(default_factory=list)
-    others: list[OtherFind] = field(default_factory=list)
+    others: list[Taken] = field(default_factory=list)
     seen: list[Path] = field(default_factory=list)
     names: list[Path] = field(default_factory=list)
     scene_files: set[Path] = field(default_factory=set)
@@ -216,6 +212,10 @@ class Gathered:
     def shown(self, path: Path) -> str:
         """A path as the case file will have it."""
         return path.relative_to(self.folder).as_posix()
+
+    def skip(self, what: Path | str, why: str) -> None:
+        """Notes a file, or what is in one, that is not used."""
+        self.others.append(unused(what if isinstance(what, str) else self.shown(what), why))
 
 
 @dataclass
@@ -240,16 +240,16 @@ class Listing:
         """Notes a file or folder that is not read."""
         self.unread.setdefault((path.parent, why), []).append(path)
 
-    def others(self, folder: Path) -> list[OtherFind]:
+    def others(self, folder: Path) -> list[Taken]:
         """What no case reads, with its names."""
         found = []
         for (_, why), paths in self.unread.items():
             names = [path.relative_to(folder).as_posix() for path in paths]
             if len(names) > SHOWN:
                 more = f"{', '.join(names[:SHOWN])} and {len(names) - SHOWN} more"
-                found.append(OtherFind(more, why, tuple(paths)))
+                found.append(unused(more, why, tuple(paths)))
                 continue
-            found += [OtherFind(n, why, (path,)) for n, path in zip(names, paths, strict=True)]
+            found += [unused(n, why, (path,)) for n, path in zip(names, paths, strict=True)]
         return found
 
 
