@@ -13,5 +13,6 @@ from cmfsim.bones.cuts.planes import Procedure as Procedure
 from cmfsim.bones.cuts.planes import free_cut as free_cut
 from cmfsim.bones.cuts.procedures import PROCEDURES as PROCEDURES
 from cmfsim.bones.cuts.procedures import place_procedure as place_procedure
+from cmfsim.bones.cuts.procedures import placed_cut as placed_cut
 from cmfsim.bones.cuts.procedures import procedure_options as procedure_options
 from cmfsim.bones.segment_checks import check_segments as check_segments

@@ -201,7 +201,7 @@ def motion_by_vertices(
     centre: (3,), mm, about which the turn is written. Default: the middle of the vertices before.
     Raises `RegistrationError`: Other triangles; vertices that lie on one line.
     """
-    if not _same_triangles(before, after):
+    if not before.has_triangles_of(after):
         raise RegistrationInputError(
             f"the surfaces have different triangles: {len(before.triangles)} on "
             f"{len(before.vertices)} vertices before, "
@@ -343,7 +343,7 @@ def achieved_plan(
         there = targets[name]
         after = SurfaceData(carried(frame, there.vertices), there.triangles, there.crease_angle)
         centre = (centres or {}).get(name)
-        if _same_triangles(parts[name], after):
+        if parts[name].has_triangles_of(after):
             return measure_pair(parts[name], after, centre=centre, is_still=name == reference)
         others = (*beside, *(part for other, part in parts.items() if other != name))
         bone = Surface(after.vertices, after.triangles, crease_angle=after.crease_angle)
@@ -415,12 +415,6 @@ def _targets(
     for name in parts:
         check_instance(f"post-operative surface of {name!r}", postoperative[name], SurfaceData)
     return postoperative
-
-
-def _same_triangles(one: SurfaceData, other: SurfaceData) -> bool:
-    return len(one.vertices) == len(other.vertices) and np.array_equal(
-        one.triangles, other.triangles
-    )
 
 
 def _centre(centre: ArrayLike | None, vertices: Floats) -> Floats:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import CaseError
+from cmfsim.surfaces.checks import areas_volumes
 from cmfsim.surfaces.levels import block_of
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
@@ -85,7 +86,8 @@ def _check_lies_on_level(segment: BoneSegment, *, is_given: bool) -> None:
     if is_given:
         return
     count = int(np.count_nonzero(inside))
-    ratio = _volume(segment) / (count * float(np.prod(spacing)))
+    volumes = areas_volumes(vertices, segment.surface.triangles.astype(np.int64))[1]
+    ratio = float(volumes.sum()) / (count * float(np.prod(spacing)))
     if count >= LEAST_VOXELS and not VOLUME_RATIO[0] <= ratio <= VOLUME_RATIO[1]:
         raise CaseError(
             f"the surface of segment {segment.name!r} encloses {ratio:.2f} times the volume of its "
@@ -108,14 +110,6 @@ def _on_zero_set(inside: NDArray[np.bool_], places: Floats) -> NDArray[np.bool_]
         some |= found
         every &= found
     return some & ~every
-
-
-def _volume(segment: BoneSegment) -> float:
-    vertices = segment.surface.vertices
-    # Relative to the centre, because rounding far from the origin would count.
-    vertices = vertices - vertices.mean(axis=0)
-    a, b, c = (vertices[segment.surface.triangles[:, k]] for k in range(3))
-    return float(np.einsum("na,na->", a, np.cross(b, c))) / 6.0
 
 
 def _place(point: Floats) -> str:

@@ -95,7 +95,7 @@ def _command(words: Sequence[str], *, is_own: bool) -> int:
 
 def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
     """The options of a command line, or the exit code if it has none."""
-    from cmfsim.cli.parsing import make_parser  # noqa: PLC0415 (loads numpy)
+    from cmfsim.cli.parsing import function_of, make_parser  # noqa: PLC0415 (loads numpy)
 
     parser = make_parser()
     if "--json" not in words:
@@ -115,12 +115,12 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace | int:
     if options.command is None:
         parser.print_help(sys.stderr)
         return BAD_INPUT
+    options.run = function_of(options.run)
     return options
 
 
 def _run(options: argparse.Namespace) -> int:
-    from cmfsim.cli.case_commands import print_findings  # noqa: PLC0415 (loads numpy)
-    from cmfsim.cli.terminal import FindingsError, print_text  # noqa: PLC0415 (loads numpy)
+    from cmfsim.cli.terminal import FindingsError, print_findings, print_text  # noqa: PLC0415 (loads numpy)
 
     try:
         return int(options.run(options))

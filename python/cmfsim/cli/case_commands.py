@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
@@ -23,11 +23,11 @@ from cmfsim.cli.terminal import (
     argument,
     columns,
     escaped,
-    in_colour,
+    print_findings,
     print_json,
     print_text,
 )
-from cmfsim.doctor import Examination, examine, findings_text
+from cmfsim.doctor import Examination, examine
 from cmfsim.drafting import CASE_FILE, init_case, read_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
@@ -170,20 +170,21 @@ def build(options: argparse.Namespace) -> int:
 def case_of(options: argparse.Namespace) -> Case:
     """The case given to a command, with the changes given on the command line."""
     case = Case.load(options.case)
-    if options.edge_length is not None:
+    given = vars(options)
+    if (edge_length := given.get("edge_length")) is not None:
         low, high = EDGE_LENGTHS
-        if not low <= options.edge_length <= high:
+        if not low <= edge_length <= high:
             raise CaseInputError(
-                f"--edge-length is {options.edge_length:g}: must be at least {low:g} and at most "
+                f"--edge-length is {edge_length:g}: must be at least {low:g} and at most "
                 f"{high:g} mm"
             )
-        mesh = dataclasses.replace(case.mesh, edge_length=options.edge_length)
+        mesh = dataclasses.replace(case.mesh, edge_length=edge_length)
         case = dataclasses.replace(case, mesh=mesh)
-    if getattr(options, "plan", None) is not None:
+    if given.get("plan") is not None:
         case = case.with_plan(options.plan)
-    if options.output is not None:
+    if (output := given.get("output")) is not None:
         # A link that the user names is followed, and the folder it leads to is printed.
-        output = options.output.resolve() if options.output.is_symlink() else options.output
+        output = output.resolve() if output.is_symlink() else output
         case = dataclasses.replace(case, output=output)
     return case
 
@@ -232,13 +233,6 @@ def _plan_values(found: Examination) -> dict[str, Any]:
 
 def _has_errors(findings: Sequence[Finding]) -> bool:
     return any(finding.severity == "error" for finding in findings)
-
-
-def print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
-    """Wrapped and coloured on a terminal; one line per part in a pipe."""
-    width = columns() if stream.isatty() else 0
-    text = findings_text(findings, colour=in_colour(stream), width=width, escape=escaped)
-    print_text(text, file=stream)
 
 
 SURFACES = (".stl", ".ply", ".obj", ".vtp")

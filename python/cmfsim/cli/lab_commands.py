@@ -3,7 +3,6 @@
 import argparse
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 from cmfsim.cli import DONE
 from cmfsim.cli.terminal import StageProgress, argument, escaped, print_json, print_text
@@ -29,7 +28,6 @@ from cmfsim.lab.virtual.population import OWN
 from cmfsim.phantom import HeadParameters, make_head
 from cmfsim.values.checks import as_positive
 
-FRONTIER_FOLDER = Path("cmfsim-frontier")
 # Voxel size of the synthetic head's CT, mm.
 PHANTOM_SPACING = 1.0
 

@@ -11,8 +11,14 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli import DONE
-from cmfsim.cli.case_commands import print_findings
-from cmfsim.cli.terminal import StageProgress, escaped, open_page, print_json, print_text
+from cmfsim.cli.terminal import (
+    StageProgress,
+    escaped,
+    open_page,
+    print_findings,
+    print_json,
+    print_text,
+)
 from cmfsim.errors import CmfsimError, LandmarkError
 from cmfsim.io import Case
 from cmfsim.io.landmarks import write_landmarks

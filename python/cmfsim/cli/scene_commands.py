@@ -115,23 +115,21 @@ def info(options: argparse.Namespace) -> int:
     return DONE
 
 
-DEMO_FOLDER = Path("cmfsim-demo")
 # Without muscles or sliding, with muscles, with both.
 DEMO_MODELS = ("H", "M", "M+S")
 
 
 def demo(options: argparse.Namespace) -> int:
     """Predicts the face of the embedded case, writes its report and opens it."""
-    models: tuple[str, ...] = options.models
     begun = time.perf_counter()
     notices = Notices(quiet=options.quiet)
-    each = (f"{work} {model}" for work in ("solving", "writing") for model in models)
+    each = (f"{work} {model}" for work in ("solving", "writing") for model in DEMO_MODELS)
     expected = expected_stages(*each, "writing the comparison", REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         progress.stage("making a head")
         made = write_demo_case(options.folder, edge_length=options.edge_length)
         prepare(made.case, report=True, evaluation=True)
-        written = _work(made, models, progress, notices)
+        written = _work(made, progress, notices)
     notices.found(written.findings)
     name = written.report
     if name is None:
@@ -153,13 +151,11 @@ def demo(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _work(
-    made: DemoCase, models: tuple[str, ...], progress: StageProgress, notices: Notices
-) -> WrittenResults:
+def _work(made: DemoCase, progress: StageProgress, notices: Notices) -> WrittenResults:
     """Predicts by each model, compares with the truth, and writes everything."""
     found = evaluate(
         made.case,
-        models,
+        DEMO_MODELS,
         progress=progress.stage,
         check=False,
         anatomy=made.anatomy,
@@ -168,9 +164,9 @@ def _work(
     return write_results(
         made.case.output,
         found.predictions,
-        models,
+        DEMO_MODELS,
         stage=progress.stage,
         evaluation=lambda: found,
         # The report shows the pictures of the last model alone.
-        pictures=lambda model: model == models[-1],
+        pictures=lambda model: model == DEMO_MODELS[-1],
     )

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.cli import BAD_INPUT, DONE
-from cmfsim.cli.case_commands import print_findings
-from cmfsim.cli.terminal import StageProgress, escaped, print_json, print_text
+from cmfsim.cli.terminal import StageProgress, escaped, print_findings, print_json, print_text
 from cmfsim.errors import CaseInputError
 from cmfsim.muscles.template import (
     MorphedMusculature,

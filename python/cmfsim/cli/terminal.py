@@ -17,7 +17,14 @@ from typing import Any, TextIO
 
 from cmfsim.errors import CmfsimError, error_text
 from cmfsim.pictures import has_screen
-from cmfsim.values.finding import Finding, FindingGroup, counted, grouped, severity_text
+from cmfsim.values.finding import (
+    Finding,
+    FindingGroup,
+    counted,
+    findings_text,
+    grouped,
+    severity_text,
+)
 from cmfsim.values.language import translated
 from cmfsim.values.progress import COUNT, Observer, TimeLeft
 
@@ -183,6 +190,13 @@ def in_colour(stream: TextIO) -> bool:
 def columns() -> int:
     """The width of the terminal, in characters."""
     return shutil.get_terminal_size().columns
+
+
+def print_findings(findings: Sequence[Finding], stream: TextIO) -> None:
+    """Wrapped and coloured on a terminal; one line per part in a pipe."""
+    width = columns() if stream.isatty() else 0
+    text = findings_text(findings, colour=in_colour(stream), width=width, escape=escaped)
+    print_text(text, file=stream)
 
 
 class FindingsError(Exception):

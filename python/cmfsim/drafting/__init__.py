@@ -12,9 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
-from cmfsim.drafting.choices import Taken
 from cmfsim.drafting.draft import CaseDraft, draft_case
-from cmfsim.drafting.finds import CASE_FILE, EXTRACTED
+from cmfsim.drafting.finds import CASE_FILE, EXTRACTED, Taken
 from cmfsim.drafting.gathering import gather
 from cmfsim.drafting.motions import TypedPlan, read_moves
 from cmfsim.drafting.written import check_written

@@ -4,51 +4,16 @@ import os
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
-from cmfsim.drafting.finds import HU_AIR, ImageFind, LandmarkFind, SurfaceFind
+from cmfsim.drafting.finds import HU_AIR, ImageFind, LandmarkFind, SurfaceFind, Taken, unused
 from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS
 
 # Characters of a line before its comment goes to lines of its own.
 WIDTH = 100
-
-
-@dataclass(frozen=True)
-class Taken:
-    """How a file, or a node of a scene, was interpreted.
-
-    Attributes
-    ----------
-    label : str
-        Its path, or its scene and node.
-    taken_for : str
-        Such as "skin" or "motion of maxilla"; "not used"; empty if this is undecided.
-    why : str
-    unit, frame : str
-        If they apply.
-    question : bool
-        Whether a person has to decide something about it.
-    paths : tuple of Path
-        The files that it is about, where its label does not name each.
-    """
-
-    label: str
-    taken_for: str
-    why: str
-    unit: str = ""
-    frame: str = ""
-    question: bool = False
-    paths: tuple[Path, ...] = ()
-
-    def as_dict(self) -> dict[str, object]:
-        """Plain values, ready for JSON."""
-        own = ("taken_for", "unit", "frame", "why", "question")
-        values = {"file": self.label, **{name: getattr(self, name) for name in own}}
-        return {**values, "files": [p.name for p in self.paths]} if self.paths else values
 
 
 def clean(text: str) -> str:
@@ -124,12 +89,6 @@ class Text:
         self.lines.append(f"{key} = {value}  # {clean(question)}")
         self.lines += [f"#   {clean(choice)}" for choice in choices]
 
-    def matrix(self, rows: Sequence[Sequence[float]], lead: str = "") -> None:
-        """A 4 × 4 matrix with every digit; `lead` makes it a comment."""
-        self.lines.append(f"{lead}matrix = [")
-        self.lines += [f"{lead}  [{', '.join(repr(float(v)) for v in row)}]," for row in rows]
-        self.lines.append(f"{lead}]")
-
     def __str__(self) -> str:
         """The text of the file."""
         return "\n".join(self.lines) + "\n"
@@ -172,7 +131,7 @@ def choose_images(found: Sequence[ImageFind]) -> Images:
         if not why and find.modality not in {"", "CT"}:
             why = f"its header says {find.modality}, which is not a CT"
         if why:
-            images.taken.append(Taken(find.label, "not used", why))
+            images.taken.append(unused(find.label, why))
         elif not find.role.is_after:
             before.append(find)
         elif images.after is None:
@@ -180,7 +139,7 @@ def choose_images(found: Sequence[ImageFind]) -> Images:
             why = f"by its name; {_said(find)}"
             images.taken.append(Taken(find.label, "CT after the operation", why))
         else:
-            images.taken.append(Taken(find.label, "not used", "a second CT after the operation"))
+            images.taken.append(unused(find.label, "a second CT after the operation"))
     if len(before) == 1:
         images.ct = before[0]
         _check_values(images, before[0])
@@ -268,7 +227,7 @@ def choose_landmarks(found: Sequence[LandmarkFind], box: Floats | None) -> Marks
     for find in found:
         kind, why = _kind(find)
         if not kind:
-            marks.taken.append(Taken(find.label, "not used", why))
+            marks.taken.append(unused(find.label, why))
         else:
             kinds.setdefault(kind, []).append(find)
     for kind, finds in kinds.items():
@@ -276,8 +235,7 @@ def choose_landmarks(found: Sequence[LandmarkFind], box: Floats | None) -> Marks
             setattr(marks, kind, finds[0])
             marks.taken += [_taken(find, kind) for find in finds[:1]]
             marks.taken += [
-                Taken(find.label, "not used", f"a second set of landmarks ({kind})")
-                for find in finds[1:]
+                unused(find.label, f"a second set of landmarks ({kind})") for find in finds[1:]
             ]
             continue
         names = " or ".join(find.label for find in finds)

@@ -9,16 +9,8 @@ from typing import Any
 import numpy as np
 
 from cmfsim.drafting import motions
-from cmfsim.drafting.choices import (
-    Anatomy,
-    Taken,
-    Text,
-    choose_images,
-    choose_landmarks,
-    legible,
-    quoted,
-)
-from cmfsim.drafting.finds import Gathered, ImageFind, LandmarkFind
+from cmfsim.drafting.choices import Anatomy, Text, choose_images, choose_landmarks, legible, quoted
+from cmfsim.drafting.finds import Gathered, ImageFind, LandmarkFind, Taken
 from cmfsim.drafting.roles import MOVING
 from cmfsim.drafting.surfaces import choose_surfaces
 from cmfsim.drafting.written import (
@@ -33,6 +25,7 @@ from cmfsim.drafting.written import (
     surface_path,
     unaccounted,
 )
+from cmfsim.io.cases.case_tables import matrix_rows
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.proposed_landmarks import ProposedSite
 
@@ -224,9 +217,9 @@ def _taken(draft: Draft) -> list[Taken]:
     if draft.marks.after is not None and not _has_any_after(draft):
         marks = _without(marks, draft.marks.after, "there is no face after the operation")
     others = [
-        Taken(o.label, "not used", o.why, paths=o.paths)
-        for o in (*draft.found.others, *draft.plan.others)
-        if not o.paths or not set(o.paths) <= set(draft.found.names)
+        other
+        for other in (*draft.found.others, *draft.plan.others)
+        if not other.paths or not set(other.paths) <= set(draft.found.names)
     ]
     others += [
         Taken(draft.found.shown(path), "names of labels", "nnU-Net writes them next to its labels")
@@ -409,7 +402,7 @@ def _write_motion(text: Text, name: str, motion: motions.DraftMotion) -> None:
         for key, value in motion.typed.items():
             text.value(key, value, TYPED_UNITS[key])
     elif motion.matrix is not None:
-        text.matrix(motion.matrix.tolist(), lead)
+        text.lines += [f"{lead}{row}" for row in matrix_rows(motion.matrix)]
     elif motion.transform and not motion.question:
         text.value("transform", motion.transform)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from cmfsim.drafting.roles import NameRole, name_role
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io.images.dicom_series import dicom_places
+from cmfsim.io.images.dicom_series import dicom_places, is_marked
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.images.segmentations import NAMES_FILE, are_labels, read_labels
 from cmfsim.io.landmarks import LandmarkFile, read_landmark_file
@@ -47,8 +47,6 @@ OURS = ("prediction.json", "build.json", "metrics.json", "cmfsim-scene.mrml")
 NOT_UTF8 = "its name is not UTF-8, so a case file cannot name it: rename it"
 NOT_HERE = "is a link to a file that is not here: fetch it (with DataLad: datalad get)"
 SEEN = "is a link to a folder that holds this one, or that was read already"
-# What a DICOM file holds after its preamble.
-PREAMBLE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +145,42 @@ class LooseMotion:
 
 
 @dataclass(frozen=True)
-class OtherFind:
-    """What is not used, and why; files of one kind in one folder may share an entry."""
+class Taken:
+    """How a file, or a node of a scene, was interpreted.
+
+    Attributes
+    ----------
+    label : str
+        Its path, or its scene and node.
+    taken_for : str
+        Such as "skin" or "motion of maxilla"; "not used"; empty if this is undecided.
+    why : str
+    unit, frame : str
+        If they apply.
+    question : bool
+        Whether a person has to decide something about it.
+    paths : tuple of Path
+        The files that it is about, where its label does not name each.
+    """
 
     label: str
+    taken_for: str
     why: str
+    unit: str = ""
+    frame: str = ""
+    question: bool = False
     paths: tuple[Path, ...] = ()
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values, ready for JSON."""
+        own = ("taken_for", "unit", "frame", "why", "question")
+        values = {"file": self.label, **{name: getattr(self, name) for name in own}}
+        return {**values, "files": [p.name for p in self.paths]} if self.paths else values
+
+
+def unused(label: str, why: str, paths: tuple[Path, ...] = ()) -> Taken:
+    """What is not used, and why; files of one kind in one folder may share an entry."""
+    return Taken(label, "not used", why, paths=paths)
 
 
 @dataclass
@@ -175,7 +203,7 @@ class Gathered:
     landmarks: list[LandmarkFind] = field(default_factory=list)
     transforms: list[TransformFind] = field(default_factory=list)
     loose: list[LooseMotion] = field(default_factory=list)
-    others: list[OtherFind] = field(default_factory=list)
+    others: list[Taken] = field(default_factory=list)
     seen: list[Path] = field(default_factory=list)
     names: list[Path] = field(default_factory=list)
     scene_files: set[Path] = field(default_factory=set)
@@ -184,6 +212,10 @@ class Gathered:
     def shown(self, path: Path) -> str:
         """A path as the case file will have it."""
         return path.relative_to(self.folder).as_posix()
+
+    def skip(self, what: Path | str, why: str) -> None:
+        """Notes a file, or what is in one, that is not used."""
+        self.others.append(unused(what if isinstance(what, str) else self.shown(what), why))
 
 
 @dataclass
@@ -208,16 +240,16 @@ class Listing:
         """Notes a file or folder that is not read."""
         self.unread.setdefault((path.parent, why), []).append(path)
 
-    def others(self, folder: Path) -> list[OtherFind]:
+    def others(self, folder: Path) -> list[Taken]:
         """What no case reads, with its names."""
         found = []
         for (_, why), paths in self.unread.items():
             names = [path.relative_to(folder).as_posix() for path in paths]
             if len(names) > SHOWN:
                 more = f"{', '.join(names[:SHOWN])} and {len(names) - SHOWN} more"
-                found.append(OtherFind(more, why, tuple(paths)))
+                found.append(unused(more, why, tuple(paths)))
                 continue
-            found += [OtherFind(n, why, (path,)) for n, path in zip(names, paths, strict=True)]
+            found += [unused(n, why, (path,)) for n, path in zip(names, paths, strict=True)]
         return found
 
 
@@ -242,7 +274,9 @@ def listing(folder: Path) -> Listing:
         kind = next((paths for endings, paths in kinds if name.endswith(endings)), None)
         if kind is not None:
             kind.append(path)
-        elif path.suffix.lower() in NO_SLICES or not (path.parent in dicom or _is_dicom(path)):
+        elif path.suffix.lower() in NO_SLICES or not (
+            path.parent in dicom or (os.access(path, os.R_OK) and is_marked(path))
+        ):
             names = path.name == NAMES_FILE
             found.skip(path, "it has names of labels" if names else "no case reads such files")
         else:
@@ -299,14 +333,6 @@ def _is_utf8(name: str) -> bool:
     except UnicodeEncodeError:
         return False
     return True
-
-
-def _is_dicom(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(PREAMBLE + 4)[PREAMBLE:] == b"DICM"
-    except OSError:
-        return False
 
 
 def surface_find(path: Path, label: str) -> SurfaceFind:

@@ -49,20 +49,16 @@ def gather(
                 progress(f"reading {found.shown(path)}")
                 _read(found, path, finds.surface_find, found.surfaces)
             else:
-                why = f"the scene {found.scene} does not have it"
-                found.others.append(finds.OtherFind(found.shown(path), why))
-        found.others += [
-            finds.OtherFind(found.shown(path), f"the scene {found.scene} does not have it")
-            for path in rest(paths.transforms)
-        ]
+                found.skip(path, f"the scene {found.scene} does not have it")
+        for path in rest(paths.transforms):
+            found.skip(path, f"the scene {found.scene} does not have it")
     else:
         _gather_files(found, paths, progress)
     # Landmarks of a scene come before those of files.
     has_marks = bool(found.landmarks)
     for path in rest(paths.markups):
         if has_marks and not name_role(path.name).is_after:
-            why = f"the scene {found.scene} has landmarks of its own"
-            found.others.append(finds.OtherFind(found.shown(path), why))
+            found.skip(path, f"the scene {found.scene} has landmarks of its own")
         else:
             _read(found, path, finds.landmark_find, found.landmarks)
     # A folder of DICOM is named last where it is the case's own: it holds all else as well.
@@ -86,17 +82,15 @@ def _gather_images(
     for path, series in places:
         label = found.shown(path) + ("" if series is None else f" (series {series})")
         if has_ct and not name_role(path.name).is_after:
-            found.others.append(finds.OtherFind(label, f"the scene {found.scene} has another CT"))
+            found.skip(label, f"the scene {found.scene} has another CT")
         elif path not in read:
             why = f"more than {MAX_IMAGES} images, and its name is none of a head's part: not read"
-            found.others.append(finds.OtherFind(label, why))
+            found.skip(label, why)
         else:
             progress(f"reading {label}")
             image = finds.image_find(path, label, series)
             if image.is_labels and found.scene and not image.role.is_after:
-                found.others.append(
-                    finds.OtherFind(label, f"the scene {found.scene} does not have it")
-                )
+                found.skip(label, f"the scene {found.scene} does not have it")
             elif image.is_labels:
                 labels.append((path, label))
             else:
@@ -128,22 +122,17 @@ def _gather_scene(
         scene = next(iter(paths.scenes), None)
     if scene is None:
         return
-    found.others += [
-        finds.OtherFind(found.shown(path), "another scene was given")
-        for path in paths.scenes
-        if not path.samefile(scene)
-    ]
+    for path in (path for path in paths.scenes if not path.samefile(scene)):
+        found.skip(path, "another scene was given")
     found.scene = found.shown(scene)
     progress(f"reading {found.scene}")
     bundled = scene.suffix.lower() == ".mrb"
     file = unpack_bundle(scene, unpacked) if bundled else scene
     scene_finds(found, read_slicer_scene(file), found.scene)
     if bundled:
-        found.others += [
-            finds.OtherFind(f"{found.scene}: {path.relative_to(unpacked).as_posix()}", NOT_NAMED)
-            for path in sorted(unpacked.rglob("*"))
-            if path.is_file() and path != file and path.resolve() not in found.scene_files
-        ]
+        for path in sorted(unpacked.rglob("*")):
+            if path.is_file() and path != file and path.resolve() not in found.scene_files:
+                found.skip(f"{found.scene}: {path.relative_to(unpacked).as_posix()}", NOT_NAMED)
 
 
 def _gather_files(
@@ -162,7 +151,7 @@ def _gather_files(
         label = found.shown(path)
         role = name_role(path.name[: -len(path.suffix)])
         if path.suffix.lower() == ".txt" and not _is_matrix(path):
-            found.others.append(finds.OtherFind(label, "is no transform: not 16 numbers"))
+            found.skip(label, "is no transform: not 16 numbers")
             continue
         found.transforms.append(finds.TransformFind(label, role, path))
 
@@ -174,7 +163,7 @@ def _read(
     try:
         into.append(read(path, label))
     except (CmfsimError, OSError) as error:
-        found.others.append(finds.OtherFind(label, f"cannot be read: {error}"))
+        found.skip(label, f"cannot be read: {error}")
 
 
 def _is_matrix(path: Path) -> bool:

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cmfsim.drafting.choices import Anatomy, Taken, quoted
-from cmfsim.drafting.finds import LooseMotion, OtherFind, SurfaceFind, TransformFind
+from cmfsim.drafting.choices import Anatomy, quoted
+from cmfsim.drafting.finds import LooseMotion, SurfaceFind, Taken, TransformFind, unused
 from cmfsim.drafting.roles import MOVING, safe_key
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.slicer.transforms import is_itk_file, motion_in_lps, read_transform_file
@@ -66,7 +66,7 @@ class Plan:
     landmarks: Mapping[str, Floats]
     motions: dict[str, DraftMotion] = field(default_factory=dict)
     taken: list[Taken] = field(default_factory=list)
-    others: list[OtherFind] = field(default_factory=list)
+    others: list[Taken] = field(default_factory=list)
     links: set[str] = field(default_factory=set)
     sites: Mapping[str, ProposedSite] = field(default_factory=dict)
 
@@ -179,7 +179,7 @@ def _add_loose(plan: Plan, motion: LooseMotion) -> None:
     name = motion.role.part
     if name not in MOVING or name in plan.motions or motion.role.registers:
         why = "the scene does not apply this transform to any model"
-        plan.others.append(OtherFind(motion.label, why))
+        plan.others.append(unused(motion.label, why))
         return
     words = plan.words(name, motion.matrix)
     question = f"{motion.label} is not applied to any model: was it hardened, or is it the plan?"
@@ -204,7 +204,7 @@ def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool)
             by_part.setdefault(part, []).append(find)
         elif find.role.registers:
             why = "its name suggests a registration, not a plan"
-            plan.taken.append(Taken(find.label, "not used", why))
+            plan.taken.append(unused(find.label, why))
         else:
             _ask_segment(plan, find)
     for name, finds in by_part.items():
@@ -219,7 +219,7 @@ def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool)
         try:
             motion = _of_file(plan, name, find, by_slicer=by_slicer)
         except (CmfsimError, OSError) as error:
-            plan.others.append(OtherFind(find.label, f"is not a rigid motion of {name}: {error}"))
+            plan.others.append(unused(find.label, f"is not a rigid motion of {name}: {error}"))
             text = f"{find.label} cannot be used: {error}"
             plan.motions[name] = DraftMotion("", (), None, '"?"', text, ("or remove this table",))
             continue

@@ -1,87 +1,28 @@
 """The part of a head that the name of a file or of a scene's node refers to."""
 
 import itertools
+import json
 import re
 import unicodedata
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 
 # Words that programs and people use, without accents: English, then German, French, Spanish,
 # Italian and Dutch. "schaedel" and "schadel" are the two ways to write an umlaut without it.
-# Parts that are no bone of a case.
-NO_BONE = frozenset(
-    ("canal", "airway", "sinus", "tongue", "muscle", "muscles", "plate", "plates", "pulp")
-    + ("screw", "screws", "splint", "guide", "plane", "planes", "eye", "eyes", "brain", "vertebra")
-    + ("vertebrae", "spine", "cartilage", "implant", "couch", "predicted", "bridge", "pharynx")
-    + ("kanal", "atemweg", "zunge", "muskel", "platte", "schiene", "hirn", "gehirn", "nerv")
-    + ("wirbel", "wirbelsaule", "wirbelsaeule", "knorpel", "implantat", "langue", "lengua")
-)
-TEETH = frozenset(
-    ("teeth", "tooth", "incisor", "canine", "premolar", "molar", "dentition")
-    + ("zahn", "zahne", "zaehne", "zahnreihe", "dent", "dents", "diente", "dientes", "dente")
-    + ("denti", "tand", "tanden", "gebit")
-)
-JOINING = frozenset(["with", "and", "including", "incl", "mit", "und", "avec", "et", "con", "met"])
-UPPER = frozenset(
-    ("upper", "maxillary", "maxilla", "oben", "obere", "oberer", "oberkiefer")
-    + ("superieur", "superieure", "superieures", "sup", "superior", "superiores", "superiore")
-    + ("superiori", "boven", "bovenste", "bovenkaak")
-)
-LOWER = frozenset(
-    ("lower", "mandibular", "mandible", "unten", "untere", "unterer", "unterkiefer")
-    + ("inferieur", "inferieure", "inferieures", "inf", "inferior", "inferiores", "inferiore")
-    + ("inferiori", "onder", "onderste", "onderkaak")
-)
+# "no_bone" are parts that are no bone of a case, "either_jaw" words for the lower jaw where
+# "inferior" stands with them, "registers" those of a transform that moves no bone.
+KNOWN: Mapping[str, frozenset[str]] = {
+    name: frozenset(" ".join(rows).split())
+    for name, rows in json.loads(
+        files("cmfsim.drafting").joinpath("part_words.json").read_text(encoding="utf-8")
+    ).items()
+}
 # The first of these that a head has holds the row of teeth.
 JAWS_OF_TEETH = {
     "upper teeth": ("maxilla", "midface", "cranium", "bone"),
     "lower teeth": ("mandible", "mandible_body", "bone"),
 }
-AFTER = frozenset(
-    ("post", "postop", "postoperative", "after", "achieved", "postsurgery", "postsurgical")
-    + ("postoperativ", "nachher", "nach", "apres", "postoperatoire", "despues", "dopo")
-    + ("postoperatief",)
-)
-SKIN = frozenset(
-    ("skin", "face", "softtissue", "softtissues", "epidermis", "soft", "haut", "gesicht")
-    + ("gesichtshaut", "weichteil", "weichteile", "weichgewebe", "peau", "visage", "piel", "cara")
-    + ("pelle", "cute", "viso", "huid", "gezicht")
-)
-CRANIUM = frozenset(
-    ("cranium", "cranial", "skull", "neurocranium", "schadel", "schaedel", "hirnschadel")
-    + ("hirnschaedel", "crane", "craneo", "cranio", "teschio", "schedel")
-)
-MANDIBLE = frozenset(
-    ("mandible", "mandibula", "mandibular", "jaw", "unterkiefer", "unterkieferknochen")
-    + ("mandibule", "mandibulaire", "mandibola", "mandibolare", "onderkaak")
-)
-MAXILLA = frozenset(
-    ("maxilla", "maxillary", "lefort", "lefort1", "lf1", "upperjaw", "upperjawbone")
-    + ("oberkiefer", "oberkieferknochen", "maxillaire", "maxilar", "mascella", "bovenkaak")
-)
-MIDFACE = frozenset(["midface", "lefort3", "lf3", "mittelgesicht"])
-CHIN = frozenset(["chin", "genio", "genioplasty", "kinn", "kinnplastik", "menton", "mento", "kin"])
-RAMUS = frozenset(
-    ("ramus", "proximal", "condyle", "condylar", "proximales", "kieferast", "unterkieferast")
-    + ("gelenkfortsatz", "kondylus", "branche", "rama", "ramo", "condilo")
-)
-JAW = frozenset(["jaw", "jawbone", "kiefer", "machoire", "mascellare", "kaak"])
-DISTAL = frozenset(["distal", "distales"])
-BODY = frozenset(["body", "corpus", "korper", "koerper", "corps", "cuerpo", "corpo", "lichaam"])
-# Of the lower jaw, where "inferior" stands with them.
-EITHER_JAW = frozenset(["maxillaire", "maxilar"])
-BONE = frozenset(["bone", "bones", "skeleton", "knochen", "skelett", "hueso", "osso"])
-LEFT = frozenset(
-    ("left", "l", "lt", "links", "linke", "linker", "linkes", "gauche", "izquierda")
-    + ("izquierdo", "sinistra", "sinistro")
-)
-RIGHT = frozenset(
-    ("right", "r", "rt", "rechts", "rechte", "rechter", "rechtes", "droit", "droite", "derecha")
-    + ("derecho", "destra", "destro")
-)
-# Words of a transform that brings data together, and moves no bone.
-REGISTERS = frozenset(
-    ("registration", "register", "registered", "align", "alignment", "aligned", "icp")
-)
 # Segments that a plan may move; the cranium holds the head.
 MOVING = ("maxilla", "midface", "mandible", "mandible_body", "ramus_left", "ramus_right", "chin")
 # A name in two cases, or with digits, holds several words.
@@ -120,7 +61,7 @@ def name_role(name: str) -> NameRole:
     triples = [a + b for a, b in zip(pairs, words[2:], strict=False)]
     found = {*words, *pairs, *triples}
     part, word = _part(found)
-    return NameRole(part, bool(found & AFTER), bool(found & REGISTERS), word)
+    return NameRole(part, bool(found & KNOWN["after"]), bool(found & KNOWN["registers"]), word)
 
 
 def _part(words: set[str]) -> tuple[str, str]:
@@ -129,41 +70,42 @@ def _part(words: set[str]) -> tuple[str, str]:
     def said(known: frozenset[str]) -> str:
         return min(words & known, default="")
 
-    if word := said(NO_BONE):
+    if word := said(KNOWN["no_bone"]):
         return "other", word
-    if word := said(TEETH):
+    if word := said(KNOWN["teeth"]):
         # "Mandible with teeth" is the bone, "mandibular teeth" are its teeth.
-        bone = _part(words - TEETH - JOINING) if words & JOINING else ("", "")
+        rest = words - KNOWN["teeth"] - KNOWN["joining"] if words & KNOWN["joining"] else set()
+        bone = _part(rest)
         return bone if bone[0] else (_row(words), word)
-    if word := said(CHIN):
+    if word := said(KNOWN["chin"]):
         return "chin", word
-    if word := said(RAMUS):
-        left, right = bool(words & LEFT), bool(words & RIGHT)
+    if word := said(KNOWN["ramus"]):
+        left, right = bool(words & KNOWN["left"]), bool(words & KNOWN["right"])
         if left != right:
             return ("ramus_left" if left else "ramus_right"), word
         return "", word
-    if words & MANDIBLE and (word := said(DISTAL | BODY)):
+    if words & KNOWN["mandible"] and (word := said(KNOWN["distal"] | KNOWN["body"])):
         return "mandible_body", word
-    if word := said(CRANIUM):
+    if word := said(KNOWN["cranium"]):
         return "cranium", word
-    if word := said(MIDFACE):
+    if word := said(KNOWN["midface"]):
         return "midface", word
-    if words & LOWER and (word := said(EITHER_JAW)):
+    if words & KNOWN["lower"] and (word := said(KNOWN["either_jaw"])):
         return "mandible", word
-    for part, known, side in (("maxilla", MAXILLA, UPPER), ("mandible", MANDIBLE, LOWER)):
-        if word := said(known - {"jaw"}):
+    for part, side in (("maxilla", "upper"), ("mandible", "lower")):
+        if word := said(KNOWN[part] - {"jaw"}):
             return part, word
-        if words & side and (word := said(JAW)):
+        if words & KNOWN[side] and (word := said(KNOWN["jaw"])):
             return part, word
     if "jaw" in words:
         return "mandible", "jaw"
-    if word := said(DISTAL):
+    if word := said(KNOWN["distal"]):
         return "mandible_body", word
-    if word := said(SKIN):
+    if word := said(KNOWN["skin"]):
         return "skin", word
     if "head" in words:
         return "skin", "head"
-    if word := said(BONE):
+    if word := said(KNOWN["bone"]):
         return "bone", word
     return "", ""
 
@@ -171,8 +113,8 @@ def _part(words: set[str]) -> tuple[str, str]:
 def _row(words: set[str]) -> str:
     """Upper or lower teeth, by words or by the numbers of teeth; else "teeth"."""
     quadrants = {word[0] for word in words if TOOTH_NUMBER.fullmatch(word)}
-    upper = bool(words & UPPER) or bool(quadrants & set(UPPER_QUADRANTS))
-    lower = bool(words & LOWER) or bool(quadrants - set(UPPER_QUADRANTS))
+    upper = bool(words & KNOWN["upper"]) or bool(quadrants & set(UPPER_QUADRANTS))
+    lower = bool(words & KNOWN["lower"]) or bool(quadrants - set(UPPER_QUADRANTS))
     if upper == lower:
         return "teeth"
     return "upper teeth" if upper else "lower teeth"

@@ -52,7 +52,7 @@ class _Mask:
 
 def segment_finds(
     files: Sequence[tuple[Path, str]],
-) -> tuple[list[finds.SurfaceFind], list[finds.OtherFind]]:
+) -> tuple[list[finds.SurfaceFind], list[finds.Taken]]:
     """The segments of files that may be skin, bone or teeth, each as a surface, and the others.
 
     Teeth are added to the jaw that their name says, where both have the same grid; so are the bones
@@ -62,12 +62,12 @@ def segment_finds(
         segment that is named after its file.
     """
     masks: list[_Mask] = []
-    others: list[finds.OtherFind] = []
+    others: list[finds.Taken] = []
     for path, label in files:
         try:
             own, dropped = _masks(path, label)
         except (CmfsimError, OSError) as error:
-            others.append(finds.OtherFind(label, f"cannot be read: {error}"))
+            others.append(finds.unused(label, f"cannot be read: {error}"))
             continue
         masks += own
         others += dropped
@@ -83,7 +83,7 @@ def segment_finds(
     return surfaces, others
 
 
-def _masks(path: Path, label: str) -> tuple[list[_Mask], list[finds.OtherFind]]:
+def _masks(path: Path, label: str) -> tuple[list[_Mask], list[finds.Taken]]:
     """The segments of a file that may be part of a case, and the others."""
     is_slicers = path.name.lower().endswith(finds.LABELS)
     read = read_segmentation(path) if is_slicers else read_labels(path)
@@ -94,15 +94,15 @@ def _masks(path: Path, label: str) -> tuple[list[_Mask], list[finds.OtherFind]]:
         shown = label if alone else f"{label} / {segment.name}"
         if role.part == "other":
             why = f"its name contains {role.word!r}, which is not a bone of a case"
-            others.append(finds.OtherFind(shown, why))
+            others.append(finds.unused(shown, why))
         elif not (read.labels[segment.layer] == segment.label).any():
-            others.append(finds.OtherFind(shown, "is empty: it has no voxel"))
+            others.append(finds.unused(shown, "is empty: it has no voxel"))
         else:
             masks.append(_Mask(shown, role, path, segment, read, alone))
     return masks, others
 
 
-def _named(masks: Sequence[_Mask]) -> tuple[list[_Mask], list[finds.OtherFind]]:
+def _named(masks: Sequence[_Mask]) -> tuple[list[_Mask], list[finds.Taken]]:
     """The masks without those of organs, of which there are many, and with names of their own."""
     unnamed = [mask for mask in masks if not mask.role.part]
     if len(unnamed) == len(masks):
@@ -110,7 +110,7 @@ def _named(masks: Sequence[_Mask]) -> tuple[list[_Mask], list[finds.OtherFind]]:
     organs = unnamed if len(unnamed) > MOST_UNNAMED else [m for m in unnamed if m.is_alone]
     why = "its name is none of skin, bone or teeth, and others have such names"
     left = [mask for mask in masks if mask not in organs]
-    return left, [finds.OtherFind(mask.label, why) for mask in organs]
+    return left, [finds.unused(mask.label, why) for mask in organs]
 
 
 def _jaw_of(teeth: _Mask, masks: Sequence[_Mask]) -> _Mask | None:
@@ -186,18 +186,18 @@ def scene_finds(found: finds.Gathered, scene: SlicerScene, label: str) -> None:
             why = f"no case uses a {node.tag} of 3D Slicer"
             if node.name.endswith(SLICE_MODELS):
                 why = "it is a plane in which Slicer shows the image"
-            found.others.append(finds.OtherFind(shown, why))
+            found.skip(shown, why)
             continue
         if node.file is None or node.missing:
             why = node.missing or "the scene names no file for it: save the scene with its data"
-            found.others.append(finds.OtherFind(shown, why))
+            found.skip(shown, why)
             continue
         try:
             _add(found, scene, node, shown)
         except (CmfsimError, OSError) as error:
             if node.kind == "model" and name_role(node.name).part not in {"", "other"}:
                 raise
-            found.others.append(finds.OtherFind(shown, str(error)))
+            found.skip(shown, str(error))
     _add_loose(found, scene, label)
 
 
@@ -245,6 +245,6 @@ def _add_loose(found: finds.Gathered, scene: SlicerScene, label: str) -> None:
         try:
             matrix = scene.to_parent(node)
         except CmfsimError as error:
-            found.others.append(finds.OtherFind(shown, str(error)))
+            found.skip(shown, str(error))
             continue
         found.loose.append(finds.LooseMotion(shown, name_role(node.name), matrix))

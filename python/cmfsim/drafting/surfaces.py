@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cmfsim.drafting.choices import SAMPLES, TURN, Anatomy, Question, Taken
-from cmfsim.drafting.finds import SurfaceFind
+from cmfsim.drafting.choices import SAMPLES, TURN, Anatomy, Question
+from cmfsim.drafting.finds import SurfaceFind, Taken, unused
 from cmfsim.drafting.roles import JAWS_OF_TEETH, MOVING, safe_key
 from cmfsim.meshing.levels import signed_level
 from cmfsim.surfaces.depth import distances
@@ -153,7 +153,7 @@ def _by_part(anatomy: Anatomy, found: Iterable[SurfaceFind]) -> dict[str, list[S
     for find in found:
         if find.role.part == "other":
             why = f"its name contains {find.role.word!r}, which is not a bone of a case"
-            anatomy.taken.append(Taken(find.label, "not used", why))
+            anatomy.taken.append(unused(find.label, why))
         else:
             parts.setdefault(find.role.part, []).append(find)
     return parts
@@ -198,7 +198,7 @@ def _choose_bones(anatomy: Anatomy, parts: dict[str, list[SurfaceFind]]) -> None
         why = (
             "the bones are given separately; according to its name, this file contains all of them"
         )
-        anatomy.taken.append(Taken(find.label, "not used", why))
+        anatomy.taken.append(unused(find.label, why))
     for part in ("cranium", *MOVING):
         named = _moved_alone(anatomy, parts.get(part, []))
         if len(named) == 1:
@@ -225,7 +225,7 @@ def _moved_alone(anatomy: Anatomy, named: Sequence[SurfaceFind]) -> Sequence[Sur
     for find in named:
         if find is not moved[0]:
             why = f"the scene moves {moved[0].label}, which is the same part, and not this one"
-            anatomy.taken.append(Taken(find.label, "not used", why))
+            anatomy.taken.append(unused(find.label, why))
     return moved
 
 
@@ -253,7 +253,7 @@ def _check_pieces(anatomy: Anatomy) -> None:
         if whole_name == "mandible" and "mandible_body" in inside and rami and not whole.is_moved:
             del anatomy.bones[whole_name]
             why = f"it is the bone before it was cut: {', '.join(inside)} lie in it"
-            anatomy.taken.append(Taken(whole.label, "not used", why))
+            anatomy.taken.append(unused(whole.label, why))
             continue
         name, share = max(inside.items(), key=lambda entry: entry[1])
         piece = anatomy.bones.pop(name)
@@ -407,10 +407,10 @@ def _choose_after(anatomy: Anatomy, found: Sequence[SurfaceFind]) -> None:
             if 0.5 < ratio < 2.0:
                 parts.setdefault("skin", []).append(find)
                 continue
-            anatomy.taken.append(Taken(find.label, "not used", "after the operation; which part?"))
+            anatomy.taken.append(unused(find.label, "after the operation; which part?"))
         else:
             why = f"{find.role.part or 'a part that its name does not say'} after the operation"
-            anatomy.taken.append(Taken(find.label, "not used", f"{why}, which no case uses"))
+            anatomy.taken.append(unused(find.label, f"{why}, which no case uses"))
     for part, finds in parts.items():
         if len(finds) > 1:
             key = "skin" if part == "skin" else f"bones.{part}"

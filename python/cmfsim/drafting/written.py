@@ -7,8 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from cmfsim.drafting.choices import Anatomy, Images, Marks, Question, Taken, Text, quoted
-from cmfsim.drafting.finds import EXTRACTED, Gathered, ImageFind, LandmarkFind, SurfaceFind
+from cmfsim.drafting.choices import Anatomy, Images, Marks, Question, Text, quoted
+from cmfsim.drafting.finds import (
+    EXTRACTED,
+    Gathered,
+    ImageFind,
+    LandmarkFind,
+    SurfaceFind,
+    Taken,
+    unused,
+)
 from cmfsim.drafting.motions import Plan
 from cmfsim.drafting.roles import safe_key
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError
@@ -59,12 +67,12 @@ def unaccounted(found: Gathered, plan: Plan, taken: Sequence[Taken]) -> list[Tak
             or any(folder in path.parents for folder in folders)
         )
         if not known and path.resolve() not in found.scene_files:
-            missing.append(Taken(label, "not used", UNDECIDED))
+            missing.append(unused(label, UNDECIDED))
     for name, below in found.links.items():
         if name in plan.links:
             continue
         why = f"it moves no segment against the head: {', '.join(below)} is under it"
-        missing.append(Taken(f"{found.scene}: {name}", "not used", why))
+        missing.append(unused(f"{found.scene}: {name}", why))
     return missing
 
 

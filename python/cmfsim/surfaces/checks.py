@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.crossings import crossing_pairs
-from cmfsim.surfaces.topology import Edges, component_labels, edges_of, orientation_flips
+from cmfsim.surfaces.topology import Edges, component_labels, edges_of, loops_of, orientation_flips
 from cmfsim.values.checks import Floats, brief
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, triangle_areas
 
 # Largest coordinate for which areas and volumes stay finite, mm.
 MAX_COORDINATE = 1e90
@@ -165,7 +165,7 @@ def check_surface(surface: SurfaceData, *, crossings: bool = True) -> SurfaceRep
     edges = edges_of(kept)
     used = vertices[np.unique(triangles)] if len(triangles) else np.zeros((1, 3))
     _, orientable = orientation_flips(edges, len(kept))
-    areas, volumes = _areas_volumes(vertices, kept)
+    areas, volumes = areas_volumes(vertices, kept)
     found = points = None
     if crossings:
         solid = keep.copy()
@@ -228,33 +228,10 @@ def duplicate_triangles(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def border_loops(vertices: Floats, edges: Edges) -> tuple[BorderLoop, ...]:
-    """The closed borders of a surface, longest first.
-
-    A walk along the border ends a loop where it returns to a vertex, so two loops that touch at a
-    vertex stay separate.
-    """
-    starts, ends = edges.border.T
-    after: dict[int, list[int]] = {}
-    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
-        after.setdefault(start, []).append(end)
-    loops: list[list[int]] = []
-    for first in starts.tolist():
-        walk, seen = [first], {first: 0}
-        while after.get(walk[-1]):
-            vertex = after[walk[-1]].pop()
-            if vertex in seen:
-                begin = seen[vertex]
-                loops.append(walk[begin:])
-                for left in walk[begin + 1 :]:
-                    del seen[left]
-                del walk[begin + 1 :]
-            else:
-                seen[vertex] = len(walk)
-                walk.append(vertex)
-        # What remains is a border that inconsistent triangles interrupt.
-        if len(walk) > 1:
-            loops.append(walk)
-    found = [_border_loop(vertices, np.array(loop, dtype=np.int64)) for loop in loops]
+    """The closed borders of a surface, longest first."""
+    loops, rests = loops_of(edges.border, edges.border[:, 0].tolist())
+    # The rests are borders that inconsistent triangles interrupt.
+    found = [_border_loop(vertices, np.array(loop, dtype=np.int64)) for loop in (*loops, *rests)]
     return tuple(sorted(found, key=lambda loop: (-loop.length, int(loop.vertices.min()))))
 
 
@@ -264,16 +241,15 @@ def _border_loop(vertices: Floats, loop: NDArray[np.int64]) -> BorderLoop:
     return BorderLoop(loop, float(np.linalg.norm(steps, axis=1).sum()), points.mean(axis=0))
 
 
-def _areas_volumes(vertices: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, Floats]:
+def areas_volumes(vertices: Floats, triangles: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Area of each triangle, and its share of the signed volume about the middle of the surface."""
     if not len(triangles):
         return np.zeros(0), np.zeros(0)
     # Relative to the middle: far from the origin, the digits of a small volume would cancel.
     middle = vertices[triangles].mean(axis=(0, 1))
     a, b, c = (vertices[triangles[:, i]] - middle for i in range(3))
-    normals = np.cross(b - a, c - a)
     volumes: Floats = (a * np.cross(b, c)).sum(axis=1) / 6.0
-    return 0.5 * np.linalg.norm(normals, axis=1), volumes
+    return triangle_areas(vertices - middle, triangles), volumes
 
 
 def _components(

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from cmfsim import _core
 from cmfsim.errors import CaseInputError, third_party
+from cmfsim.surfaces.checks import areas_volumes, has_three_corners
+from cmfsim.surfaces.topology import loops_of
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, Indices, as_number, as_positive
 from cmfsim.values.image_data import ImageData
@@ -34,18 +36,11 @@ _MADE: WeakKeyDictionary[ImageData, Future[SurfaceData]] = WeakKeyDictionary()
 class SurfaceOptions:
     """Options of the surface of a level.
 
-    Attributes
-    ----------
-    max_triangles : int
-        Surfaces with more are decimated (quadrics; Garland and Heckbert 1997) to about this many.
-    smoothing : int
-        Rounds of Taubin smoothing (1995), which take away the steps of the voxels and keep the
-        volume; 0 for none.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Fewer than 100 triangles, rounds below 0 or above 100.
+    max_triangles: Surfaces with more are decimated (quadrics; Garland and Heckbert 1997) to about
+        this many.
+    smoothing: Rounds of Taubin smoothing (1995), which take away the steps of the voxels and keep
+        the volume; 0 for none.
+    Raises `CaseError`: Fewer than 100 triangles, rounds below 0 or above 100.
     """
 
     max_triangles: int = 30_000
@@ -65,23 +60,10 @@ def surface_of_level(
 
     Marching cubes (Lewiner 2003, scikit-image), smoothed, and decimated where it is too fine.
 
-    Parameters
-    ----------
-    name : str
-        Of the bone, for messages.
-    level : ImageData
-        Positive inside.
-    options : SurfaceOptions, optional
-
-    Returns
-    -------
-    SurfaceData
-        Outward normals, mm.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) A level without an inside; scikit-image is missing.
+    name: Of the bone, for messages.
+    level: Positive inside.
+    Returns: Outward normals, mm.
+    Raises `CaseError`: A level without an inside; scikit-image is missing.
     """
     options = options or SurfaceOptions()
     values = level.single
@@ -208,30 +190,16 @@ def _without_slits(
     same = np.arange(len(points))
     same[centred] = centred[first[back.reshape(-1)]]
     joined = same[triangles]
-    kept = (
-        (joined[:, 0] != joined[:, 1])
-        & (joined[:, 1] != joined[:, 2])
-        & (joined[:, 2] != joined[:, 0])
-    )
-    used, left = used_nodes(joined[kept])
+    used, left = used_nodes(joined[has_three_corners(joined)])
     return left, points[used]
 
 
 def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> SurfaceData:
     """The surface with about as many triangles as wanted, open where it was (Garland 1997).
 
-    Parameters
-    ----------
-    name : str
-        For messages.
-    surface : SurfaceData
-    max_triangles : int
-        A surface that has no more is given back as it is.
-
-    Raises
-    ------
-    CaseError
-        (also `ValueError`) Nothing is left of the surface.
+    name: For messages.
+    max_triangles: A surface that has no more is given back as it is.
+    Raises `CaseError`: Nothing is left of the surface.
     """
     if len(surface.triangles) <= max_triangles:
         return surface
@@ -258,7 +226,8 @@ def _closed(points: Floats, corners: Indices) -> tuple[Floats, NDArray[np.int64]
     lone = ~np.isin(edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0])
     centres: list[Floats] = []
     fans: list[tuple[int, int, int]] = []
-    for loop in _loops(edges[lone][:, ::-1]):
+    borders = edges[lone][:, ::-1]
+    for loop in loops_of(borders, sorted(borders[:, 0].tolist()))[0]:
         centre = n + len(centres)
         centres.append(points[loop].mean(axis=0))
         fans += [(a, b, centre) for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
@@ -272,32 +241,7 @@ def _half_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
-def _loops(edges: NDArray[np.int64]) -> list[list[int]]:
-    """Directed border edges as loops that pass each of their vertices once."""
-    onward: dict[int, list[int]] = {}
-    for a, b in edges.tolist():
-        onward.setdefault(a, []).append(b)
-    loops = []
-    for start in sorted(onward):
-        while onward[start]:
-            path, place = [start], {start: 0}
-            while onward.get(path[-1]):
-                after = onward[path[-1]].pop()
-                if after in place:
-                    # The part since the last visit is a loop by itself.
-                    cut = place[after]
-                    loops.append(path[cut:])
-                    for vertex in path[cut + 1 :]:
-                        del place[vertex]
-                    path = path[: cut + 1]
-                else:
-                    place[after] = len(path)
-                    path.append(after)
-    return loops
-
-
 def _outward(points: Floats, triangles: NDArray[np.int64]) -> Indices:
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    volume = float(np.einsum("na,na->", a, np.cross(b, c))) / 6.0
+    volume = float(areas_volumes(points, triangles)[1].sum())
     corners = triangles if volume > 0.0 else triangles[:, ::-1]
     return cast("Indices", corners.astype(np.uint32))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
 from cmfsim.surfaces.checks import (
+    areas_volumes,
     border_loops,
     check_extent,
     duplicate_triangles,
@@ -174,9 +175,7 @@ WALL_SHARE = 0.3
 def _without_inner_wall(vertices: Floats, triangles: Integers) -> tuple[Integers, float]:
     """Triangles without inner walls, and which share of the volume the largest of them enclosed."""
     labels = component_labels(edges_of(triangles), len(triangles))
-    middle = vertices[triangles].mean(axis=(0, 1))
-    a, b, c = (vertices[triangles[:, i]] - middle for i in range(3))
-    volumes = np.abs(np.bincount(labels, weights=(a * np.cross(b, c)).sum(axis=1) / 6.0))
+    volumes = np.abs(np.bincount(labels, weights=areas_volumes(vertices, triangles)[1]))
     outer = int(np.argmax(volumes))
     large = [p for p in np.flatnonzero(volumes > WALL_SHARE * volumes[outer]) if p != outer]
     if not large:
@@ -316,10 +315,7 @@ def _outward(vertices: Floats, triangles: Integers) -> tuple[Integers, int]:
     flips, _ = orientation_flips(edges, len(triangles))
     labels = component_labels(edges, len(triangles))
     oriented = np.where(flips[:, None], triangles[:, ::-1], triangles)
-    middle = vertices[triangles].mean(axis=(0, 1))
-    a, b, c = (vertices[oriented[:, i]] - middle for i in range(3))
-    volumes = np.bincount(labels, weights=(a * np.cross(b, c)).sum(axis=1) / 6.0)
-    areas = np.bincount(labels, weights=np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    areas, volumes = (np.bincount(labels, w) for w in areas_volumes(vertices, oriented))
     largest = int(np.argmax(areas))
     turn = np.zeros(len(volumes), dtype=bool)
     if volumes[largest] < 0.0:

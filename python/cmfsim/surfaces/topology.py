@@ -1,7 +1,7 @@
 """Topology of triangles and tets: edges, connected pieces, and consistent orientation."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -89,6 +89,37 @@ def connected_labels(pairs: Integers, count: int) -> Integers:
     return np.unique(root, return_inverse=True)[1].reshape(-1)
 
 
+def loops_of(edges: Integers, starts: Iterable[int]) -> tuple[list[list[int]], list[list[int]]]:
+    """Directed edges (k, 2) as loops that pass each vertex once, and the paths that are left.
+
+    A walk ends a loop where it returns to a vertex, so two loops that touch at a vertex stay
+    separate.
+
+    starts: The vertices where walks begin, one after the other.
+    """
+    onward: dict[int, list[int]] = {}
+    for start, end in edges.tolist():
+        onward.setdefault(start, []).append(end)
+    loops: list[list[int]] = []
+    paths: list[list[int]] = []
+    for first in starts:
+        path, place = [first], {first: 0}
+        while onward.get(path[-1]):
+            vertex = onward[path[-1]].pop()
+            if vertex in place:
+                begin = place[vertex]
+                loops.append(path[begin:])
+                for left in path[begin + 1 :]:
+                    del place[left]
+                del path[begin + 1 :]
+            else:
+                place[vertex] = len(path)
+                path.append(vertex)
+        if len(path) > 1:
+            paths.append(path)
+    return loops, paths
+
+
 def orientation_flips(edges: Edges, n_triangles: int) -> tuple[NDArray[np.bool_], bool]:
     """Which triangles to flip for a consistent surface, and whether there is such a choice.
 
@@ -128,10 +159,5 @@ def tet_bodies(tets: NDArray[Any]) -> Integers:
     face = face * count + faces[:, 2]
     order = np.argsort(face)
     same = face[order[1:]] == face[order[:-1]]
-    pairs = np.stack([order[:-1][same], order[1:][same]]) // 4
-    sparse = import_module("scipy.sparse")
-    ones = np.ones(pairs.shape[1], dtype=bool)
-    graph = sparse.coo_matrix((ones, pairs), shape=(len(tets), len(tets)))
-    _, body = import_module("scipy.sparse.csgraph").connected_components(graph, directed=False)
-    bodies: Integers = body.astype(np.int64)
-    return bodies
+    pairs = np.stack([order[:-1][same], order[1:][same]], axis=1) // 4
+    return connected_labels(pairs, len(tets))

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -41,56 +42,15 @@ class Source:
         return {"sd": self.sd, "unit": self.unit, "reference": self.reference}
 
 
-_MODULI = "spread of the published values in docs/moduli.md"
-_EXECUTION = (
-    "24 bimaxillary patients, plan against CT after the operation, √(mean² + SD²) of the absolute "
-    "differences (PMC8432567, 2021)"
-)
-# Of the material; only ratios of moduli matter, so that fat, along and across together count once.
-TISSUE = (
-    Source("fat modulus", 0.45, "log", _MODULI),
-    Source("muscle modulus along", 1.1, "log", _MODULI),
-    Source("muscle modulus across", 1.1, "log", _MODULI),
-    Source("fat Poisson's ratio", 0.05, "1", "assumed: 0.40 here, 0.43 to 0.49 in other models"),
-    Source("muscle Poisson's ratio", 0.03, "1", "assumed: models of the face use 0.4 to 0.49"),
-    Source("muscle fraction", 0.2, "share", "assumed: muscles of a template, not of the patient"),
-    Source("fibre direction about L", 10.0, "degrees", "assumed"),
-    Source("fibre direction about P", 10.0, "degrees", "assumed"),
-    Source("fibre direction about S", 10.0, "degrees", "assumed"),
-)
-# Of each segment that the plan moves, about the middle of what is joined to it.
-PLAN = (
-    Source("to the left", 0.82, "mm", _EXECUTION),
-    Source("backwards", 1.10, "mm", _EXECUTION),
-    Source("upwards", 1.27, "mm", _EXECUTION),
-    Source("pitch", 1.78, "degrees", _EXECUTION),
-    Source("roll", 0.59, "degrees", _EXECUTION),
-    Source("yaw", 0.71, "degrees", _EXECUTION),
-)
-# Along the normal of the skin, without a solve.
-ADDED = (
-    Source("thickness change", 0.05, "share", "assumed: share of the depth of the soft tissue"),
-    Source("segmentation threshold", 0.25, "mm", "assumed: half a voxel of 0.5 mm"),
-    Source("scan noise", 0.2, "mm", "assumed: noise of a surface scan"),
-    Source(
-        "form of the model", 0.5, "mm", "assumed: half the mean error on virtual patients P1 to P4"
-    ),
+_PRIORS = json.loads(files("cmfsim.values").joinpath("priors.json").read_text(encoding="utf-8"))
+# Of the material: only ratios of moduli matter, so that fat, along and across together count once.
+# Of each segment that the plan moves, about the middle of what is joined to it. Along the normal of
+# the skin, without a solve.
+TISSUE, PLAN, ADDED = (
+    tuple(Source(**source) for source in _PRIORS[kind]) for kind in ("tissue", "plan", "added")
 )
 # What no derivative gives, and what stands for it.
-NOT_COVERED = (
-    (
-        "bilateral or unilateral contact, and the extent of the sliding region: these are "
-        "discrete choices; predict again with the other one to see its effect"
-    ),
-    (
-        "errors of single landmarks: cmfsim sensitivity draws them; here, the muscle fraction "
-        "and direction represent them"
-    ),
-    (
-        "segmentation threshold of bone, contact of the lips, and errors of the model's form "
-        "that are larger in one place than in another: only a calibration shows their effect"
-    ),
-)
+NOT_COVERED: tuple[str, ...] = tuple(_PRIORS["not_covered"])
 
 
 def band_sources() -> dict[str, Any]:

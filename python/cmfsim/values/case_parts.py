@@ -105,12 +105,9 @@ class Plane(checks.Frozen):
     point: checks.Floats
     normal: checks.Floats
 
-    def __init__(self, point: ArrayLike, normal: ArrayLike) -> None:
-        place, unit = (
-            checks.as_point("plane point", point),
-            checks.as_direction("plane normal", normal),
-        )
-        checks.keep(self, point=place, normal=unit)
+    def __init__(self, point: ArrayLike, normal: ArrayLike, called: str = "plane") -> None:
+        unit = checks.as_direction(f"{called} normal", normal)
+        checks.keep(self, point=checks.as_point(f"{called} point", point), normal=unit)
 
     def distance(self, points: ArrayLike) -> checks.Floats:
         """The signed distances of (n, 3) points from the plane, mm: positive along its normal."""

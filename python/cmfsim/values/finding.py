@@ -12,14 +12,6 @@ from cmfsim.values.checks import as_text, check_one_of
 from cmfsim.values.finding_table import FINDING_KINDS, FORMER_CODES, filled
 from cmfsim.values.language import translated
 
-# What several findings of one code have in common. Others are stated by the worst of them.
-TITLES: Mapping[str, str] = {
-    "muscle-does-not-fit": "{n} muscles partly outside the tissue",
-    "muscle-missed": "{n} muscles contain no sample of the tissue and do not affect it",
-    "muscle-sheet": "{n} muscles are sheets, whose outline hardly determines their fibre direction",
-    "landmark-far": "{n} landmarks are far from their surface",
-    "surface-open": "{n} surfaces are open",
-}
 # A size within the text of a finding: the larger, the worse.
 SIZE = re.compile(r"(\d+(?:[.,]\d+)?)\s?(%|mm\b|°)")
 # What two findings of one wording may differ in.
@@ -138,14 +130,15 @@ class FindingGroup:
         """The line, each of its texts as `said` gives it: in the reader's language, for one."""
         worst = self.worst
         count = len(self.findings)
-        if self.code not in TITLES or count == 1:
+        kind = FINDING_KINDS.get(self.code)
+        if kind is None or not kind.several or count == 1:
             stated = self._wordings()[:MOST_WORDINGS]
             line = "; ".join(_stated(finding, said) for finding in stated)
             more = count - len(stated)
             rest = said(f"and {more} more of this kind")
             return f"{line}; {rest} [{self.code}]" if more else line
         size = _size(worst)[1]
-        title = said(TITLES[self.code].format(n=count))
+        title = said(kind.several.format(n=count))
         if size and worst.where:
             return f"{title} ({said('largest:')} {worst.where} {size})"
         return f"{title} ({said('such as:')} {said(_shortened(worst.what))})"

@@ -4,9 +4,11 @@
 between the ear canals; of pairs the left one.
 """
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib.resources import files
 from types import MappingProxyType
 
 import numpy as np
@@ -15,118 +17,45 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import LandmarkInputError
 from cmfsim.values.checks import Floats
 
-_SKULL_MIDLINE: Mapping[str, tuple[float, float, float]] = {
-    "glabella": (0.0, -93.5, 43.2), "infradentale": (0.0, -89.8, -53.5),
-    "menton": (0.0, -82.7, -83.9), "mid_philtrum": (0.0, -95.2, -29.0),
-    "nasion": (0.0, -90.8, 29.7), "pogonion": (0.0, -90.6, -74.3), "rhinion": (0.0, -98.5, 11.0),
-    "supradentale": (0.0, -93.2, -32.5), "supraglabella": (0.0, -90.6, 58.3),
-    "supramentale": (0.0, -89.3, -66.0),
-}  # fmt: skip
-_SKULL_PAIRED: Mapping[str, tuple[float, float, float]] = {
-    "frontal_eminence": (31.5, -82.4, 68.0), "gonion": (48.9, -20.0, -60.0),
-    "inferior_malar": (31.5, -76.2, -16.0), "lateral_orbit": (56.0, -64.0, 4.0),
-    "occlusal_line": (51.7, -38.0, -45.0), "sub_m2": (42.3, -49.0, -62.0),
-    "suborbital": (31.5, -79.8, 1.0), "supra_m2": (34.1, -50.0, -27.0),
-    "supraglenoid": (64.5, -12.0, 5.0), "supraorbital": (31.5, -85.7, 35.0),
-    "zygomatic_arch": (66.6, -29.5, 1.5),
-}  # fmt: skip
-_SKIN_MIDLINE: Mapping[str, tuple[float, float, float]] = {
-    "labiale_inferius": (0.0, -100.2, -53.2), "labiale_superius": (0.0, -102.2, -34.9),
-    "nasion": (0.0, -97.5, 28.5), "pogonion": (0.0, -99.6, -74.0),
-    "pronasale": (0.0, -121.5, -7.3), "subnasale": (0.0, -102.0, -22.6),
-}  # fmt: skip
-_SKIN_PAIRED: Mapping[str, tuple[float, float, float]] = {
-    "alare": (16.8, -104.5, -12.5), "cheilion": (25.5, -89.6, -44.7),
-    "endocanthion": (16.8, -91.0, 17.5), "exocanthion": (45.5, -80.7, 18.0),
-}  # fmt: skip
-
-# The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
-# in its text, so the choice is ours.
-SKIN_LANDMARKS = (
-    "nasion", "pronasale", "subnasale", "labiale_superius", "labiale_inferius", "pogonion",
-    "exocanthion_L", "exocanthion_R", "endocanthion_L", "endocanthion_R", "alare_L", "alare_R",
-    "cheilion_L", "cheilion_R",
-)  # fmt: skip
-
-_SKIN_PLACES: Mapping[str, str] = {
-    "nasion": "root of the nose, at the height of the nasofrontal suture",
-    "pronasale": "most protruded point of the nose",
-    "subnasale": "where nasal septum and upper lip meet",
-    "labiale_superius": "upper border of the red of the upper lip",
-    "labiale_inferius": "lower border of the red of the lower lip",
-    "pogonion": "foremost point of the soft chin",
-    "exocanthion": "outer corner of the eye",
-    "endocanthion": "inner corner of the eye",
-    "alare": "most lateral point of the wing of the nose",
-    "cheilion": "corner of the mouth",
-}
-
-_MIDLINE: Mapping[str, str] = {
-    "supraglabella": "frontal bone above the glabella, where the forehead begins to rise upright",
-    "glabella": "most prominent point between the brow ridges",
-    "nasion": "where nasal and frontal bones meet",
-    "rhinion": "lower end of the suture between the nasal bones, the tip of the bony nose",
-    "mid_philtrum": "deepest point of the maxilla between nasal spine and upper incisors",
-    "supradentale": "between the upper central incisors, at the edge of the bone",
-    "infradentale": "between the lower central incisors, at the edge of the bone",
-    "supramentale": "deepest point of the mandible between lower incisors and chin",
-    "pogonion": "foremost point of the bony chin",
-    "menton": "lowest point of the mandible",
-}
-_PAIRED: Mapping[str, str] = {
-    "frontal_eminence": "bulge of the forehead, straight above the middle of the eye",
-    "supraorbital": "upper rim of the orbit, above the middle of the eye",
-    "suborbital": "lower rim of the orbit, below the middle of the eye",
-    "inferior_malar": "lower border of cheekbone and maxilla, below the suborbital point",
-    "lateral_orbit": "cheekbone beside and some 10 mm below the outer rim of the orbit",
-    "zygomatic_arch": "point of the zygomatic arch that lies furthest to the side",
-    "supraglenoid": "root of the zygomatic arch before the ear, above the jaw joint",
-    "gonion": "point of the angle of the mandible furthest to the side, back and below",
-    "supra_m2": "maxilla above the upper second molar",
-    "occlusal_line": "front and outer face of the ramus at the height where the teeth meet",
-    "sub_m2": "body of the mandible below the lower second molar",
-}
+_DATA = json.loads(
+    files("cmfsim.values").joinpath("landmark_sites.json").read_text(encoding="utf-8")
+)
 _SIDES: Mapping[str, str] = {"_L": "left", "_R": "right"}
 
 
-def _places(
-    midline: Mapping[str, tuple[float, float, float]],
-    paired: Mapping[str, tuple[float, float, float]],
-) -> Mapping[str, Floats]:
-    places = {name: np.array(place) for name, place in midline.items()}
-    for name, (x, y, z) in paired.items():
+def _places(kind: str) -> Mapping[str, Floats]:
+    given = _DATA["places"][kind]
+    places = {name: np.array(place) for name, place in given["midline"].items()}
+    for name, (x, y, z) in given["paired"].items():
         places[f"{name}_L"], places[f"{name}_R"] = np.array([x, y, z]), np.array([-x, y, z])
     return MappingProxyType(places)
 
 
+def _definitions(kind: str) -> Mapping[str, str]:
+    paired, found = _DATA["places"][kind]["paired"], {}
+    for name, where in _DATA["definitions"][kind].items():
+        for side, word in _SIDES.items() if name in paired else (("", "midline"),):
+            found[f"{name}{side}"] = f"{word}: {where}"
+    return MappingProxyType(found)
+
+
 # By the key of a case's [landmarks].
 REFERENCE_PLACES: Mapping[str, Mapping[str, Floats]] = MappingProxyType(
-    {"skull": _places(_SKULL_MIDLINE, _SKULL_PAIRED), "skin": _places(_SKIN_MIDLINE, _SKIN_PAIRED)}
+    {"skull": _places("skull"), "skin": _places("skin")}
 )
+# 10 in the midline and 11 on either side, after the sites at which Rhine & Campbell (1980) and
+# Phillips & Smuts (1996) measured the soft tissue; left and right are the patient's.
+SKULL_LANDMARKS = _definitions("skull")
+# The fourteen landmarks of the skin, after Kim et al. (2010), Figure 8: the figure's names are not
+# in its text, so the choice is ours.
+SKIN_SITES = _definitions("skin")
+SKIN_LANDMARKS = tuple(SKIN_SITES)
 
 
 def _plain(name: str) -> str:
     """A name without its side."""
     return name[:-2] if name[-2:] in _SIDES else name
 
-
-# 10 in the midline and 11 on either side, after the sites at which Rhine & Campbell (1980) and
-# Phillips & Smuts (1996) measured the soft tissue; left and right are the patient's.
-SKULL_LANDMARKS: Mapping[str, str] = MappingProxyType(
-    {name: f"midline: {where}" for name, where in _MIDLINE.items()}
-    | {
-        f"{name}{side}": f"{word}: {where}"
-        for name, where in _PAIRED.items()
-        for side, word in _SIDES.items()
-    }
-)
-# The same of the skin.
-SKIN_SITES: Mapping[str, str] = MappingProxyType(
-    {
-        name: f"{_SIDES.get(name[-2:], 'midline')}: {_SKIN_PLACES[_plain(name)]}"
-        for name in SKIN_LANDMARKS
-    }
-)
 
 # Sites of the lower jaw, without their side.
 JAW_SITES = (
@@ -172,45 +101,9 @@ class CephalometricSite:
 
 
 # Abbreviations as in cephalometry, with those of ALI_CBCT (Gillot et al. 2023) where they differ.
-# fmt: off
-CEPHALOMETRY: tuple[CephalometricSite, ...] = tuple(CephalometricSite(tuple(row[0].split()), *row[1:]) for row in (
-    ("N Na", "skull", "nasion", "nasion", "front of the frontonasal suture"),
-    ("G", "skull", "glabella", "glabella", "foremost point between the brows"),
-    ("Rhi Rh", "skull", "rhinion", "rhinion", "tip of the nasal bones"),
-    ("A SS", "skull", "A point, subspinale", "mid_philtrum", "deepest point of the maxilla between anterior nasal spine and prosthion"),
-    ("Pr SPr", "skull", "prosthion", "supradentale", "edge of the bone between the upper central incisors"),
-    ("Id", "skull", "infradentale", "infradentale", "edge of the bone between the lower central incisors"),
-    ("B", "skull", "B point", "supramentale", "deepest point of the mandible between infradentale and pogonion"),
-    ("Pog Pg", "skull", "pogonion", "pogonion", "foremost point of the bony chin"),
-    ("Me", "skull", "menton", "menton", "lowest point of the chin"),
-    ("Or", "skull", "orbitale", "suborbital", "lowest point of the rim of the orbit"),
-    ("Zy", "skull", "zygion", "zygomatic_arch", "outermost point of the zygomatic arch"),
-    ("Go", "skull", "gonion", "gonion", "point of the angle of the mandible"),
-    ("N' Na'", "skin", "soft nasion", "nasion", "root of the nose"),
-    ("Prn Pn", "skin", "pronasale", "pronasale", "tip of the nose"),
-    ("Sn", "skin", "subnasale", "subnasale", "where septum and upper lip meet"),
-    ("Ls", "skin", "labiale superius", "labiale_superius", "border of the upper vermilion"),
-    ("Li", "skin", "labiale inferius", "labiale_inferius", "border of the lower vermilion"),
-    ("Pog' Pg'", "skin", "soft pogonion", "pogonion", "foremost point of the soft chin"),
-    ("Ex", "skin", "exocanthion", "exocanthion", "outer corner of the eye"),
-    ("En", "skin", "endocanthion", "endocanthion", "inner corner of the eye"),
-    ("Al", "skin", "alare", "alare", "outermost point of the nose"),
-    ("Ch", "skin", "cheilion", "cheilion", "corner of the mouth"),
-    ("S", "skull", "sella", "", "middle of the sella turcica"),
-    ("Ba", "skull", "basion", "", "front edge of the foramen magnum"),
-    ("ANS", "skull", "anterior nasal spine", "", "tip of the spine"),
-    ("PNS", "skull", "posterior nasal spine", "", "tip of the spine"),
-    ("Po", "skull", "porion", "", "highest point of the opening of the ear canal, on each side"),
-    ("Co", "skull", "condylion", "", "highest point of each condyle"),
-    ("Gn", "skull", "gnathion", "", "point of the chin between pogonion and menton"),
-    ("U1 UR1O UL1O", "skull", "upper incisor", "", "edge of the upper central incisor"),
-    ("L1 LR1O LL1O", "skull", "lower incisor", "", "edge of the lower central incisor"),
-    ("U1R UR1R UL1R", "skull", "root of the upper incisor", "", "tip of its root"),
-    ("L1R LR1R LL1R", "skull", "root of the lower incisor", "", "tip of its root"),
-    ("U6 UR6O UL6O UR6MB UL6MB", "skull", "upper first molar", "", "crown of the upper first molar: middle (O), mesiobuccal cusp (MB)"),
-    ("L6 LR6O LL6O LR6MB LL6MB", "skull", "lower first molar", "", "crown of the lower first molar: middle (O), mesiobuccal cusp (MB)"),
-))
-# fmt: on
+CEPHALOMETRY: tuple[CephalometricSite, ...] = tuple(
+    CephalometricSite(tuple(short.split()), *texts) for short, *texts in _DATA["cephalometry"]
+)
 
 
 def named_site(label: str, kind: str) -> str | None:

@@ -91,6 +91,11 @@ class SurfaceData(Frozen):
         """The surface of the core, made once: its search tree takes longer than most searches."""
         return Surface(self.vertices, self.triangles, crease_angle=self.crease_angle)
 
+    def has_triangles_of(self, other: "SurfaceData") -> bool:
+        """Whether another surface has the same triangles, so that its vertices are this one's."""
+        same = len(self.vertices) == len(other.vertices)
+        return same and np.array_equal(self.triangles, other.triangles)
+
     def __getstate__(self) -> dict[str, Any]:
         """The fields alone: the core's surface stays where it was made."""
         return {field.name: getattr(self, field.name) for field in fields(self)}

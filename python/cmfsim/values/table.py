@@ -38,15 +38,8 @@ def plain_line(text: str) -> str:
 class Table:
     """Rows of text under a heading; columns of numbers are set right.
 
-    Attributes
-    ----------
-    columns : tuple of str
-    rows : tuple of tuple of str
-    caption : str
-    numeric : bool
-        Whether all columns but the first hold numbers.
-    gap : str
-        Between the columns of plain text.
+    numeric: Whether all columns but the first hold numbers.
+    gap: Between the columns of plain text.
     """
 
     columns: Sequence[str]

@@ -9,9 +9,9 @@ import cmfsim
 import head_case
 import label_images
 from cmfsim.drafting import init_case, written
-from cmfsim.drafting.choices import Text
 from cmfsim.drafting.roles import name_role
 from cmfsim.drafting.written import UNDECIDED
+from cmfsim.io.cases.case_tables import matrix_rows
 from scene_text import model, pack, shift, transform, write_scene
 
 pytest.importorskip("SimpleITK")
@@ -340,9 +340,8 @@ def test_a_motion_that_reads_as_another_is_an_error(tmp_path, monkeypatch):
         move,
         model("Mandible", "mandible.ply", "Move"),
     )
-    matrix = Text.matrix
-    stays = np.eye(4).tolist()
-    monkeypatch.setattr(Text, "matrix", lambda self, *_: matrix(self, stays))
+    rows = matrix_rows(np.eye(4))
+    monkeypatch.setattr("cmfsim.drafting.draft.matrix_rows", lambda _: rows)
     with pytest.raises(cmfsim.CaseError, match="the motion of mandible is another"):
         init_case(tmp_path)
 

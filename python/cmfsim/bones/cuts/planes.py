@@ -6,21 +6,14 @@ from dataclasses import dataclass, field, replace
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
-from cmfsim.values.checks import (
-    Floats,
-    as_direction,
-    as_point,
-    as_rows,
-    as_text,
-    check_instance,
-    keep,
-)
+from cmfsim.values.case_parts import Plane
+from cmfsim.values.checks import Floats, as_text, check_instance, keep
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 
 
 @dataclass(frozen=True, eq=False)
-class CuttingPlane:
+class CuttingPlane(Plane):
     """An unbounded plane that cuts bone; its normal points into the piece that is cut off.
 
     Attributes
@@ -44,20 +37,11 @@ class CuttingPlane:
     [3.0]
     """
 
-    point: Floats
-    normal: Floats
     name: str
 
     def __init__(self, point: ArrayLike, normal: ArrayLike, name: str = "plane") -> None:
-        as_text("plane name", name)
-        where = f"plane {name!r}"
-        normal = as_direction(f"{where} normal", normal)
-        keep(self, point=as_point(f"{where} point", point), normal=normal, name=name)
-
-    def distance(self, points: ArrayLike) -> Floats:
-        """The signed distance of points (n, 3), mm: positive on the side of the normal."""
-        offset = as_rows("points", points, 3) - self.point
-        return offset @ self.normal
+        super().__init__(point, normal, f"plane {as_text('plane name', name)!r}")
+        keep(self, name=name)
 
     def distance_along(self, image: ImageData) -> tuple[Floats, Floats, Floats]:
         """The signed distance at the voxels of an image's grid, mm: the sum of what is returned.

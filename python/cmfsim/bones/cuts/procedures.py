@@ -9,51 +9,35 @@ A missing site is estimated where the other sites of its jaw put it in an averag
 partner on the other side is known, it departs from there as the partner does.
 """
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import TypeAlias
+from importlib.resources import files
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure
+from cmfsim.bones.cuts.planes import Cut, CuttingPlane, Procedure, free_cut
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.registration.closest import robust_similarity
 from cmfsim.registration.proposed.shape_model.site_covariance import placed_distribution
+from cmfsim.values.case_parts import CaseOsteotomy
 from cmfsim.values.checks import Floats, as_number, check_one_of
 from cmfsim.values.finding import Finding
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, SKULL_LANDMARKS, is_lower_site
 
-# The sites of each procedure. Nasion is not among those of Le Fort I: it would only state which
-# side of the plane of the upper teeth is up.
-NEEDED: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "le_fort_1": ("supradentale", "supra_m2_L", "supra_m2_R"),
-        "le_fort_3": (
-            "nasion", "supradentale", "supra_m2_L", "supra_m2_R", "supraorbital_L",
-            "supraorbital_R", "suborbital_L", "suborbital_R", "lateral_orbit_L", "lateral_orbit_R",
-            "zygomatic_arch_L", "zygomatic_arch_R",
-        ),
-        "bsso": (
-            "infradentale", "menton", "sub_m2_L", "sub_m2_R", "occlusal_line_L", "occlusal_line_R",
-            "gonion_L", "gonion_R",
-        ),
-        "genioplasty": (
-            "infradentale", "menton", "sub_m2_L", "sub_m2_R", "occlusal_line_L", "occlusal_line_R",
-        ),
-    }
-)  # fmt: skip
-# With these three, every procedure can be placed; the rest is estimated from them.
-PLACING: Mapping[str, tuple[str, str, str]] = MappingProxyType(
-    {
-        "le_fort_1": ("supradentale", "supra_m2_L", "supra_m2_R"),
-        "le_fort_3": ("nasion", "supra_m2_L", "supra_m2_R"),
-        "bsso": ("infradentale", "gonion_L", "gonion_R"),
-        "genioplasty": ("infradentale", "menton", "sub_m2_L"),
-    }
+# Of each procedure: the sites that it needs (nasion is not among those of Le Fort I: it would only
+# state which side of the plane of the upper teeth is up); three with which all others can be
+# estimated; and of each option the default, the lowest and the highest value, and what it states.
+# Distances mm, angles degrees. Bone farther to the side than `width` stays: the lower edge of the
+# zygoma is not shaved. A positive `tilt` of the chin's cut is right for roots that lean backwards.
+_TABLE: Mapping[str, Any] = json.loads(
+    files("cmfsim.bones.cuts").joinpath("procedures.json").read_text(encoding="utf-8")
 )
+PROCEDURES = tuple(_TABLE)
+NEEDED: Mapping[str, tuple[str, ...]] = {kind: tuple(_TABLE[kind]["needed"]) for kind in _TABLE}
 # Known sites spread at least this far across their longest direction, mm: a line of sites does not
 # show how the head is turned about it.
 LEAST_SPREAD = 8.0
@@ -79,38 +63,6 @@ CHIN_HEIGHT = 8.0
 CHIN_LEAST_CLEARANCE = 1.0
 # The frontozygomatic suture lies this part of the way from the lower to the upper orbital rim.
 FRONTOZYGOMATIC_PART = 0.65
-# Default, lowest and highest value of every option, and what it states. Distances mm, angles
-# degrees. Bone farther to the side than `width` stays: the lower edge of the zygoma is not shaved.
-_OPTIONS: Mapping[str, Mapping[str, tuple[float, float, float, str]]] = MappingProxyType(
-    {
-        "le_fort_1": {
-            "height": (5.0, -10.0, 20.0, "cut above the root tips"),
-            "tilt": (0.0, -30.0, 30.0, "front of the cut raised"),
-            "cant": (0.0, -30.0, 30.0, "left side of the cut raised"),
-            "posterior": (12.0, 2.0, 30.0, "back end of the piece behind the second molars"),
-            "width": (12.0, 5.0, 40.0, "sides of the piece beyond the second molars"),
-        },
-        "le_fort_3": {
-            "height": (0.0, -10.0, 10.0, "cut of the nose above nasion"),
-            "junction": (22.0, 5.0, 40.0, "top of the back cut above the molars"),
-            "posterior": (12.0, 2.0, 30.0, "back end of the piece behind the second molars"),
-            "wall": (6.0, 0.0, 20.0, "cut of the orbit's wall behind its rim"),
-            "arch": (0.5, 0.0, 1.0, "cut of the arch: 0 at the orbit, 1 at its middle"),
-        },
-        "bsso": {
-            "setback": (5.0, -15.0, 25.0, "outer cut behind the second molars"),
-            "angle": (50.0, 0.0, 75.0, "split, from straight across"),
-            "lingula": (10.0, 0.0, 30.0, "inner cut above the bite"),
-        },
-        "genioplasty": {
-            "clearance": (5.0, -5.0, 20.0, "cut below the root tips"),
-            # Roots lean backwards.
-            "tilt": (5.0, -30.0, 30.0, "back of the cut lowered"),
-            "posterior": (0.0, -40.0, 20.0, "back end of the chin behind the second molars"),
-        },
-    }
-)
-PROCEDURES = tuple(_OPTIONS)
 _JAW = ("mandible_body", "mandible")
 _UPPER = ("midface", "cranium", "skull")
 # The cuts of a procedure, and what is noticed as they are placed.
@@ -122,10 +74,7 @@ def with_missing_sites(
 ) -> tuple[dict[str, Floats], tuple[Finding, ...]]:
     """The sites of a procedure, missing ones estimated, and a warning that lists those.
 
-    Errors
-    ------
-    LandmarkError
-        (also `ValueError`) The known sites do not place the others; it names at most three to
+    Raises `LandmarkError`: The known sites do not place the others; it names at most three to
         place, which do.
     """
     points = {name: landmarks[name] for name in NEEDED[kind] if name in landmarks}
@@ -136,7 +85,7 @@ def with_missing_sites(
     known = {n: p for n, p in landmarks.items() if n in REFERENCE_PLACES["skull"]}
     own = [name for name in known if is_lower_site(name) == is_lower]
     if not _spread([known[name] for name in own]):
-        asked = [name for name in PLACING[kind] if name not in landmarks]
+        asked = [name for name in _TABLE[kind]["placing"] if name not in landmarks]
         raise LandmarkInputError(
             f"{kind} needs the landmark {asked[0]!r}"
             + (f" and {len(asked) - 1} more ({', '.join(asked[1:])})" if asked[1:] else "")
@@ -193,17 +142,17 @@ def procedure_options(kind: str) -> dict[str, float]:
     5.0
     """
     check_one_of("procedure", kind, PROCEDURES)
-    return {name: default for name, (default, *_) in _OPTIONS[kind].items()}
+    return {name: default for name, (default, *_) in _TABLE[kind]["options"].items()}
 
 
 def option_ranges(kind: str) -> dict[str, tuple[float, float, float]]:
     """The default, lowest and highest value of each option of a procedure, mm or degrees."""
-    return {name: option[:3] for name, option in _OPTIONS[kind].items()}
+    return {name: tuple(option[:3]) for name, option in _TABLE[kind]["options"].items()}
 
 
 def option_words(kind: str) -> dict[str, str]:
     """What each option of a procedure states: no motion, but where and how it cuts."""
-    return {name: option[3] for name, option in _OPTIONS[kind].items()}
+    return {name: option[3] for name, option in _TABLE[kind]["options"].items()}
 
 
 def place_procedure(
@@ -261,6 +210,16 @@ def place_procedure(
     return Procedure(kind, cuts, chosen, (*estimated, *findings))
 
 
+def placed_cut(cut: CaseOsteotomy, landmarks: Mapping[str, ArrayLike]) -> Procedure:
+    """A cut of a case: its procedure placed from skull landmarks, or its plane."""
+    if cut.procedure is not None:
+        return place_procedure(cut.procedure, landmarks, cut.options)
+    plane = cut.plane
+    if plane is None or cut.bone is None or cut.name is None:  # checked by `CaseOsteotomy`
+        raise AssertionError(cut)
+    return free_cut(cut.bone, cut.name, (CuttingPlane(plane.point, plane.normal),))
+
+
 def _small_head(points: Mapping[str, Floats], height: float) -> Iterator[Finding]:
     """A warning where roots of an adult's length place the cut in a head of a child's size."""
     average = REFERENCE_PLACES["skull"]
@@ -284,7 +243,7 @@ def _chosen_options(kind: str, options: Mapping[str, float]) -> dict[str, float]
         if name not in chosen:
             raise CaseInputError(f"{kind} has no option {name!r}: use {', '.join(chosen)}")
         number = as_number(f"{kind} {name}", value)
-        _, low, high, _ = _OPTIONS[kind][name]
+        _, low, high, _ = _TABLE[kind]["options"][name]
         if not low <= number <= high:
             raise CaseInputError(f"{kind} {name} is {number:g}: {low:g} to {high:g} is allowed")
         chosen[name] = number

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.bones import CuttingPlane, free_cut, place_procedure
+from cmfsim.bones import place_procedure, placed_cut
 from cmfsim.bones.cuts.planes import Cut
 from cmfsim.doctor.evidence import Evidence, place_text
 from cmfsim.doctor.sites.placement import LANDMARK_WARNING
@@ -194,14 +194,9 @@ def _check_procedure(evidence: Evidence, cut: CaseOsteotomy, where: str) -> Iter
 def _cuts(evidence: Evidence) -> Iterator[Cut]:
     """The cuts of the case that can be placed, in their order."""
     for cut in evidence.case.osteotomies:
-        if cut.procedure is not None:
-            # Landmarks or options that do not place it are reported by `check_cuts`.
-            with suppress(CaseError, LandmarkError):
-                placed = place_procedure(cut.procedure, evidence.skull_landmarks, cut.options)
-                yield from placed.cuts
-        elif cut.plane is not None and cut.bone is not None and cut.name is not None:
-            plane = CuttingPlane(cut.plane.point, cut.plane.normal)
-            yield from free_cut(cut.bone, cut.name, (plane,)).cuts
+        # Landmarks or options that do not place it are reported by `check_cuts`.
+        with suppress(CaseError, LandmarkError):
+            yield from placed_cut(cut, evidence.skull_landmarks).cuts
 
 
 def _owners(evidence: Evidence, bone: str, points: Floats) -> NDArray[np.object_]:

@@ -143,7 +143,7 @@ def _check_modality(name: str, found: set[str]) -> None:
 def dicom_files(folder: Path) -> list[Path]:
     """The files that a folder of DICOM may be read from: its own, and DICOM files below it."""
     own = sorted(p for p in folder.iterdir() if p.is_file())
-    return [*own, *(p for p in _below(folder) if _is_marked(p))]
+    return [*own, *(p for p in _below(folder) if is_marked(p))]
 
 
 def dicom_places(folders: Sequence[Path]) -> list[tuple[Path, str | None]]:
@@ -193,7 +193,8 @@ def _below(folder: Path) -> Iterator[Path]:
             yield from (p for name in sorted(names) if (p := here / name).is_file())
 
 
-def _is_marked(path: Path) -> bool:
+def is_marked(path: Path) -> bool:
+    """Whether a file has the mark of DICOM behind its preamble."""
     with path.open("rb") as file:
         return file.read(PREAMBLE + 4)[PREAMBLE:] == b"DICM"
 
@@ -252,7 +253,7 @@ def _headers_below(
     """The images in folders below that belong to a folder, and why others cannot be read."""
     headers, damaged = list[DicomHeader](), list[str]()
     for path in _below(folder):
-        if not _is_marked(path):
+        if not is_marked(path):
             continue
         _check_number(folder, len(headers))
         try:

@@ -145,9 +145,6 @@ def read_moved_surface(
         raise UnpairedError(
             f"{names.format(f'triangle {first} at other vertices', 'at its own')}: {SAME_NEEDED}"
         )
-    if not np.isfinite(there).all():
-        vertex = int(np.flatnonzero(~np.isfinite(there).all(axis=1))[0])
-        raise CaseInputError(f"{Path(after).name}: vertex {vertex} is not finite")
     # One place with two motions is two vertices: there the bone was cut.
     kept, number = _welded(np.concatenate([here, there], axis=1))
     rest = SurfaceData(here[kept] * scale, number[triangles])

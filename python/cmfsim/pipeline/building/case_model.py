@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cmfsim._core import TetMesh, __version__
-from cmfsim.bones import (
-    CuttingPlane,
-    Procedure,
-    check_segments,
-    cut_bones,
-    free_cut,
-    place_procedure,
-)
+from cmfsim.bones import Procedure, check_segments, cut_bones, placed_cut
 from cmfsim.doctor import diagnose
 from cmfsim.doctor.sites.landmarks import LANDMARK_CODES
 from cmfsim.errors import CaseInputError
@@ -335,7 +328,8 @@ def _bones(
     """The segments of the bones with their motions, and the procedures that cut them."""
     case = head.case
     stages.begin("cutting the bones")
-    cut = cut_bones(head.anatomy.bones, _procedures(case, head.skull))
+    placed = [placed_cut(osteotomy, head.skull) for osteotomy in case.osteotomies]
+    cut = cut_bones(head.anatomy.bones, placed)
     stages.add(cut.findings)
     by_hand = not case.landmarks.proposed
     check_pieces(case, head.skull, cut.segments, cut.procedures, by_hand=by_hand)
@@ -425,17 +419,6 @@ def _checked(case: Case) -> tuple[Finding, ...]:
         more = f" ({len(errors) - 1} more: cmfsim doctor shows them)" if len(errors) > 1 else ""
         raise CaseInputError(f"{first.where}: {first.what}; {first.fix}{more}")
     return findings
-
-
-def _procedures(case: Case, landmarks: Mapping[str, Floats]) -> list[Procedure]:
-    placed = []
-    for osteotomy in case.osteotomies:
-        if osteotomy.procedure is not None:
-            placed.append(place_procedure(osteotomy.procedure, landmarks, osteotomy.options))
-        elif osteotomy.plane is not None:
-            plane = CuttingPlane(osteotomy.plane.point, osteotomy.plane.normal)
-            placed.append(free_cut(str(osteotomy.bone), str(osteotomy.name), (plane,)))
-    return placed
 
 
 def kind_options_of(case: Case) -> KindOptions:

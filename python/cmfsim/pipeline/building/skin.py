@@ -22,7 +22,7 @@ from cmfsim.pipeline.building.case_checks import CaseLipContact, Head
 from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.surfaces.depth import barycentric, distances
-from cmfsim.surfaces.levels import SurfaceOptions, contact_surface, surface_of_level
+from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.surfaces.topology import Integers, connected_labels, edges_of, tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.case_parts import UNITS
@@ -31,7 +31,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.patient_model import LiftedTissue
 from cmfsim.values.scene import NODE_KINDS, NodeKinds
-from cmfsim.values.surface_data import SurfaceData, triangle_areas, used_nodes
+from cmfsim.values.surface_data import SurfaceData, area_vectors, triangle_areas, used_nodes
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 
 # Held nodes that a body needs: three hold it unless they are in line.
@@ -125,11 +125,9 @@ def find_seam(
 
 def _upwards(surface: SurfaceData) -> SurfaceData:
     """The surface, turned if its normals look down."""
-    vertices, triangles = surface.vertices, surface.triangles
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    if float(np.cross(b - a, c - a)[:, 2].sum()) >= 0.0:
+    if float(area_vectors(surface.vertices, surface.triangles)[:, 2].sum()) >= 0.0:
         return surface
-    return replace(surface, triangles=triangles[:, ::-1])
+    return replace(surface, triangles=surface.triangles[:, ::-1])
 
 
 def separated_at_seam(mesh: TetMesh, kinds: NodeKinds, body: Integers, seam: LipSeam) -> Held:
@@ -250,18 +248,11 @@ def _obstacles(
             mine = ids[(nearest == number) & (away[number] <= REACH)]
             if not len(mine):
                 continue
-            whole = _sheet(segment, walls)
+            whole = walls.of(segment)
             surface = whole if lip == jaw else _on_teeth(whole, bones)
             if surface is not None:
                 found.append(ObstacleData(mine, segment.name, surface))
     return found
-
-
-def _sheet(segment: BoneSegment, walls: CaseContacts) -> SurfaceData:
-    """The contact sheet of a segment, else the blurred bone."""
-    if segment.name in walls.sheets:
-        return walls.sheets[segment.name].surface
-    return contact_surface(segment)
 
 
 def _on_teeth(sheet: SurfaceData, bones: Sequence[Surface]) -> SurfaceData | None:

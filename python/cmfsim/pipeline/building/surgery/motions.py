@@ -417,10 +417,7 @@ def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None
     if before is None or given is None or case.surfaces is None:
         return None
     here = read_surface(before, units=case.surfaces.units, frame=case.surfaces.frame)
-    same = len(here.vertices) == len(there.vertices) and np.array_equal(
-        here.triangles, there.triangles
-    )
-    return MovedSurface(here, there.vertices) if same else None
+    return MovedSurface(here, there.vertices) if here.has_triangles_of(there) else None
 
 
 def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:

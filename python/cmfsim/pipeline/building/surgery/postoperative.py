@@ -109,7 +109,7 @@ def _laid_on(case: Case, bones: Mapping[str, SurfaceData]) -> Floats:
     still = read_surface(before[name], units=case.surfaces.units, frame=case.surfaces.frame)
     after = bones[name]
     here, there = still.vertices, after.vertices
-    if here.shape == there.shape and np.array_equal(still.triangles, after.triangles):
+    if still.has_triangles_of(after):
         return _trimmed_fit(there, here)
     start = np.eye(4)
     start[:3, 3] = here.mean(axis=0) - there.mean(axis=0)

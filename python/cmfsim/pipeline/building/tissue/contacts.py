@@ -237,17 +237,15 @@ class CaseContacts:
     sheets: Mapping[str, ContactSheet] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
 
+    def of(self, segment: BoneSegment) -> SurfaceData:
+        """The contact surface of a segment: its sheet, else the blurred bone."""
+        sheet = self.sheets.get(segment.name)
+        return contact_surface(segment) if sheet is None else sheet.surface
+
     def of_scene(self, segments: Sequence[BoneSegment], kinds: NodeKinds) -> dict[str, SurfaceData]:
         """The contact surface of each segment that nodes slide on."""
-        return {
-            segment.name: (
-                self.sheets[segment.name].surface
-                if segment.name in self.sheets
-                else contact_surface(segment)
-            )
-            for segment in segments
-            if len(kinds.nodes("sliding", segment.name))
-        }
+        slid = [s for s in segments if len(kinds.nodes("sliding", s.name))]
+        return {segment.name: self.of(segment) for segment in slid}
 
     def summary(
         self,
