@@ -80,19 +80,25 @@ class _Shape:
     """A surface with what its flat ends are found from.
 
     vertices: (n, 3), mm.
-    corners: (t, 3). The rows of each triangle's vertices.
+    corners: (3, t). The rows of each triangle's vertices.
     areas: (t, 3), mm². The normal of each triangle, as long as its area.
+    borders: (2, b). The rows of the ends of each open edge.
     """
 
     vertices: Floats
     corners: NDArray[np.int64]
     areas: Floats
+    borders: NDArray[np.int64]
 
     @classmethod
     def of(cls, surface: SurfaceData) -> "_Shape":
         used, corners = used_nodes(surface.triangles)
         vertices = surface.vertices[used]
-        return cls(vertices, corners, area_vectors(vertices, corners))
+        starts, ends, count = corners.ravel(), corners[:, [1, 2, 0]].ravel(), len(vertices)
+        is_open = ~np.isin(starts * count + ends, ends * count + starts)
+        borders = np.stack([starts[is_open], ends[is_open]])
+        areas = area_vectors(vertices, corners)
+        return cls(vertices, np.ascontiguousarray(corners.T), areas, borders)
 
     def cap(self, normal: Floats, depth: float) -> tuple[float, float]:
         """Place of the end along a direction, and the area that lies flat, or is missing, there."""
@@ -132,21 +138,18 @@ class _Shape:
 
     def _flat(self, normal: Floats, near: NDArray[np.bool_]) -> float:
         """The area of the triangles between some vertices that face along a direction."""
-        areas = self.areas[near[self.corners].all(axis=1)]
+        areas = self.areas[near[self.corners].all(axis=0)]
         sizes = np.linalg.norm(areas, axis=1)
         return float(sizes[areas @ normal > CAP_NORMAL * sizes].sum())
 
     def _missing(self, normal: Floats, near: NDArray[np.bool_]) -> float:
         """The area that open borders between some vertices enclose, seen along a direction."""
-        beside = self.corners[near[self.corners].sum(axis=1) > 1]
-        starts, ends = beside.ravel(), beside[:, [1, 2, 0]].ravel()
-        count = len(self.vertices)
-        border = near[starts] & near[ends] & ~np.isin(starts * count + ends, ends * count + starts)
-        if not border.any():
+        starts, ends = self.borders[:, near[self.borders].all(axis=0)]
+        if not len(starts):
             return 0.0
         # By Stokes' theorem; triangles run the other way round than the cap that they lack.
-        first = self.vertices[starts[border][0]]
-        one, two = (self.vertices[rows[border]] - first for rows in (starts, ends))
+        first = self.vertices[starts[0]]
+        one, two = (self.vertices[rows] - first for rows in (starts, ends))
         return max(-0.5 * float(np.cross(one, two).sum(axis=0) @ normal), 0.0)
 
 
