@@ -148,7 +148,14 @@ impl Decimation {
             }
             t[usize::from(at)] = i;
             changed[triangle] = true;
-            self.costs[triangle] = self.costs_of(&self.triangles[triangle]);
+            let t = *t;
+            for k in (0..3).map(|k| (usize::from(at) + k) % 3) {
+                let ends = [t[k], t[(k + 1) % 3]];
+                // The edge across keeps its cost, unless that is of before the border was known.
+                if ends.contains(&i) || ends.iter().all(|&j| self.on_border[j as usize]) {
+                    self.costs[triangle][k] = self.cost(ends[0], ends[1]).0;
+                }
+            }
             self.least[triangle] = least_of(&self.costs[triangle]);
             true
         });
