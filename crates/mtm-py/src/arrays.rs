@@ -186,9 +186,7 @@ fn three_axes<'py>(
 }
 
 fn non_zero(array: &Bound<'_, PyAny>, name: Named<'_>) -> PyResult<Vec<bool>> {
-    let numpy = array.py().import("numpy")?;
-    let inside = numpy.call_method1("not_equal", (array, 0))?;
-    let inside = numpy.call_method1("ascontiguousarray", (inside,))?;
+    let inside = converted(array, name, "biu", "bool", "")?;
     let inside: PyReadonlyArrayDyn<'_, bool> = inside.extract()?;
     let values = inside.as_slice().map_err(|e| name.fail(format!("is not contiguous: {e}")))?;
     Ok(values.to_vec())
