@@ -40,7 +40,7 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType({
     "below": (0.0, 0.0, -1.0),
 })  # fmt: skip
 MARGIN = 1.04
-TEXT_SIZE = 9
+TEXT_SIZE, DPI = 9, 72
 LEGEND_ROW = 26  # pixels
 # Pixels left of texts below the views, and from a swatch to its text.
 EDGE, SWATCH = 12, 26
@@ -185,20 +185,25 @@ def _band_of_text(
     texts: Sequence[tuple[int, int, str]], width: int, height: int
 ) -> NDArray[np.uint8]:
     """Texts on white, (height, width, 3)."""
-    plotter = pyvista_module().Plotter(off_screen=True, window_size=[width, height])
-    try:
-        plotter.set_background("white")
-        for left, row, text in texts:
-            # The fonts that come with VTK have no minus sign; it sets formulas between dollars.
-            plotter.add_text(
-                "".join(c if c.isprintable() and c != "$" else "?" for c in text.replace("−", "-")),
-                position=(left, height - 8 - (row + 1) * LEGEND_ROW),
-                font_size=TEXT_SIZE,
-                color="black",
-            )
-        return np.array(plotter.screenshot(return_img=True))[:, :, :3]
-    finally:
-        plotter.close()
+    # As a window shows them, which takes longer to open than all texts to draw.
+    core, image_data = import_module("vtkmodules.vtkRenderingCore"), pyvista_module().ImageData
+    font = core.vtkTextProperty()
+    font.SetFontSize(2 * TEXT_SIZE)
+    band = np.full((height, width, 3), 255, dtype=np.uint8)
+    for left, row, text in texts:
+        if not text.strip():
+            continue
+        # The fonts that come with VTK have no minus sign; it sets formulas between dollars.
+        shown = "".join(c if c.isprintable() and c != "$" else "?" for c in text.replace("−", "-"))
+        image, size = image_data(), [0, 0]
+        core.vtkTextRenderer.GetInstance().RenderString(font, shown, image, size, DPI)
+        across, up, _ = image.dimensions
+        # Its rows run upwards, and its last channel is how black a pixel is.
+        ink = image.active_scalars.reshape(up, across, -1)[: size[1], : min(size[0], width - left)]
+        bottom = 8 + (row + 1) * LEGEND_ROW
+        place = band[bottom - len(ink) : bottom, left : left + ink.shape[1]]
+        np.minimum(place, 255 - ink[::-1, :, 3:], out=place)
+    return band
 
 
 class Shown:
