@@ -98,18 +98,15 @@ def _check_lies_on_level(segment: BoneSegment, *, is_given: bool) -> None:
 def _on_zero_set(inside: NDArray[np.bool_], places: Floats) -> NDArray[np.bool_]:
     """Whether the cube of three voxels around each place (in voxels) contains both sides."""
     places = places[:: -(-len(places) // SAMPLES)]
-    index = np.rint(places).astype(np.intp)
-    shape = np.array(inside.shape)
-    some, every = np.zeros(len(index), dtype=bool), np.ones(len(index), dtype=bool)
-    for step in np.ndindex(3, 3, 3):
-        near = index + np.array(step) - 1
-        # Beyond the image is outside: surfaces are closed at its border.
-        within = ((near >= 0) & (near < shape)).all(axis=1)
-        found = np.zeros(len(index), dtype=bool)
-        found[within] = inside[tuple(near[within].T)]
-        some |= found
-        every &= found
-    return some & ~every
+    low, high = block_of(inside)
+    # Beyond the image is outside: surfaces are closed at its border. Farther off, all is.
+    rim = 3
+    block = np.pad(inside[tuple(slice(*ends) for ends in zip(low, high, strict=True))], rim)
+    index = np.rint(places).astype(np.intp) - low + rim
+    index = np.clip(index, 1, np.array(block.shape) - 2)
+    cube = np.ravel_multi_index(np.indices((3, 3, 3)).reshape(3, -1), block.shape)
+    near = block.ravel()[np.ravel_multi_index((index - 1).T, block.shape)[:, None] + cube]
+    return np.asarray(near.any(axis=1) & ~near.all(axis=1))
 
 
 def _place(point: Floats) -> str:
