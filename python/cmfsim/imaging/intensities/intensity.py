@@ -174,7 +174,9 @@ def _means(values: NDArray[Any], shown: ShownRegion | None) -> NDArray[np.float6
     edges = [min(BLOCK, n) for n in values.shape]
     step = max(1, int(np.cbrt(values.size / SAMPLE)))
     starts = [range(0, n - e + 1, step) for n, e in zip(values.shape, edges, strict=True)]
-    total = np.zeros([len(s) for s in starts])
+    # In the order of the values, so that they are passed in that of memory.
+    firsts = tuple(slice(s.start, s.stop, step) for s in starts)
+    total = np.zeros_like(values[firsts], dtype=np.float64)
     for shift in product(*(range(e) for e in edges)):
         places = (
             slice(first, n - e + first + 1, step)
