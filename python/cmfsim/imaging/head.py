@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.bones.bone import Bone, bone_level, find_bone, teeth_level
 from cmfsim.imaging.bones.jaw import Jaws, part_jaws
-from cmfsim.imaging.bones.metal import find_metal, metal_within
+from cmfsim.imaging.bones.metal import cropped, find_metal
 from cmfsim.imaging.intensities.cupping import without_cupping, without_noise
 from cmfsim.imaging.intensities.intensity import weak_bone
 from cmfsim.imaging.intensities.levels import level_of
@@ -158,7 +158,7 @@ def _opened(
     _check_head(work, skin.mask)
     say("bone")
     # The couch and the air around the head need no more work, here or later.
-    work, metal = work.part(skin.box), metal_within(metal, skin.box)
+    work, metal = cropped(work, metal, skin.box)
     smooth, noisy = without_noise(metal.hu)
     metal = replace(metal, hu=smooth)
     bone = find_bone(work, metal, skin, options)

@@ -71,15 +71,17 @@ class Metal:
     findings: tuple[Finding, ...]
 
 
-def metal_within(metal: Metal, box: Block) -> Metal:
-    """The metal in a block of the grid."""
+def cropped(work: Working, metal: Metal, box: Block) -> tuple[Working, Metal]:
+    """The image and the metal in a block of the grid."""
     layers = box[2]
     low, high = (
         min(max(place - layers.start, 0), layers.stop - layers.start)
         for place in (metal.layers.start, metal.layers.stop)
     )
     mask = None if metal.mask is None or low == high else np.asfortranarray(metal.mask[box])
-    return Metal(mask, slice(low, high), np.asfortranarray(metal.hu[box]), metal.findings)
+    part = work.part(box)
+    hu = part.hu if metal.hu is work.hu else np.asfortranarray(metal.hu[box])
+    return part, Metal(mask, slice(low, high), hu, metal.findings)
 
 
 def find_metal(work: Working, options: SegmentOptions) -> Metal:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
-from cmfsim.imaging.bones.metal import Metal, metal_within, without_streaks
+from cmfsim.imaging.bones.metal import Metal, cropped, without_streaks
 from cmfsim.imaging.intensities.intensity import AIR, SOFT
 from cmfsim.imaging.intensities.levels import level_of
 from cmfsim.imaging.morphology import (
@@ -129,7 +129,7 @@ def find_skin(work: Working, metal: Metal, options: SegmentOptions, beside: Exec
     margin = 1.2 * float(steps.max())
     around = depth(head, steps)
     box = _box(around > -margin - float(steps.max()), steps, shift, work)
-    work, metal = work.part(box), metal_within(metal, box)
+    work, metal = cropped(work, metal, box)
     shift = shift - work.spacing * np.array([b.start for b in box])
     near = resampled_to(around, steps, shift, work.hu.shape, work.spacing)
     near += np.float32(margin)
