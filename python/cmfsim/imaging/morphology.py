@@ -49,6 +49,9 @@ def _package(name: str) -> Any:
 def watershed(height: Volume, seeds: NDArray[Any], mask: Mask) -> NDArray[Any]:
     """The seed whose flood reaches each voxel of the mask first, rising over the height."""
     flood = _package("skimage.segmentation").watershed
+    basins = np.zeros(mask.shape, dtype=seeds.dtype, order="F")
+    box = box_of(mask, 1)
+    height, seeds, mask = height[box], seeds[box], mask[box]
     # Floods start at the rims of seeds: those inside them would only lengthen the queue.
     sown = seeds != 0
     enclosed = sown.copy(order="K")
@@ -56,8 +59,9 @@ def watershed(height: Volume, seeds: NDArray[Any], mask: Mask) -> NDArray[Any]:
         along, out = np.moveaxis(seeds, axis, 0), np.moveaxis(enclosed, axis, 0)
         out[1:] &= along[1:] == along[:-1]
         out[:-1] &= along[:-1] == along[1:]
-    basins: NDArray[Any] = flood(height.T, seeds.T, mask=(mask & ~enclosed).T).T
-    return np.where(enclosed & mask, seeds, basins)
+    flooded = flood(height.T, seeds.T, mask=(mask & ~enclosed).T).T
+    basins[box] = np.where(enclosed & mask, seeds, flooded)
+    return basins
 
 
 def simplex(
