@@ -46,7 +46,7 @@ BY_SHAPE = "jaws-parted-by-shape"
 VOXEL_ERROR = 0.5
 # A site of the skin this near to something on the face may lie on it, and is then expected to be
 # off by the second, mm.
-ON_THINGS, UNDER_THINGS = 3.0, 8.0
+ON_THINGS, UNDER_THINGS = 5.0, 8.0
 # A site that moves by more when the jaws are separated again is doubtful, mm.
 MOVED = 3.5
 # What a template head keeps its surfaces in.

@@ -9,7 +9,7 @@ import cmfsim
 import real_heads
 from cmfsim.pipeline.proposing import _blurred, read_template_head
 from cmfsim.registration.proposed import measured_biases
-from cmfsim.registration.proposed.judgement import missing_sites
+from cmfsim.registration.proposed.judgement import missing_sites, with_doubts_of_support
 from cmfsim.registration.proposed.pose import Pose, refined_pose
 from cmfsim.registration.proposed.shape_model.fitted_head import fit_head
 from cmfsim.registration.proposed.shape_model.samples import samples_of
@@ -106,6 +106,15 @@ def test_sites_of_the_skin_are_gone_with_those_that_they_are_found_from(wrong, l
     unusual = missing_sites(skull, skin, [], pose, has_jaw=True, odd={})
     assert not unusual.skull
     assert not unusual.skin
+
+
+def test_corners_of_the_mouth_are_doubtful_with_a_lip():
+    lip = ProposedSite(np.zeros(3), 6.0, "something lies there")
+    sites = {"labiale_inferius": lip, "cheilion_L": ProposedSite(np.ones(3), 2.5, "")}
+    found = with_doubts_of_support(sites, sites, ("skin", "skin"))
+    assert "labiale_inferius (skin)" in found["cheilion_L"].doubt
+    assert found["cheilion_L"].error == lip.error
+    assert found["labiale_inferius"].doubt == lip.doubt
 
 
 def test_every_site_of_a_synthetic_person_is_found_within_3_mm(person, found):

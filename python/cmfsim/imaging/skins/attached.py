@@ -114,19 +114,21 @@ class _Head:
 class Attached:
     """What is on the face.
 
-    middle, size: (3,), mm.
+    middle: (3,), mm. The mean of its voxels.
+    box: (2, 3), mm. The lowest and the highest corner of what it takes up.
     volume: mm³. Not known of what lies flat: 0.
     """
 
-    middle: NDArray[np.float64]
-    size: NDArray[np.float64]
+    middle: Floats
+    box: Floats
     volume: float
     kind: str
 
     @property
-    def box(self) -> Floats:
-        """The lowest and the highest corner of what it takes up, (2, 3) mm."""
-        return self.middle + 0.5 * np.array([-self.size, self.size])
+    def size(self) -> Floats:
+        """Its extents, (3,) mm."""
+        extents: Floats = self.box[1] - self.box[0]
+        return extents
 
     @property
     def finding(self) -> Finding:
@@ -165,8 +167,8 @@ def _flat(head: _Head, work: Working, skin: Skin) -> list[Attached]:
         index = np.rint((places - head.origin) / head.spacing).astype(np.intp)
         index = np.clip(index, 0, np.array(head.mask.shape) - 1)
         if head.away_broadly[tuple(index.T)].max() <= FLAT:
-            size = (np.ptp(voxels, axis=0) + 1) * spacing
-            things.append(Attached(places.mean(axis=0), size, 0.0, FLAT_TEXT))
+            box = [places.min(axis=0), places.max(axis=0)] + spacing * [[-0.5], [0.5]]
+            things.append(Attached(places.mean(axis=0), box, 0.0, FLAT_TEXT))
     return things
 
 
@@ -225,14 +227,16 @@ def _pieces(
     things = []
     for piece in np.flatnonzero(sizes * float(np.prod(spacing)) >= LEAST_VOLUME).tolist():
         block = blocks[piece - 1]
-        size = np.array([b.stop - b.start for b in block]) * spacing
-        if float(np.linalg.norm(size)) < LEAST_LENGTH:
+        # Voxels reach half an edge beyond their middles.
+        ends = np.array([[b.start for b in block], [b.stop for b in block]])
+        box = origin + (ends - 0.5) * spacing
+        if float(np.linalg.norm(box[1] - box[0])) < LEAST_LENGTH:
             continue
         here = labels[block] == piece
         first = np.array([b.start for b in block])
         middle = origin + (first + np.argwhere(here).mean(axis=0)) * spacing
         kind = next(text for which, text in kinds if which[block][here].mean() > 0.5)
-        things.append(Attached(middle, size, sizes[piece] * float(np.prod(spacing)), kind))
+        things.append(Attached(middle, box, sizes[piece] * float(np.prod(spacing)), kind))
     return things
 
 

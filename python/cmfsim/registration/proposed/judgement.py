@@ -34,20 +34,21 @@ IMPOSSIBLE = 15.0
 INCONSISTENT = "the point found there is inconsistent with the other sites"
 
 
-# Sites of the skull, on the same side, that others are found from: those of the skin are gone with
-# any of them, and all are doubtful with any.
-SUPPORT: Mapping[str, Mapping[str, tuple[str, ...]]] = MappingProxyType({
-    "skull": {
+# Sites that others are found from, on the same side, by the kind of both: those of the skin are
+# gone with any of the skull, and all are doubtful with any.
+SUPPORT: Mapping[tuple[str, str], Mapping[str, tuple[str, ...]]] = MappingProxyType({
+    ("skull", "skull"): {
         "supraglabella": ("glabella",), "mid_philtrum": ("supradentale",),
         "supramentale": ("pogonion",), "frontal_eminence": ("supraorbital",),
         "inferior_malar": ("suborbital",), "lateral_orbit": ("suborbital",),
         "zygomatic_arch": ("supraglenoid",),
     },
-    "skin": {
+    ("skin", "skull"): {
         "pogonion": ("pogonion",), "nasion": ("nasion",),
         "exocanthion": ("supraorbital", "suborbital"),
         "endocanthion": ("supraorbital", "suborbital"),
     },
+    ("skin", "skin"): {"cheilion": ("labiale_superius", "labiale_inferius")},
 })  # fmt: skip
 # Those that are looked for between nose and chin: they are wrong where the chin is.
 ABOVE_CHIN = ("subnasale", "labiale_superius", "labiale_inferius", "alare", "cheilion")
@@ -101,7 +102,7 @@ def missing_sites(
             lost[name] = "the skin around it was not recognised"
         elif (cut := _cut_at(skin[name], cuts, AT_CUT)) is not None:
             lost[name] = f"{IMAGE_ENDS} ({cut.name} border)"
-        elif support := next((n for n in _support("skin", name) if n in gone), ""):
+        elif support := next((n for n in _support(("skin", "skull"), name) if n in gone), ""):
             lost[name] = gone[support]
         elif name.startswith(ABOVE_CHIN) and "pogonion" in strange:
             lost[name] = gone["pogonion"]
@@ -145,21 +146,25 @@ def judged(points: Mapping[str, Floats], pose: Pose, likeness: float) -> dict[st
 
 
 def with_doubts_of_support(
-    kind: str, sites: Mapping[str, ProposedSite], skull: Mapping[str, ProposedSite]
+    sites: Mapping[str, ProposedSite], others: Mapping[str, ProposedSite], kinds: tuple[str, str]
 ) -> dict[str, ProposedSite]:
-    """The sites, doubtful and no surer where one of the skull is doubtful that they rest on."""
+    """The sites, doubtful and no surer where one of the others is doubtful that they rest on.
+
+    kinds: Of the sites and of the others, "skull" or "skin".
+    """
     result = dict(sites)
     for name, site in sites.items():
-        of = next((n for n in _support(kind, name) if n in skull and skull[n].doubt), "")
+        of = next((n for n in _support(kinds, name) if n in others and others[n].doubt), "")
         if of:
-            doubt = site.doubt or f"it is found from {of} (skull), which is doubtful"
-            result[name] = ProposedSite(site.point, max(site.error, skull[of].error), doubt)
+            doubt = site.doubt or f"it is found from {of} ({kinds[1]}), which is doubtful"
+            result[name] = ProposedSite(site.point, max(site.error, others[of].error), doubt)
     return result
 
 
-def _support(kind: str, name: str) -> list[str]:
+def _support(kinds: tuple[str, str], name: str) -> list[str]:
     base = name.removesuffix("_L").removesuffix("_R")
-    return [f"{of}{name.removeprefix(base)}" for of in SUPPORT[kind].get(base, ())]
+    found = SUPPORT[kinds].get(base, ())
+    return [f"{of}{name.removeprefix(base)}" for of in found] + [*found]
 
 
 def _unevenness(own: Mapping[str, Floats]) -> dict[str, float]:

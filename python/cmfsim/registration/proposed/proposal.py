@@ -261,9 +261,10 @@ def landmarks_from(
     added = {name: site for name, site in all_skull.items() if name not in of_skull.sites}
     all_skull |= weakened(added, evidence, pose.size)
     all_skin, missing_skin = with_model(of_skin, likely, fitted, pose.size)
+    all_skin = with_doubts_of_support(all_skin, all_skin, ("skin", "skin"))
     return ProposedLandmarks(
-        with_doubts_of_support("skull", all_skull, all_skull),
-        with_doubts_of_support("skin", all_skin, all_skull),
+        with_doubts_of_support(all_skull, all_skull, ("skull", "skull")),
+        with_doubts_of_support(all_skin, all_skull, ("skin", "skull")),
         missing_skull,
         missing_skin,
         evidence.impossible,
