@@ -248,8 +248,7 @@ def _under_things(
         near = ((b[0] - ON_THINGS < site.point) & (site.point < b[1] + ON_THINGS) for b in boxes)
         if any(inside.all() for inside in near):
             reason = "something that is no part of the face lies there (skin-attachment)"
-            doubt = "; ".join(filter(None, (site.doubt, reason)))
-            result[name] = replace(site, error=max(site.error, UNDER_THINGS), doubt=doubt)
+            result[name] = site.doubted(reason, UNDER_THINGS)
     return result
 
 
@@ -278,8 +277,7 @@ def _with_moves(
         if moved > MOVED:
             site = sites[name]
             reason = f"it moved by {moved:.1f} mm when the jaws were separated by landmarks"
-            doubt = "; ".join(filter(None, (site.doubt, reason)))
-            result[name] = replace(site, error=max(site.error, moved), doubt=doubt)
+            result[name] = site.doubted(reason, moved)
     return result
 
 
@@ -451,7 +449,7 @@ def _compared(
     if gap <= DOUBTFUL * float(np.hypot(others.errors[row], np.sqrt(3.0) * stds[key])):
         return site
     reason = f"the image and the other sites place it {gap:.0f} mm away"
-    return replace(site, doubt="; ".join(filter(None, (site.doubt, reason))))
+    return site.doubted(reason)
 
 
 def _following(

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from cmfsim.values.checks import Floats, keep
@@ -89,6 +89,11 @@ class ProposedSite:
     def state(self) -> SiteState:
         """Where it comes from."""
         return SiteState(self.origin, self.error, self.doubt)
+
+    def doubted(self, reason: str, least: float = 0.0) -> "ProposedSite":
+        """The site with a further reason to check it, and at least this expected error, mm."""
+        doubt = "; ".join(filter(None, (self.doubt, reason)))
+        return replace(self, error=max(self.error, least), doubt=doubt)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ away is looked for here.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -181,13 +181,11 @@ def weakened(
     if not evidence.reason or (kind == "skin" and not evidence.is_open):
         return dict(sites)
     weak = (*BACK_SITES, *FRONT_SITES) if kind == "skull" else MOUTH_SITES
-    result = {}
+    result = dict(sites)
     for name, site in sites.items():
         least = WEAK_ERROR if name.startswith(BACK_SITES) else WEAK_FRONT_ERROR
         if name.startswith(weak):
-            doubt = "; ".join(filter(None, (site.doubt, f"its jaw: {evidence.reason}")))
-            site = replace(site, error=max(site.error, size * least), doubt=doubt)  # noqa: PLW2901
-        result[name] = site
+            result[name] = site.doubted(f"its jaw: {evidence.reason}", size * least)
     return result
 
 

@@ -113,9 +113,7 @@ def without_outliers(kinds: Sequence[SitesOfKind]) -> list[SitesOfKind]:
     """The sites, those doubtful that all others place elsewhere, and as far off as that."""
     sites = {(found.kind, name): site for found in kinds for name, site in found.sites.items()}
     for key, gap in outliers(sites, DOUBTFUL).items():
-        site, reason = sites[key], f"the other sites place it {gap:.1f} mm away"
-        doubt = "; ".join(filter(None, (site.doubt, reason)))
-        sites[key] = replace(site, error=max(site.error, gap), doubt=doubt)
+        sites[key] = sites[key].doubted(f"the other sites place it {gap:.1f} mm away", gap)
     return [
         replace(found, sites={name: sites[found.kind, name] for name in found.sites})
         for found in kinds
@@ -151,12 +149,12 @@ def with_model(
             continue
         moved = _surface_place(found, name, likely[kind, name][0], size)
         point = site.point if moved is None else moved
-        error, doubt = float(np.hypot(site.error, GAP_SHARE * gap)), site.doubt
+        error = float(np.hypot(site.error, GAP_SHARE * gap))
+        sites[name] = ProposedSite(point, error, site.doubt)
         if deviations >= DOUBTFUL:
             reason = f"the shape of the whole head places it {gap:.1f} mm away"
             reason += "; placed by the others" * (deviations > REPLACED and moved is not None)
-            error, doubt = max(site.error, 0.5 * gap), "; ".join(filter(None, (doubt, reason)))
-        sites[name] = ProposedSite(point, error, doubt)
+            sites[name] = ProposedSite(point, site.error, site.doubt).doubted(reason, 0.5 * gap)
     for name, reason in found.missing.items():
         if IMAGE_ENDS in reason or found.surface_of(name) is None:
             continue
