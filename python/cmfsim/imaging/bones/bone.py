@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import ImageInputError
 from cmfsim.imaging.bones.metal import Metal, without_streaks
+from cmfsim.imaging.bones.vessels import without_vessels
 from cmfsim.imaging.intensities.intensity import SOFT
 from cmfsim.imaging.intensities.levels import level_of
 from cmfsim.imaging.morphology import (
@@ -67,7 +68,7 @@ SEAL_PART = 0.6
 class Bone:
     """Bone on the working grid.
 
-    hu: (nx, ny, nz) float32. What bone was found in: streaks of metal are taken out.
+    hu: (nx, ny, nz) float32. What bone was found in: streaks of metal and vessels are taken out.
     surface: (nx, ny, nz) float32. HU whose surface of bone lies at the threshold: see
         `at_half_height`.
     mask: (nx, ny, nz) bool. Bone and the hollows in it.
@@ -100,7 +101,8 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     hu = metal.hu
     solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
     solid &= under > options.least_skin
-    solid, bare, findings = _without_islands(solid, under < thin, work, options)
+    hu, solid, vessels = without_vessels(hu, solid, work.spacing)
+    solid, bare, islands = _without_islands(solid, under < thin, work, options)
     with ThreadPoolExecutor(1) as beside:
         walls = beside.submit(_walls, hu, solid, under, work, options)
         cavity = _cranial_cavity(solid, skin, work)
@@ -108,7 +110,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     surface = hu
     if options.bone_threshold is None:
         surface, mask = at_half_height(hu, mask, threshold, BONE_SCALE, work.spacing)
-    return Bone(hu, surface, mask, solid & mask, bare, cavity, tuple(findings))
+    return Bone(hu, surface, mask, solid & mask, bare, cavity, (*vessels, *islands))
 
 
 def bone_level(bone: Bone, options: SegmentOptions) -> Volume:
