@@ -16,6 +16,17 @@ Move = Callable[[np.ndarray], np.ndarray]
 # Depth of the band in which what is below the bite begins to move, reach of a random bump, and size
 # of all bumps together along an axis, mm.
 BAND, BUMP_REACH, BUMPS = 6.0, 40.0, 3.0
+# From the top of a joint down to the neck of the mandible, mm.
+CONDYLE = 8.0
+# The mandible as a whole against the upper jaw, from its joints on, mm.
+JAW_SHIFTS = {
+    "retrognathic, 10 mm": (0.0, 10.0, 0.0),
+    "prognathic, 10 mm": (0.0, -10.0, 0.0),
+    "mandible 10 mm aside": (10.0, 0.0, 0.0),
+}
+OF_MANDIBLE = (
+    "infradentale", "supramentale", "pogonion", "menton", "gonion", "occlusal_line", "sub_m2",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +55,6 @@ def warped(head: KnownHead) -> Iterator[tuple[str, KnownHead]]:
     bite = 0.5 * (skull["supradentale"] + skull["infradentale"])
     middle, brow = float(skull["nasion"][0]), float(skull["nasion"][2])
 
-    def low(p: np.ndarray) -> np.ndarray:
-        return np.asarray(1.0 / (1.0 + np.exp((p[:, 2:] - bite[2]) / BAND)))
-
     def below(p: np.ndarray) -> np.ndarray:
         # Zero at the brow, and one at the bite.
         return np.asarray(np.clip((brow - p[:, 2:]) / (brow - bite[2]), 0.0, None))
@@ -59,8 +67,6 @@ def warped(head: KnownHead) -> Iterator[tuple[str, KnownHead]]:
     moves: dict[str, Move] = {
         "long face": lambda p: p + below(p) * [0.0, 0.0, -8.0],
         "short face": lambda p: p + below(p) * [0.0, 0.0, 7.0],
-        "retrognathic, 8 mm": lambda p: p + low(p) * [0.0, 8.0, 0.0],
-        "prognathic, 8 mm": lambda p: p + low(p) * [0.0, -8.0, 0.0],
         "wide": lambda p: p + (p - [middle, 0.0, 0.0]) * [0.12, 0.0, 0.0],
         "narrow": lambda p: p + (p - [middle, 0.0, 0.0]) * [-0.12, 0.0, 0.0],
         "asymmetric, chin 6 mm aside": lambda p: p + side(p) * [1.0, 0.0, 0.0],
@@ -77,6 +83,8 @@ def warped(head: KnownHead) -> Iterator[tuple[str, KnownHead]]:
     }
     for name, move in moves.items():
         yield name, head.moved(move)
+    for name, shift in JAW_SHIFTS.items():
+        yield name, with_jaw_shifted(head, shift)
     yield "bone 1 mm thicker", _thicker(head, 1.0)
     yield "bone 1 mm thinner", _thicker(head, -1.0)
     yield "rough by 0.7 mm", head.mapped(_rough)
@@ -90,6 +98,32 @@ def warped(head: KnownHead) -> Iterator[tuple[str, KnownHead]]:
         head.mapped(lambda s: where(s, lambda p: (p[:, 2] > bite[2] + 15.0) | (p[:, 1] < spine))),
     )
     yield "holes", head.mapped(holed)
+
+
+def with_jaw_shifted(head: KnownHead, shift: tuple[float, float, float]) -> KnownHead:
+    """The head with its mandible displaced: teeth and body in whole, the joints where they are."""
+    skull, skin = head.truth
+    bite = 0.5 * (skull["supradentale"] + skull["infradentale"])
+    joints = 0.5 * (skull["supraglenoid_L"] + skull["supraglenoid_R"])[2] - CONDYLE
+
+    def bone(p: np.ndarray) -> np.ndarray:
+        part = np.clip((joints - p[:, 2:]) / (joints - bite[2] - CONDYLE), 0.0, 1.0)
+        return np.asarray(p + part**2 * (3.0 - 2.0 * part) * shift)
+
+    def soft(p: np.ndarray) -> np.ndarray:
+        return np.asarray(p + 1.0 / (1.0 + np.exp((p[:, 2:] - bite[2]) / BAND)) * shift)
+
+    def carried(surface: SurfaceData, move: Move) -> SurfaceData:
+        return replace(surface, vertices=move(surface.vertices))
+
+    return KnownHead(
+        {n: carried(b, bone) if n == "mandible" else b for n, b in head.bones.items()},
+        carried(head.skin, soft),
+        (
+            {n: bone(p[None])[0] if n.startswith(OF_MANDIBLE) else p for n, p in skull.items()},
+            {n: soft(p[None])[0] for n, p in skin.items()},
+        ),
+    )
 
 
 def _turned(size: float, angles: tuple[float, float, float]) -> Move:

@@ -8,6 +8,7 @@ import pytest
 
 import cmfsim
 import real_heads
+from benches.scenes import warped_heads
 from benches.scenes.warped_heads import KnownHead, warped
 from cmfsim.pipeline.proposing import read_template_head
 from cmfsim.registration.proposed.definitions import detection
@@ -27,8 +28,8 @@ def atlas():
     return KnownHead(known.bones, known.skin, (known.skull, known.skin_landmarks))
 
 
-# Before, in turn: 3.7, 4.0, 3.1 and 2.7 mm; gonion 14 mm, incisors 43 mm off.
-@pytest.mark.parametrize("name", ["narrow", "long skull", "front half", "retrognathic, 8 mm"])
+# Before, in turn: 3.7, 4.0 and 3.1 mm; gonion 14 mm, incisors 43 mm off.
+@pytest.mark.parametrize("name", ["narrow", "long skull", "front half"])
 def test_an_unusual_head_has_its_landmarks(name):
     head = next(head for known, head in warped(atlas()) if known == name)
     found = cmfsim.propose_landmarks(head.bones, head.skin)
@@ -36,6 +37,20 @@ def test_an_unusual_head_has_its_landmarks(name):
         errors = np.array([np.linalg.norm(site.point - truth[n]) for n, site in sites.items()])
         assert errors.mean() < 2.5
         assert errors.max() < 9.0
+
+
+# Molars were found between incisors of one jaw and the ramus of the other, up to 11 mm off, and a
+# chin 10 mm aside about the plane of symmetry, 8 to 11 mm off, both without a doubt.
+@pytest.mark.parametrize("name", warped_heads.JAW_SHIFTS)
+def test_a_mandible_far_from_its_place_has_its_landmarks_and_leaves_the_upper_jaw_its_own(name):
+    head = next(head for known, head in warped(atlas()) if known == name)
+    found = cmfsim.propose_landmarks(head.bones, head.skin)
+    for sites, truth in zip((found.skull, found.skin), head.truth, strict=True):
+        errors = {n: np.linalg.norm(site.point - truth[n]) for n, site in sites.items()}
+        assert np.mean([*errors.values()]) < 2.5
+        molars = [e for n, e in errors.items() if n.startswith(("sub_m2", "supra_m2"))]
+        assert max(molars, default=0.0) < 4.0
+        assert all(e < 2.0 * sites[n].error for n, e in errors.items() if not sites[n].doubt)
 
 
 @pytest.mark.parametrize("size", [0.7, 0.85, 1.25])

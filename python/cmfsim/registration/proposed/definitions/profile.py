@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from cmfsim.registration.proposed.definitions.depth_maps import STEP, DepthMap
 from cmfsim.values.checks import Floats
 
-# How far from the plane of symmetry the midline of a jaw is looked for, mm.
-LEAN = 9.0
+# How far from the plane of symmetry the midline of a jaw is looked for, mm; the second, if it leans
+# farther than the first.
+LEANS = (9.0, 18.0)
 # Half the width over which both sides are compared, and cells that are left out at the middle, mm.
 HALF_WIDTH, CORE = 26.0, 1.5
 # Differences between the sides count up to this, mm: a tooth that one side lacks must not pull.
@@ -38,23 +39,28 @@ def local_midline(front: DepthMap, band: tuple[float, float], about: float = 0.0
     strip = front.values[:, columns]
     if np.isfinite(strip).sum() * STEP * STEP < 200.0:
         return None
+    for lean in LEANS:
+        middles = about + np.arange(-lean, lean + 0.01, 0.5 * STEP)
+        scores = [
+            _unevenness(front, strip, middle) + PULL * (middle - about) ** 2 for middle in middles
+        ]
+        best = int(np.argmin(scores))
+        if 0 < best < len(scores) - 1:
+            a, b, c = scores[best - 1 : best + 2]
+            bend = a - 2.0 * b + c
+            return float(middles[best] + (0.5 * (a - c) / bend if bend > 0.0 else 0.0) * 0.5 * STEP)
+    return None
+
+
+def _unevenness(front: DepthMap, strip: Floats, middle: float) -> float:
+    """How much the two sides of a strip differ about a middle, mm on average."""
     offsets = np.arange(CORE, HALF_WIDTH, STEP)
-    middles = about + np.arange(-LEAN, LEAN + 0.01, 0.5 * STEP)
-    scores = []
-    for middle in middles:
-        right = _rows(front, strip, middle - offsets)
-        left = _rows(front, strip, middle + offsets)
-        gap = np.abs(left - right)
-        gap[np.isnan(left) != np.isnan(right)] = MOST_DIFFERENCE
-        gap = np.minimum(gap[np.isfinite(gap)], MOST_DIFFERENCE)
-        score = float(gap.mean()) if len(gap) else MOST_DIFFERENCE
-        scores.append(score + PULL * (middle - about) ** 2)
-    best = int(np.argmin(scores))
-    if not 0 < best < len(scores) - 1:
-        return None
-    a, b, c = scores[best - 1 : best + 2]
-    bend = a - 2.0 * b + c
-    return float(middles[best] + (0.5 * (a - c) / bend if bend > 0.0 else 0.0) * 0.5 * STEP)
+    right = _rows(front, strip, middle - offsets)
+    left = _rows(front, strip, middle + offsets)
+    gap = np.abs(left - right)
+    gap[np.isnan(left) != np.isnan(right)] = MOST_DIFFERENCE
+    gap = np.minimum(gap[np.isfinite(gap)], MOST_DIFFERENCE)
+    return float(gap.mean()) if len(gap) else MOST_DIFFERENCE
 
 
 def _rows(front: DepthMap, strip: Floats, places: Floats) -> Floats:

@@ -221,8 +221,10 @@ def _jaw_angle(view: SideView, half: Floats, found: Sites) -> None:
     view.put(found, "gonion", np.array([0.5 * (at[0] + lateral), at[1], at[2]]))
 
 
-# Between the upper incisors and the front of the ramus, the second molar stands at this share.
-MOLAR_SHARE = 0.803
+# Between the upper incisors and the front of the ramus, the upper second molar stands at this share
+# if the edge of the lower incisors is this far behind that of the upper ones, mm. Else the whole
+# lower jaw, ramus and molars, is as much farther back or forwards.
+MOLAR_SHARE, OVERJET = 0.803, 5.1
 # From the plane where the molars meet up and down to the sites, and how far back the lower is, mm.
 OVER_MOLARS, UNDER_MOLARS, LOWER_BEHIND = 13.0, 19.5, 3.8
 # Where molars stand across, mm.
@@ -234,6 +236,8 @@ def _teeth_line(view: SideView, found: Sites) -> None:
     lower, neck = found.get("_lower_edge"), found.get("supradentale")
     if lower is None or neck is None:
         return
+    upper = found.get("_upper_edge")
+    behind = 0.0 if upper is None else float(lower[1] - upper[1]) - OVERJET
     across = np.abs(view.mandible[:, 0])
     teeth = view.mandible[(across > MOLAR_ROW[0]) & (across < MOLAR_ROW[1])]
     level = float(lower[2]) + 4.0
@@ -243,15 +247,15 @@ def _teeth_line(view: SideView, found: Sites) -> None:
         if front is None:
             return
         border = front
-        molar = float(neck[1]) + MOLAR_SHARE * (border - float(neck[1]))
-        row = teeth[np.abs(teeth[:, 1] - molar) < 4.0]
+        molar = float(neck[1]) + MOLAR_SHARE * (border - behind - float(neck[1]))
+        row = teeth[np.abs(teeth[:, 1] - molar - behind) < 4.0]
         if len(row) < 10:
             return
         level = float(np.quantile(row[:, 2], 0.995)) - 0.8
     view.put(found, "occlusal_line", np.array([-view.jaw.at(border, level), border, level]))
     high = level + OVER_MOLARS
     view.put(found, "supra_m2", np.array([-view.outer.at(molar, high), molar, high]))
-    back, low = molar + LOWER_BEHIND, level - UNDER_MOLARS
+    back, low = molar + behind + LOWER_BEHIND, level - UNDER_MOLARS
     view.put(found, "sub_m2", np.array([-view.jaw.at(back, low), back, low]))
 
 
