@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from cmfsim.registration.proposed.definitions.depth_maps import STEP, DepthMap
-from cmfsim.registration.proposed.definitions.skin_sites import MOUTH_CORNER, find_skin_sites
+from cmfsim.registration.proposed.definitions.skin_sites import (
+    MOUTH_CORNER,
+    _peaks,
+    find_skin_sites,
+)
 
 pytest.importorskip("scipy")
 
@@ -83,3 +87,13 @@ def test_a_nose_that_the_image_cuts_off_on_one_side_keeps_its_other_wing():
     half = find_skin_sites(DepthMap(whole.low, values), SKULL)
     wing = find_skin_sites(whole, SKULL)["alare_L"]
     np.testing.assert_allclose(half["alare_L"], wing, atol=0.5)
+
+
+@pytest.mark.parametrize("step", [0.0, 0.5])
+def test_peaks_are_those_of_scipy_flat_ones_too(step):
+    signal = pytest.importorskip("scipy.signal")
+    rng = np.random.default_rng(3)
+    for least in (0.15, 0.5, 1.0) * 20:
+        line = np.cumsum(rng.normal(size=rng.integers(3, 80)))
+        line = np.round(line / step) * step if step else line
+        assert _peaks(line, least) == signal.find_peaks(line, prominence=least)[0].tolist()

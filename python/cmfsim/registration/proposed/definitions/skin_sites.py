@@ -1,6 +1,7 @@
 """Each landmark of the skin where its own definition holds, supported by those of the skull."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 
@@ -121,9 +122,7 @@ def _lips(front: DepthMap, lean: float, ends: tuple[float, float], found: Sites)
     a, b = inside[0], inside[-1]
     chord = line[a] + (line[b] - line[a]) * (z[inside] - z[a]) / (z[b] - z[a])
     out = chord - line[inside]
-    signal = third_party("scipy.signal", "landmarks are proposed", "imaging")
-    # The local maxima that rise from both sides by a lip's least height.
-    peaks = signal.find_peaks(out, prominence=LEAST_LIP)[0].tolist()
+    peaks = _peaks(out, LEAST_LIP)
     if len(peaks) < 2:
         return
     # The two that stand out most, from above.
@@ -133,6 +132,24 @@ def _lips(front: DepthMap, lean: float, ends: tuple[float, float], found: Sites)
         at = inside[k] + round(beyond / STEP)
         if np.isfinite(line[at]):
             found[name] = np.array([lean, line[at], z[at]])
+
+
+def _peaks(line: Floats, least: float) -> list[int]:
+    """The local maxima that rise from both sides by so much; the middle of one that is flat.
+
+    Those of SciPy's `find_peaks` by prominence; loading `scipy.signal` takes half a second.
+    """
+    found = []
+    changes = np.flatnonzero(np.diff(line)).tolist()
+    for before, last in pairwise(changes):
+        top, after = line[last], last + 1
+        if max(line[before], line[after]) < top:
+            higher = np.flatnonzero(line > top)
+            low = higher[higher < last].max(initial=-1) + 1
+            high = higher[higher > last].min(initial=len(line))
+            if top - max(line[low:last].min(), line[after:high].min()) >= least:
+                found.append((before + after) // 2)
+    return found
 
 
 def _mouth_corner(front: DepthMap, lean: float, height: float, side: int) -> tuple[float, float]:
