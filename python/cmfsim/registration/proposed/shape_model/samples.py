@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,12 +54,12 @@ def cut_planes(
 ) -> tuple[CutPlane, ...]:
     """The planes at which surfaces end flat: borders of the image, padding, or a cut neck."""
     ends = [(sign * np.eye(3)[axis], CAP_DEPTH) for axis in range(3) for sign in (-1.0, 1.0)]
-    shapes = [_Shape.of(surface) for surface in surfaces]
+    shapes = [_SHAPES.get(s) or _SHAPES.setdefault(s, _Shape.of(s)) for s in surfaces]
     if shown is not None:
         # Voxels make steps of a plane that runs obliquely.
         ends += [(normal, PADDED_DEPTH) for normal in shown.normals]
     oblique = len(ends)
-    ends += [(normal, CAP_DEPTH) for shape in shapes for normal in shape.flat_ends()]
+    ends += [(normal, CAP_DEPTH) for shape in shapes for normal in shape.flat_ends]
     found: list[CutPlane] = []
     for row, (normal, depth) in enumerate(ends):
         caps = [shape.cap(normal, depth) for shape in shapes]
@@ -106,8 +108,12 @@ class _Shape:
         near = along.max() - along < depth
         return float(along.max()), self._flat(normal, near) + self._missing(normal, near)
 
-    def flat_ends(self) -> Iterator[Floats]:
+    @cached_property
+    def flat_ends(self) -> tuple[Floats, ...]:
         """The directions, (3,), in which the surface ends flat or open, of its convex hull."""
+        return tuple(self._flat_ends())
+
+    def _flat_ends(self) -> Iterator[Floats]:
         spatial = third_party("scipy.spatial", "landmarks are proposed", "imaging")
         points = self.vertices[:: max(1, len(self.vertices) // HULL_POINTS)]
         try:
@@ -152,6 +158,9 @@ class _Shape:
         one, two = (self.vertices[rows] - first for rows in (starts, ends))
         return max(-0.5 * float(np.cross(one, two).sum(axis=0) @ normal), 0.0)
 
+
+# Those of surfaces in use: the skin is asked for its ends beside all bone, then beside some.
+_SHAPES: WeakKeyDictionary[SurfaceData, _Shape] = WeakKeyDictionary()
 
 # Points on bone and skin that a fit is made with.
 BONE_POINTS, SKIN_POINTS = 3000, 2500
