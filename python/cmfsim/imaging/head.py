@@ -1,7 +1,7 @@
 """The way from a CT to an anatomy, stage by stage, and whether the CT shows the whole head."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -107,8 +107,12 @@ def segmented(
     *,
     landmarks: Mapping[str, ArrayLike] | None = None,
     progress: Progress | None = None,
+    on_skin: Callable[[ImageData], object] | None = None,
 ) -> tuple[Anatomy, OpenHead]:
-    """What `segment_head` gives, and the head from which it is segmented with other landmarks."""
+    """What `segment_head` gives, and the head from which it is segmented with other landmarks.
+
+    on_skin: Called with the level of the skin while the jaws are separated, in another thread.
+    """
     options = SegmentOptions() if options is None else options
 
     def say(stage: str) -> None:
@@ -131,6 +135,7 @@ def segmented(
         # Where the bone is and which of it is the jaw are found without each other.
         level = beside.submit(bone_level, bone, options)
         noticed = beside.submit(_noticed, work, skin, bone, options)
+        skinned = beside.submit(_skin_image, work, skin, on_skin)
         if modelled is not None:
             modelled.result()
         bones, teeth, jaws = _bones(work, bone, skin, points, level, options=options, say=say)
@@ -140,7 +145,7 @@ def segmented(
         things = [thing.finding for thing in attached]
         findings = (*first, *weak, *second, *seen, *things, *jaws)
     air = None if hollow is None else work.image(hollow)
-    levels = work.image(skin.level), bones, air, teeth
+    levels = skinned.result(), bones, air, teeth
     boxes = tuple(thing.box for thing in attached)
     return Anatomy(*levels, findings, shown=work.shown, attached=boxes), head
 
@@ -166,6 +171,13 @@ def _opened(
     bone = find_bone(work, metal, skin, options)
     second = (*metal.findings, *skin.findings, *bone.findings)
     return OpenHead(work, skin, bone, ((*findings, *cupping, *noisy), second))
+
+
+def _skin_image(work: Working, skin: Skin, then: Callable[[ImageData], object] | None) -> ImageData:
+    image = work.image(skin.level)
+    if then is not None:
+        then(image)
+    return image
 
 
 def _noticed(

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -22,6 +23,7 @@ from cmfsim.io.meshes.photos import photo_files
 from cmfsim.io.results.result_files import is_model_file
 from cmfsim.io.slicer.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces, signed_level
+from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.case_parts import CaseImage, CaseMesh, CaseMotion
@@ -102,6 +104,8 @@ def read_anatomy(
             tissue,
             landmarks=landmarks or None,
             progress=lambda stage: progress(f"segmenting the head: {stage}"),
+            # Landmarks that are to be found need the skin's surface first.
+            on_skin=None if landmarks else partial(detailed_surface, "skin"),
         )
         if kept is not None and is_new:
             kept[key] = opened, noticed
