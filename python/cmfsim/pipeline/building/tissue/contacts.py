@@ -194,10 +194,12 @@ def cleft_tets(
     least = np.where(owner < 0, most[:, None], owner).min(axis=1)
     inside |= (most != least) & (moves[most] | moves[least])
 
-    corners = nodes[tets]
-    centroids = corners.mean(axis=1)
+    # Coordinate by coordinate, (3, 4, m): sums over three or four neighbours in memory are slow.
+    corners = nodes.T[:, tets.T]
+    middles = corners.mean(axis=1)
     # A point is at most so much nearer to anything than the nearest corner of its tet.
-    radius = np.linalg.norm(corners - centroids[:, None], axis=2).max(axis=1)
+    radius = np.sqrt(((corners - middles[:, None]) ** 2).sum(axis=0).max(axis=0))
+    centroids = middles.T
     reach = width + float(radius.max())
     surfaces = [s.surface.searched for s in segments]
     is_moved = np.array([segment.name in moved for segment in segments])
