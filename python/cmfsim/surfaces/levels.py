@@ -212,18 +212,17 @@ def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> S
 def _closed(points: Floats, corners: Indices) -> tuple[Floats, NDArray[np.int64]]:
     """The surface with triangles at edges that more than two share removed, and holes filled."""
     triangles = corners.astype(np.int64)
-    while True:
-        low, high = np.sort(_half_edges(triangles), axis=1).T
-        _, number, count = np.unique(
-            low * len(points) + high, return_inverse=True, return_counts=True
-        )
-        shared = (count[number] > 2).reshape(3, -1).any(axis=0)
-        if not shared.any():
-            break
-        triangles = triangles[~shared]
-    edges = _half_edges(triangles)
     n = len(points)
-    lone = ~np.isin(edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0])
+    while True:
+        edges = _half_edges(triangles)
+        keys = np.minimum(*edges.T) * n + np.maximum(*edges.T)
+        in_order = np.sort(keys)
+        thrice = in_order[2:][in_order[2:] == in_order[:-2]]
+        if not len(thrice):
+            break
+        triangles = triangles[~_among(keys, thrice).reshape(3, -1).any(axis=0)]
+    back = edges[:, 1] * n + edges[:, 0]
+    lone = ~_among(edges[:, 0] * n + edges[:, 1], np.sort(back))
     centres: list[Floats] = []
     fans: list[tuple[int, int, int]] = []
     borders = edges[lone][:, ::-1]
@@ -234,6 +233,13 @@ def _closed(points: Floats, corners: Indices) -> tuple[Floats, NDArray[np.int64]
     if not centres:
         return points, triangles
     return np.vstack([points, centres]), np.vstack([triangles, np.array(fans, dtype=np.int64)])
+
+
+def _among(keys: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which keys are among others, which are in order: a third of the time of `np.isin`."""
+    places = np.minimum(np.searchsorted(others, keys), len(others) - 1)
+    found: NDArray[np.bool_] = others[places] == keys
+    return found
 
 
 def _half_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
