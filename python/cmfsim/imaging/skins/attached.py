@@ -242,14 +242,14 @@ def _pieces(
 
 def _dense_all_through(hu: Volume, layer: Mask, spacing: NDArray[np.float64]) -> Mask:
     """Where a layer under the skin is denser than tissue, and evenly so: rests, gel, bolus."""
-    weights = layer.astype(np.float32)
-
-    def mean(values: Volume) -> Any:
-        shares = smoothed(weights, AMONG, spacing)
-        return smoothed(weights * values, AMONG, spacing) / np.maximum(shares, np.float32(1e-6))
-
     if not layer.any():
         return layer
+    weights = layer.astype(np.float32)
+    shares = np.maximum(smoothed(weights, AMONG, spacing), np.float32(1e-6))
+
+    def mean(values: Volume) -> Any:
+        return smoothed(weights * values, AMONG, spacing) / shares
+
     middle = mean(hu)
     spread = np.sqrt(np.maximum(mean(hu * hu) - middle * middle, 0.0))
     least = max(MUSCLE, float(np.median(hu[layer])) + DENSER)
