@@ -15,7 +15,7 @@ from cmfsim.imaging.bones.metal import cropped, find_metal
 from cmfsim.imaging.intensities.cupping import without_cupping, without_noise
 from cmfsim.imaging.intensities.intensity import weak_bone
 from cmfsim.imaging.intensities.levels import level_of
-from cmfsim.imaging.morphology import Mask, Volume, depth, label, load, simpleitk
+from cmfsim.imaging.morphology import Mask, Volume, depth, label, load
 from cmfsim.imaging.options import SegmentOptions
 from cmfsim.imaging.skins.attached import Attached, find_attached
 from cmfsim.imaging.skins.skin import SKIN_SCALE, Skin, find_skin
@@ -121,8 +121,6 @@ def segmented(
             progress(stage)
 
     points = None if landmarks is None else _checked(landmarks)
-    # Needed first: one library is loaded at a time.
-    simpleitk()
     with ThreadPoolExecutor(THREADS) as beside:
         # Libraries, while the image is resampled.
         beside.submit(load)
