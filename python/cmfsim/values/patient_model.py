@@ -205,12 +205,12 @@ class PatientModel(Frozen):
         """Whether the landmarks were found automatically: the case names none."""
         return "landmarks" in self.summary
 
-    @property
+    @cached_property
     def skin_nodes(self) -> NDArray[np.uint32]:
         """The nodes on the skin, (k,) uint32, ascending: vertex i of `skin` is node i of these."""
         return used_nodes(self.skin_triangles)[0].astype(np.uint32)
 
-    @property
+    @cached_property
     def skin(self) -> SurfaceData:
         """The patient's skin as the mesh has it, outward."""
         nodes, triangles = used_nodes(self.skin_triangles)

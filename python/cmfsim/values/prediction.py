@@ -98,20 +98,22 @@ class Prediction(Frozen):
         """The patient's skin before the operation, as the mesh has it."""
         return self.patient.skin
 
-    @property
+    @cached_property
     def skin(self) -> SurfaceData:
         """The predicted skin: the vertices and triangles of `skin_before`, moved."""
         before = self.skin_before
         return SurfaceData(before.vertices + self.skin_displacements, before.triangles)
 
-    @property
+    @cached_property
     def skin_displacements(self) -> Floats:
         """How each vertex of the skin moves, (k, 3) mm: as its node, except where the tissue ends.
 
         Next to the planes on which the tissue ends, and is fixed, it moves as the skin before them
         (`SkinEnd`).
         """
-        return self.patient.skin_field(self.result.displacements)
+        moved = self.patient.skin_field(self.result.displacements)
+        moved.setflags(write=False)
+        return moved
 
     def carried(self, points: ArrayLike) -> Floats:
         """How points on or near the skin move, (k, 3) mm: as `carried_points` has it.
