@@ -22,6 +22,8 @@ NUMBERS = {
                                     "plan-centre-far"),
     "centimetres": (TURN, "translation = [0, -0.4, 0.1]", "plan-tiny"),
     "another order": (TURN, "translation = [-4, 0, 1]", "plan-sideways"),
+    "the skull": ("[plan.mandible]", "[plan.cranium]\ntranslation = [0, -3, 0]\n\n[plan.mandible]",
+                  "plan-cranium"),
     "both Le Fort": ("[plan.mandible]", f"{LE_FORT}\n[plan.mandible]", "cuts-both-le-fort"),
 }  # fmt: skip
 

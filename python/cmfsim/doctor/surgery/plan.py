@@ -28,6 +28,8 @@ SMALL, SIDEWAYS = 1.0, 3.0
 TINY_TURN = (1e-3, 0.2)
 # No segment is turned about a point further from it than this, mm: a head is 250 mm high.
 FAR_CENTRE = 150.0
+# Bones that jaw surgery leaves where they are, by the names that segmentation and cases give them.
+HELD = ("cranium", "skull")
 # Less than this is rounding of no motion, mm and degrees.
 NOTHING = 1e-6
 # Where no surface of the segment is known, how far it reaches from the point that is, mm.
@@ -82,6 +84,10 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
             where=motion.where,
             fix=remedy,
             facts={"most": FAR},
+        )
+    elif far > SMALL and motion.name in HELD:
+        yield Finding(
+            "plan-cranium", f"{motion.name} moves by up to {far:.1f} mm", where=motion.where
         )
     elif angle > TINY_TURN[0] and motion.typed and motion.centre is None:
         yield Finding(
