@@ -195,6 +195,7 @@ WRONG = {
     "name": ('name = "half"', 'name = "../half"', 38, "osteotomies[1].name is not a valid name"),
     "unknown motion": ("angle = 90", "angel = 90", 42, "did you mean 'angle'"),
     "zero axis": ("axis = [0, 0, 1]", "axis = [0, 0, 0]", 43, "axis is (0, 0, 0)"),
+    "no angle": ("angle = 90\n", "", 42, "axis turns nothing without an angle: give angle"),
     "no rotation": ("[[1, 0, 0, 2]", "[[2, 0, 0, 2]", 47, "matrix is not rigid"),
     "three rows": (", [0, 0, 0, 1]]", "]", 47, "four rows of four numbers"),
     "poisson": ("poisson = 0.46", "poisson = 0.5", 57, "must be above -1 and at most 0.4999"),

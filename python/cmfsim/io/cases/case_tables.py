@@ -367,6 +367,8 @@ def motion_of(table: Table, folder: Path) -> CaseMotion:
         if (vector := table.vector(key)) is not None
     }
     angle = table.number("angle", "degrees", low=-360.0, high=360.0)
+    if angle is None and "axis" in given:
+        table.fail("axis", "turns nothing without an angle: give angle (degrees), or remove axis")
     with table.at("axis" if "axis" in given else None):
         matrix = rigid_motion(angle=0.0 if angle is None else angle, **given)
     centre = given.get("centre")
