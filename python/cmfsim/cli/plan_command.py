@@ -158,7 +158,8 @@ def splint_case(options: argparse.Namespace) -> int:
     """Makes a splint and writes it."""
     case = case_of(options)
     kind = "intermediate" if options.intermediate else "final"
-    path = _free_path(case, options.out, f"splint-{kind}.stl")
+    # The whole name is known when the plan is.
+    _free_path(case, options.out, f"splint-{kind}.stl")
     notices, findings = checked(options, case)
     more = {} if options.thickness is None else {"thickness": options.thickness}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
@@ -173,10 +174,14 @@ def splint_case(options: argparse.Namespace) -> int:
             observer=notices,
             **more,
         )
+        which = "-".join(filter(None, (kind, made.first, made.plan_digits)))
+        path = _free_path(case, options.out, f"splint-{which}.stl")
         path.parent.mkdir(parents=True, exist_ok=True)
         write_surface(path, made.surface)
     values = {
         "splint": kind,
+        "first": made.first,
+        "plan_digits": made.plan_digits,
         "file": str(path),
         "thickness_mm": made.thickness,
         "seat_mm": made.seat,
@@ -186,6 +191,9 @@ def splint_case(options: argparse.Namespace) -> int:
         print_json({"case": case.name, **values})
         return DONE
     print_text(f"splint {kind}: {escaped(str(path))}")
+    other = "mandible" if made.first == "maxilla" else "maxilla"
+    held = f"{made.first} as planned, {other} as before the operation"
+    print_text(f"       {held if made.first else 'both jaws as planned'}; plan {made.plan_digits}")
     print_text(
         f"       {made.thickness:.2f} mm thick between the teeth, which seat to {made.seat:.2f} mm"
     )

@@ -3,7 +3,7 @@
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +46,7 @@ from cmfsim.planning.replanning import (
 from cmfsim.values.anatomy import JAWS, BoneSegment
 from cmfsim.values.checks import Floats, as_whole, check_one_of
 from cmfsim.values.landmark_sites import label_key
+from cmfsim.values.motion import plan_digits
 from cmfsim.values.progress import BUILDING, PLANNING
 from cmfsim.values.skin_band import BandOptions
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
@@ -340,9 +341,10 @@ def make_splint(
             row.moved(motions[row.arch.jaw]) if row.arch.jaw in held else row for row in rows
         )
         hinge = _hinge(bones.segments)
-        return splint_between(
+        made = splint_between(
             upper, lower, hinge, thickness=thickness, opening=opening, label=label
         )
+        return replace(made, first=intermediate, plan_digits=plan_digits(bones.motions))
 
 
 def plan_for_bite(

@@ -137,7 +137,7 @@ def solved_patient(
         "model": model,
         "case_key": _case_key(patient, scene),
         "plan": planned_motions(patient, scene),
-        "plan_digits": plan_digits({n: _entries(motion) for n, motion in scene.plan.items()}),
+        "plan_digits": plan_digits(scene.plan),
         "skin": {
             "mean": float(moved.mean()),
             "p95": float(np.percentile(moved, 95)),
@@ -180,13 +180,6 @@ def _arrays(scene: Scene) -> Iterator[tuple[str, NDArray[Any]]]:
             yield f"moved {name}", motion.moved_vertices
         else:
             yield f"motion of {name}", motion
-
-
-def _entries(motion: NDArray[Any] | MovedSurface) -> NDArray[np.float64]:
-    """The numbers of a motion: a matrix, or how its vertices move."""
-    if isinstance(motion, MovedSurface):
-        return np.asarray(motion.moved_vertices - motion.surface.vertices, dtype=np.float64)
-    return np.asarray(motion, dtype=np.float64)
 
 
 def planned_motions(patient: PatientModel, scene: Scene) -> dict[str, dict[str, Any]]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import rigid_matrix as rigid_matrix  # noqa: PLC0414 (passed on)
 from cmfsim.errors import BoundaryInputError, CaseInputError
 from cmfsim.values.checks import as_unmasked
+from cmfsim.values.surface_data import MovedSurface
 
 # Entries of motions are distinguished to a millionth, mm or of a rotation.
 DIGITS = 1e6
@@ -212,17 +213,21 @@ def _sine_cosine(degrees: float) -> tuple[float, float]:
     return sine, cosine
 
 
-def plan_digits(motions: Mapping[str, NDArray[np.float64]]) -> str:
+def plan_digits(motions: Mapping[str, NDArray[np.float64] | MovedSurface]) -> str:
     """Eight hexadecimal digits that plans of other motions do not share.
 
     The planning page writes the same digits into the plans that it saves. Segments that stay do
     not count.
 
-    motions: mapping of str to (4, 4), mm, by segment; or (n, 3), the motion of its vertices.
+    motions: mapping of str to (4, 4), mm, by segment; or the motion of its vertices, (n, 3) or a
+        surface.
     """
     texts = []
     for name, motion in motions.items():
-        parts = motion - np.eye(4) if motion.shape == (4, 4) else motion
+        if isinstance(motion, MovedSurface):
+            parts = motion.moved_vertices - motion.surface.vertices
+        else:
+            parts = motion - np.eye(4) if motion.shape == (4, 4) else motion
         numbers = np.floor(parts.ravel() * DIGITS + 0.5).astype(np.int64)
         if numbers.any():
             texts.append(f"{name}:{','.join(map(str, numbers.tolist()))}")

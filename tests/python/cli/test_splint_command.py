@@ -9,6 +9,7 @@ import cmfsim
 import phantom_case
 import shared_values
 from cmfsim.cli import main
+from cmfsim.values.motion import plan_digits
 
 # Degrees that make room in the closed bite of the synthetic head, as its refusal advises.
 OPENING = 4.0
@@ -28,7 +29,14 @@ def test_the_command_writes_a_splint_and_its_figures(case, capsys, monkeypatch):
     assert main(words) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["splint"] == "intermediate"
-    assert found["file"].endswith("splint-intermediate.stl")
+    digits = plan_digits(
+        {
+            "maxilla": cmfsim.rigid_motion((0, -4, 0)),
+            "mandible_body": cmfsim.rigid_motion((0, 3, 0)),
+        }
+    )
+    assert (found["first"], found["plan_digits"]) == ("maxilla", digits)
+    assert found["file"].endswith(f"splint-intermediate-maxilla-{digits}.stl")
     assert found["opening_degrees"] == OPENING
     assert found["thickness_mm"] >= 2.0
     assert found["seat_mm"] <= 0.1
@@ -40,7 +48,7 @@ def test_a_closed_bite_ends_with_the_opening_that_makes_room(case, capsys):
     assert main(["splint", str(case), "--json", "-q", "--no-doctor"]) == 2
     text = json.loads(capsys.readouterr().out)["error"]["text"]
     assert "splint-bite-closed" in text or "splint-rows-overlap" in text
-    assert not (case.parent / "out" / "splint-final.stl").exists()
+    assert not [*(case.parent / "out").glob("splint-final*")]
 
 
 def test_a_jaw_that_stays_needs_no_splint(case, tmp_path_factory):

@@ -66,6 +66,11 @@ class Splint:
         How deep a crown lies inside the splint at most: teeth seat to this.
     opening : float, degrees
         By which the lower jaw is opened about its joint heads.
+    first : str or None
+        The jaw that is as planned while the other is as before the operation, "maxilla" or
+        "mandible", of an intermediate splint of a case.
+    plan_digits : str
+        The digits of the plan that `predict` prints; of a splint of a case.
     """
 
     surface: SurfaceData
@@ -75,6 +80,8 @@ class Splint:
     thickness: float
     seat: float
     opening: float
+    first: str | None = None
+    plan_digits: str = ""
 
 
 def splint_between(
