@@ -6,6 +6,7 @@ insertion, so that no undercut holds it. Its walls lie at right angles to the bi
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -124,6 +125,7 @@ def splint_between(
     """
     _check_range("thickness", thickness, "mm", LEAST_THICKNESS, MOST_THICKNESS)
     _check_range("opening", opening, "°", 0.0, MOST_OPENING)
+    outline = _outline(label) if label else None
     lower = lower.moved(_opened(hinge, opening))
     overlap = contact_map(upper, lower).greatest_overlap
     if overlap > MOST_OVERLAP:
@@ -150,8 +152,8 @@ def splint_between(
         )
     teeth = np.maximum(*taken)
     level = _without_thin(grid, np.minimum(slab, -teeth))
-    if label:
-        level = np.maximum(level, np.minimum(_letters(label, grid, slab, ends), -teeth))
+    if outline is not None:
+        level = np.maximum(level, np.minimum(_letters(outline, grid, slab, ends), -teeth))
     made = _surface(grid.with_values(largest_piece(level)))
     back = np.asarray(np.linalg.inv(frame), dtype=np.float64)
     surface = SurfaceData(carried(back, made.vertices), made.triangles)
@@ -299,15 +301,18 @@ def _feet(grid: ImageData, level: NDArray[np.float32], line: Floats) -> NDArray[
     return beside & (level > 0.0)
 
 
-def _letters(
-    text: str, grid: ImageData, slab: NDArray[np.float32], ends: tuple[float, float]
-) -> NDArray[np.float32]:
-    """The level of letters that stand on the front of a slab, read from the patient's front."""
-    ndimage = third_party("scipy.ndimage", "splints are made", "imaging")
+def _outline(text: str) -> Any:
+    """The outline of letters, mm about their middle: a `matplotlib.path.Path`."""
     paths = third_party("matplotlib.textpath", "labels are drawn", "report")
     fonts = third_party("matplotlib.font_manager", "labels are drawn", "report")
     outlines = third_party("matplotlib.path", "labels are drawn", "report")
     font = fonts.FontProperties(weight="bold", size=LETTER)
+    known = fonts.get_font(fonts.findfont(font)).get_charmap()
+    if unknown := [letter for letter in text if ord(letter) not in known]:
+        raise CaseInputError(
+            f"label {text!r} has {unknown[0]!r} (splint-label), which would be an empty box: use "
+            "letters and digits"
+        )
     points, codes = paths.text_to_path.get_text_path(font, text, ismath=False)
     places = np.asarray(points, dtype=np.float64) * LETTER / paths.text_to_path.FONT_SCALE
     width = float(np.ptp(places[:, 0])) if len(places) else 0.0
@@ -316,10 +321,17 @@ def _letters(
             f"label {text!r} is {width:.0f} mm wide (splint-label): up to {WIDEST_LABEL:g} mm fit "
             "the front; use fewer letters"
         )
-    places -= 0.5 * (places.min(axis=0) + places.max(axis=0))
+    return outlines.Path(places - 0.5 * (places.min(axis=0) + places.max(axis=0)), codes)
+
+
+def _letters(
+    outline: Any, grid: ImageData, slab: NDArray[np.float32], ends: tuple[float, float]
+) -> NDArray[np.float32]:
+    """The level of letters that stand on the front of a slab, read from the patient's front."""
+    ndimage = third_party("scipy.ndimage", "splints are made", "imaging")
     x, y, z = grid.axes()
     flat = np.stack(np.broadcast_arrays(x[:, 0, :], z[0] - 0.5 * sum(ends)), axis=-1)
-    inside = outlines.Path(places, codes).contains_points(flat.reshape(-1, 2))
+    inside = outline.contains_points(flat.reshape(-1, 2))
     inside = inside.reshape(flat.shape[:2])
     stroke = ndimage.distance_transform_edt(inside) - ndimage.distance_transform_edt(~inside)
     # The front of each column of voxels is the first that the slab has at mid-height.

@@ -246,6 +246,8 @@ def test_a_label_stands_out_of_the_front_alone(coarse):
     assert shape_of(made.surface).is_manifold
     with pytest.raises(cmfsim.CaseError, match="splint-label"):
         cmfsim.splint_between(coarse.upper, coarse.lower, HINGE, label="a name that is too long")
+    with pytest.raises(cmfsim.CaseError, match=r"label 'Nr\. 漢' has '漢' \(splint-label\)"):
+        cmfsim.splint_between(coarse.upper, coarse.lower, HINGE, label="Nr. 漢")
 
 
 def test_a_jaw_without_teeth_has_no_row():
