@@ -167,3 +167,17 @@ def test_figures_of_a_prediction_follow_its_plan(tmp_path_factory):
     few = {**patient.landmarks, "skin": {"labiale_superius": lip}}
     fewer = dataclasses.replace(prediction.patient, landmarks=few)
     assert not face_motion(dataclasses.replace(prediction, patient=fewer))
+
+
+@pytest.mark.parametrize("measured", [cmfsim.cephalometry, cmfsim.occlusion])
+def test_what_are_no_landmarks_of_a_head_has_no_values(known, measured):
+    """Sides exchanged turned the ANB of 5° into -5°, in any position of the head."""
+    motion = cmfsim.rigid_motion((5.0, 6.0, 7.0), 140.0, (1.0, 2.0, 3.0))
+    mirrored = {name: (motion @ [-x, y, z, 1.0])[:3] for name, (x, y, z) in known.items()}
+    with pytest.raises(cmfsim.LandmarkError, match="left and right are swapped in the landm"):
+        measured(mirrored)
+    with pytest.raises(cmfsim.LandmarkError, match="left and right are swapped"):
+        measured(known, mirrored)
+    for place in ((np.nan, 0.0, 0.0), (0.0, 0.0), "front"):
+        with pytest.raises(cmfsim.LandmarkError, match="landmark pogonion"):
+            measured(known | {"pogonion": place})

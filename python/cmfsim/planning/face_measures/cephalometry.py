@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import rigid_fit
-from cmfsim.errors import RegistrationError
+from cmfsim.errors import CaseInputError, LandmarkInputError, RegistrationError
 from cmfsim.planning.face_measures.definitions import Measure, measures_of
-from cmfsim.values.checks import Floats
+from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, profile_sites
 
 # Sites that are constructed: points of the Frankfort plane and of the occlusal plane.
@@ -32,6 +32,11 @@ BITES = (
     (("U-back", "L-back"), ("U-front", "L-front")),
     (("supra_m2", "sub_m2"), ("Pr", "Id")),
 )
+
+
+# With the labels of both sides exchanged, landmarks that fit the average head so much better were
+# exchanged; sites of one side and the midline may fit equally well both ways.
+EXCHANGED = 0.8
 
 
 def _turn(a: Floats, b: Floats, c: Floats, d: Floats) -> float:
@@ -82,6 +87,11 @@ def cephalometry(
     dict of str to float or None
         By `Measure.key`, mm or degrees.
 
+    Raises
+    ------
+    LandmarkError
+        (also `ValueError`) A landmark that is not three finite numbers; left and right swapped.
+
     Examples
     --------
     >>> import cmfsim
@@ -89,8 +99,19 @@ def cephalometry(
     >>> round(cmfsim.cephalometry(sites)["anb"], 2)
     3.88
     """
-    places = projected(landmarks, before)
+    places = projected(known_sites(landmarks), None if before is None else known_sites(before))
     return {measure.key: value_of(measure, places) for measure in CEPHALOMETRIC_MEASURES}
+
+
+def known_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
+    """The landmarks as points, mm.
+
+    Raises `LandmarkError`: One is not three finite numbers.
+    """
+    try:
+        return {name: as_point(f"landmark {name}", place) for name, place in landmarks.items()}
+    except CaseInputError as error:
+        raise LandmarkInputError(str(error)) from error
 
 
 def value_of(measure: Measure, places: Mapping[str, Floats]) -> float | None:
@@ -122,6 +143,8 @@ def head_axes(landmarks: Mapping[str, ArrayLike]) -> Floats:
     The plane is normal to the mean direction between the two sides of the cranium, and forwards
     lies in the Frankfort plane of the average head registered to the cranium. With fewer than three
     sites of it, both are those of the coordinates.
+
+    Raises `LandmarkError`: Left and right are swapped, from which no midsagittal plane follows.
     """
     average = REFERENCE_PLACES["skull"]
     names = [name for name in average if name in landmarks and not is_lower_site(name)]
@@ -130,7 +153,16 @@ def head_axes(landmarks: Mapping[str, ArrayLike]) -> Floats:
     if len(names) >= 3:
         # Sites on a line tell no turn.
         with contextlib.suppress(RegistrationError):
-            turn = rigid_fit([average[name] for name in names], [*places.values()]).matrix[:3, :3]
+            known, given = [average[name] for name in names], [*places.values()]
+            fit = rigid_fit(known, given)
+            turn = fit.matrix[:3, :3]
+            exchanged = rigid_fit([average[_other_side(name)] for name in names], given)
+            if exchanged.rms < EXCHANGED * fit.rms:
+                raise LandmarkInputError(
+                    "left and right are swapped in the landmarks of the cranium: L and R are the "
+                    "patient's sides; swap the labels _L and _R, or if the whole head is mirrored, "
+                    "export it again"
+                )
     lefts = [name for name in names if name.endswith("_L") and f"{name[:-2]}_R" in places]
     across = sum((places[n] - places[f"{n[:-2]}_R"] for n in lefts), np.zeros(3))
     across = across if lefts else turn[:, 0]
@@ -138,6 +170,10 @@ def head_axes(landmarks: Mapping[str, ArrayLike]) -> Floats:
     forwards = -turn[:, 1] + (turn[:, 1] @ across) * across
     forwards = forwards / np.linalg.norm(forwards)
     return np.stack([forwards, np.cross(forwards, across)])
+
+
+def _other_side(name: str) -> str:
+    return name[:-1] + {"L": "R", "R": "L"}[name[-1]] if name[-2:] in ("_L", "_R") else name
 
 
 def projected(

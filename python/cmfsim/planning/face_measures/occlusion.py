@@ -14,7 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmfsim.planning.face_measures.cephalometry import FORMULAS, OCCLUSAL, head_axes, occlusal_plane
+from cmfsim.planning.face_measures.cephalometry import (
+    FORMULAS,
+    OCCLUSAL,
+    head_axes,
+    known_sites,
+    occlusal_plane,
+)
 from cmfsim.planning.face_measures.definitions import measures_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -96,6 +102,11 @@ def occlusion(
     dict of str to float or None
         By `Measure.key`, mm or degrees.
 
+    Raises
+    ------
+    LandmarkError
+        As `cephalometry`.
+
     Examples
     --------
     >>> import cmfsim
@@ -103,7 +114,8 @@ def occlusion(
     >>> cmfsim.occlusion(sites)["upper_midline"]
     1.5
     """
-    frame = bite_frame(landmarks if before is None else before)
+    landmarks = known_sites(landmarks)
+    frame = bite_frame(landmarks if before is None else known_sites(before))
     places = np.array([*landmarks.values()], dtype=np.float64).reshape(-1, 3)
     found = {
         key: term.value(term.weights @ places, frame)
