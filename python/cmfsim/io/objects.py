@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from cmfsim._core import TetMesh
-from cmfsim.errors import ImageInputError
+from cmfsim.errors import CaseInputError, ImageInputError
 from cmfsim.io.images.image_files import logged, placed
 from cmfsim.io.images.image_headers import check_affine, check_shape
 from cmfsim.io.meshes.mesh_files import read_tets
 from cmfsim.io.meshes.plain_mesh import NAMES, Cells, PlainMesh, oriented
 from cmfsim.io.meshes.surfaces import surface_of
+from cmfsim.values.checks import as_floats
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
@@ -21,6 +22,8 @@ _log = logging.getLogger(__name__)
 
 # nibabel's names of units of length, mm; others state none, and are mm.
 UNITS = {"meter": 1000.0, "micron": 0.001}
+# Cells of a surface, and what is passed over beside them.
+OF_SURFACE = {"triangle", "quad", "vertex", "line"}
 
 
 def from_meshio(mesh: Any) -> TetMesh | SurfaceData:
@@ -37,8 +40,8 @@ def from_meshio(mesh: Any) -> TetMesh | SurfaceData:
     Raises
     ------
     CaseError
-        (also `ValueError`) Other volume cells, no triangles, an index that is not there, a point
-        that is not finite.
+        (also `ValueError`) No mesh, other volume cells, no triangles, an index that is not there or
+        no whole number, a point that is not finite.
     MeshError
         (also `ValueError`) Tets without volume, or nodes that no tet uses: see `repair_tets`.
 
@@ -49,6 +52,7 @@ def from_meshio(mesh: Any) -> TetMesh | SurfaceData:
     >>> cmfsim.from_meshio(meshio.Mesh(corners, [("tetra", [[0, 2, 1, 3]])])).n_tets
     1
     """
+    _check_kind(mesh, "cell_sets", "meshio.Mesh")
     return _mesh_of(mesh.points, [(str(b.type), b.data) for b in mesh.cells], "meshio mesh")
 
 
@@ -61,15 +65,39 @@ def from_pyvista(mesh: Any) -> TetMesh | SurfaceData:
     >>> cmfsim.from_pyvista(pyvista.Sphere()).vertices.shape
     (842, 3)
     """
+    _check_kind(mesh, "cast_to_unstructured_grid", "PyVista data set")
     grid = mesh.cast_to_unstructured_grid()
     cells = [(NAMES.get(int(number), str(number)), c) for number, c in grid.cells_dict.items()]
     return _mesh_of(grid.points, cells, "PyVista mesh")
 
 
+def _check_kind(mesh: Any, mark: str, wanted: str) -> None:
+    kind = type(mesh).__name__
+    if kind == "MultiBlock":
+        raise CaseInputError("the mesh is a MultiBlock: give one of its blocks, or its combine()")
+    if not hasattr(mesh, mark):
+        raise CaseInputError(
+            f"the mesh is of type {kind}: a {wanted} is needed; read_tet_mesh and read_surface "
+            "read files"
+        )
+
+
 def _mesh_of(points: Any, cells: Iterable[tuple[str, Any]], name: str) -> TetMesh | SurfaceData:
-    blocks = tuple(Cells(kind, np.asarray(rows, dtype=np.int64)) for kind, rows in cells)
-    mesh = PlainMesh(np.asarray(points, dtype=np.float64), blocks)
+    blocks = []
+    for kind, given in cells:
+        rows = np.asarray(given)
+        if rows.size and rows.dtype.kind not in "iu":
+            raise CaseInputError(
+                f"{name}: {kind} cells have dtype {rows.dtype}: whole numbers are needed"
+            )
+        blocks.append(Cells(kind, rows.astype(np.int64)))
+    mesh = PlainMesh(as_floats("points", points), tuple(blocks))
     if not len(mesh.cells_dict.get("tetra", ())):
+        if {b.type for b in mesh.cells if len(b.data)} - OF_SURFACE:
+            raise CaseInputError(
+                f"{name}: linear tets or triangles are needed, found {mesh.found}: convert the "
+                "cells first, such as by PyVista's linear_copy() and triangulate()"
+            )
         return surface_of(mesh, Path(name))
     tets = read_tets(mesh, Path(name))[0].astype(np.uint32)
     return TetMesh(mesh.points, oriented(mesh.points, tets)[0])

@@ -44,6 +44,36 @@ def test_what_is_no_mesh_of_tets_or_triangles_is_refused():
         cmfsim.from_meshio(meshio_mesh(CORNERS, [("triangle", [[0, 1, 9]])]))
 
 
+def test_what_other_arrays_would_be_cut_to_is_refused():
+    """Indices of 0.5 became 0, and the imaginary part of points was dropped."""
+    for points, tets, words in (
+        (CORNERS, np.array(TETS) + 0.5, "tetra cells have dtype float64: whole numbers"),
+        (CORNERS.astype(complex), TETS, "points has dtype complex128"),
+        (CORNERS.astype(str), TETS, "points has dtype <U"),
+    ):
+        with pytest.raises(CaseInputError, match=words):
+            cmfsim.from_meshio(meshio_mesh(points, [("tetra", tets)]))
+    second = ("tetra10", [[0, 1, 2, 3, 4, 0, 1, 2, 3, 4]])
+    with pytest.raises(CaseInputError, match=r"found tetra10: convert .* linear_copy\(\)"):
+        cmfsim.from_meshio(meshio_mesh(CORNERS, [second]))
+
+
+def test_what_is_no_mesh_is_named():
+    pv = pytest.importorskip("pyvista", reason="needs PyVista")
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.array(TETS)}, CORNERS)
+    for given, words in (
+        ("tissue.vtu", "of type str: a PyVista data set is needed; read_tet_mesh and"),
+        (None, "of type NoneType"),
+        (pv.MultiBlock([grid]), "is a MultiBlock: give one of its blocks"),
+        (meshio_mesh(CORNERS, [("tetra", TETS)]), "of type Mesh: a PyVista data set is needed"),
+    ):
+        with pytest.raises(CaseInputError, match=words):
+            cmfsim.from_pyvista(given)
+    for given in ("tissue.vtu", grid):
+        with pytest.raises(CaseInputError, match=r"a meshio\.Mesh is needed"):
+            cmfsim.from_meshio(given)
+
+
 def test_meshes_of_pyvista_come_back_as_they_went():
     pv = pytest.importorskip("pyvista", reason="needs PyVista")
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.array(TETS)}, CORNERS)
@@ -55,7 +85,7 @@ def test_meshes_of_pyvista_come_back_as_they_went():
     assert np.array_equal(surface.triangles, ball.regular_faces)
     # Quads are split.
     assert len(cmfsim.from_pyvista(pv.Plane(i_resolution=2, j_resolution=3)).triangles) == 12
-    with pytest.raises(CaseInputError, match="PyVista mesh: a surface of triangles is needed"):
+    with pytest.raises(CaseInputError, match=r"PyVista mesh: linear tets or tri.*triangulate"):
         cmfsim.from_pyvista(pv.ImageData(dimensions=(3, 3, 3)))
 
 
