@@ -147,6 +147,11 @@ def predict(
     >>> prediction.skin.vertices.shape  # doctest: +SKIP
     (19840, 3)
     """
+    if not isinstance(model, str):
+        raise CaseInputError(
+            f"model is {model!r}: predict takes one model, such as 'M+S'; predict_models takes "
+            "several and yields a prediction for each"
+        )
     # To its end: a bar then ends full.
     for found in [*predict_models(case, model, band=band, **options)]:
         return found

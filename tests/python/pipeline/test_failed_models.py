@@ -64,6 +64,11 @@ def test_a_model_alone_that_fails_is_an_error(unsettled, capsys):
         cmfsim.predict(cmfsim.Case.load(unsettled), model="H+S", check=False)
 
 
+def test_several_models_are_not_answered_by_the_first():
+    with pytest.raises(cmfsim.CaseError, match=r"predict takes one model.*predict_models"):
+        cmfsim.predict("no folder is read", model=["H", "M"])
+
+
 def test_an_observer_learns_of_stages_and_of_models_that_fail(unsettled):
     class Watch(cmfsim.Observer):
         def __init__(self):
