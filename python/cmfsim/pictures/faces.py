@@ -253,6 +253,8 @@ def animate_face(
         raise CaseInputError(
             f"{path.name}: films need ffmpeg, which is not installed: write a .gif"
         )
+    if not path.parent.is_dir():
+        raise CaseInputError(f"{path}: there is no folder {path.parent}: make it, or give another")
     shift = after - before.vertices
     moving = np.linalg.norm(shift, axis=1) > MOVES
     if not moving.any():

@@ -1,5 +1,7 @@
 """An animation shows the face before, on its way, after, and back again."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ import cmfsim
 from benches.scenes import meshes
 from cmfsim.pictures import canvas, faces
 from cmfsim.pictures.faces import FILM_SIZE, animate_face
+from cmfsim.processes.worker import run_program
 
 pytest.importorskip("pyvista")
 image = pytest.importorskip("PIL.Image")
@@ -61,9 +64,26 @@ def test_a_film_gets_every_frame_as_long_as_it_is_seen(tmp_path, monkeypatch):
         animate_face(tmp_path / "face.mp4", BALL, MOVED)
 
 
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_a_film_of_ffmpeg_shows_the_frames_that_it_got(tmp_path, monkeypatch):
+    """Grey levels: before, half of the way, after, and back; ffmpeg itself reads the film."""
+    levels = iter((20, 120, 220))
+    shape = (*FILM_SIZE[::-1], 3)
+    monkeypatch.setattr(canvas, "drawn", lambda *_: np.full(shape, next(levels), np.uint8))
+    film = tmp_path / "a film.mp4"
+    animate_face(film, BALL, MOVED)
+    words = ("-v", "error", "-i", str(film), "-f", "rawvideo", "-pix_fmt", "gray", "-")
+    read = run_program("ffmpeg", ["ffmpeg", *words], seconds=60.0)
+    pictures = np.frombuffer(read.stdout, np.uint8).reshape(-1, shape[0] * shape[1])
+    expected = [20] * 12 + [120] + [220] * 12 + [120]
+    assert np.allclose(pictures.mean(axis=1), expected, atol=3.0)
+
+
 def test_what_cannot_be_animated_is_refused(tmp_path, monkeypatch):
     with pytest.raises(cmfsim.CaseError, match=r"an animation is written as \.gif or \.mp4"):
         animate_face(tmp_path / "face.png", BALL, MOVED)
+    with pytest.raises(cmfsim.CaseError, match=r"no folder .*nowhere: make it"):
+        animate_face(tmp_path / "nowhere" / "face.gif", BALL, MOVED)
     with pytest.raises(cmfsim.CaseError, match="no point of the face moves"):
         animate_face(tmp_path / "face.gif", BALL, BALL.vertices)
     monkeypatch.setenv("PATH", str(tmp_path))
