@@ -170,6 +170,9 @@ def build(options: argparse.Namespace) -> int:
 def case_of(options: argparse.Namespace) -> Case:
     """The case given to a command, with the changes given on the command line."""
     case = Case.load(options.case)
+    if not Path(options.case).is_absolute():
+        # Results are printed as the case was given.
+        case = dataclasses.replace(case, output=case.output.relative_to(Path.cwd()))
     given = vars(options)
     if (edge_length := given.get("edge_length")) is not None:
         low, high = EDGE_LENGTHS

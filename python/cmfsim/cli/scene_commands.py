@@ -134,13 +134,16 @@ def demo(options: argparse.Namespace) -> int:
     name = written.report
     if name is None:
         return FAILED
-    page = made.case.output / name
+    # As the folder was given.
+    folder, home = Path(options.folder), made.case.file.parent
+    case_file = folder / made.case.file.name
+    page = folder / (made.case.output / name).relative_to(home)
     seconds = time.perf_counter() - begun
     if options.json:
-        answer = {"case": str(made.case.file), "report": str(page), "seconds": seconds}
+        answer = {"case": str(case_file), "report": str(page), "seconds": seconds}
         print_json({**answer, "findings": notices.as_dicts()})
         return DONE
-    print_text(f"case    {escaped(str(made.case.file))}")
+    print_text(f"case    {escaped(str(case_file))}")
     for finding in notices.findings:
         if finding.code == "landmarks-proposed":
             print_text(f"note    {escaped(finding.what)}")

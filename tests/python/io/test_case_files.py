@@ -126,6 +126,20 @@ def test_everything_in_a_case_file_arrives(tmp_path):
     assert case.output == tmp_path / "results/first"
 
 
+def test_a_case_is_that_of_the_folder_in_which_it_was_loaded(tmp_path, monkeypatch):
+    """A script that goes to another patient's folder does not read that patient's files."""
+    load(tmp_path, FULL)
+    monkeypatch.chdir(tmp_path)
+    case = cmfsim.Case.load("case.toml")
+    (tmp_path / "plan.toml").write_text('[plan.half]\ntransform = "a.txt"\n', encoding="utf-8")
+    planned = case.with_plan("plan.toml")
+    monkeypatch.chdir("/")
+    assert case.file == tmp_path / "case.toml"
+    assert case.surfaces.skin == tmp_path / "../scans/skin.ply"
+    assert case.output == tmp_path / "results/first"
+    assert planned.plan["half"].transform == tmp_path / "a.txt"
+
+
 def test_what_a_case_file_leaves_out_has_its_default(tmp_path):
     """The default fat, 4 mm, refinement, an output folder beside the file."""
     case = load(tmp_path, HEAD + SURFACES)

@@ -160,7 +160,8 @@ class Case:
             (also `ValueError`) Not TOML, an unknown key, a value of another type or out of range:
             with file, line and key.
         """
-        return _read(_case_file(Path(path)), changes)
+        # A script may change its working folder, where the same path leads to another patient.
+        return _read(_case_file(Path(path)).absolute(), changes)
 
     def with_plan(self, path: AnyPath) -> "Case":
         """The case under the plan in another file, such as one saved by the planning page.
@@ -186,7 +187,7 @@ class Case:
         made_for = MADE_FOR.search(Path(path).read_text(encoding="utf-8"))
         return replace(
             self,
-            plan=plan_of(document, Path(path).parent),
+            plan=plan_of(document, Path(path).absolute().parent),
             achieved=False,
             made_for="" if made_for is None else made_for[1],
         )
