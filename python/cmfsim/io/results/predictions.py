@@ -47,6 +47,8 @@ PREDICTION_FILES = re.compile(
     r"|(plan|muscles|band|contacts|lateral)\.png|timings\.json"
 )
 PREDICTION_FILE = "prediction.json"
+# One of these is in every summary and report.
+MARKS = (b"cmfsim", b'"case_key"')
 TIMINGS_FILE = "timings.json"
 AGAIN = "run cmfsim predict again"
 
@@ -199,6 +201,21 @@ def predictions_of(folder: AnyPath) -> dict[Path, dict[str, Any]]:
     by_model = {summary["model"]: place for place, summary in reversed(found.items())}
     ordered = [by_model[model] for model in MODELS if model in by_model]
     return {place: found[place] for place in ordered}
+
+
+def check_own(folder: Path) -> None:
+    """Finds files of another program that results would replace, or remove as those of old ones.
+
+    Raises `CaseError`: A summary or a report in the folder is not one of cmfsim.
+    """
+    for path in (folder / name for name in (PREDICTION_FILE, EVALUATION_FILE, REPORT_FILE)):
+        data = path.read_bytes() if path.is_file() else b""
+        # An empty one is what a full disk left.
+        if data and not any(mark in data for mark in MARKS):
+            raise CaseInputError(
+                f"{path}: was not written by cmfsim, and the results would replace or remove it: "
+                "move it, or choose another output folder"
+            )
 
 
 def stale_results(folder: Path, key: str) -> list[str]:

@@ -20,6 +20,7 @@ from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.images.dicom_series import dicom_files
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.io.meshes.photos import photo_files
+from cmfsim.io.results.predictions import PREDICTION_FILE, check_own
 from cmfsim.io.results.result_files import is_model_file
 from cmfsim.io.slicer.transforms import read_transform_file
 from cmfsim.meshing import anatomy_from_surfaces, signed_level
@@ -310,7 +311,7 @@ def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) 
 
     is_written: Whether a file of a name is written: of a model where left out.
     Raises `CaseError`: The output folder is a file, a link that leads out of the case's folder, or
-        holds an input of a name that is written there.
+        holds an input of a name that is written there, or a summary or report of another program.
     Raises `OSError`: It cannot be written to.
     """
     folder = case.output
@@ -324,6 +325,8 @@ def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) 
             raise CaseInputError(
                 f"{path}: the results would replace this input; choose another output folder"
             )
+    if is_written(PREDICTION_FILE):
+        check_own(folder)
 
 
 def _files(case: Case) -> Iterator[Path]:

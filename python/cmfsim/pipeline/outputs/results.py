@@ -24,6 +24,7 @@ from cmfsim.io.cases.case_files import CASE_FILE
 from cmfsim.io.files.summaries import hashes_of, write_summary
 from cmfsim.io.images.dicom_series import write_dicom_pdf
 from cmfsim.io.results.predictions import (
+    check_own,
     fill_prediction,
     is_prediction_file,
     is_result_file,
@@ -249,6 +250,7 @@ def write_results(
     Raises `CmfsimError`, `OSError`: What a prediction or a file ends in; the folder is then as it
         was.
     """
+    check_own(output)
     written = WrittenResults()
     clock = _Clock()
 

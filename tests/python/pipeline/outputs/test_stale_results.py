@@ -100,6 +100,20 @@ def evaluation(case, prediction):
     return found
 
 
+@pytest.mark.parametrize("name", ["metrics.json", "report.html", "prediction.json"])
+def test_files_of_another_program_stay(case, prediction, tmp_path, capsys, name):
+    """`metrics.json` and `report.html` were removed as those of another plan."""
+    mine = tmp_path / name
+    mine.write_text('{"accuracy": 0.9}', encoding="utf-8")
+    words = ["predict", str(case), "--model", "H", "-q", "--no-doctor", "-o", str(tmp_path)]
+    assert main(words) == 2
+    assert f"{mine}: was not written by cmfsim" in capsys.readouterr().err
+    with pytest.raises(cmfsim.CaseError, match="move it, or choose another output folder"):
+        prediction.save(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert mine.read_text(encoding="utf-8") == '{"accuracy": 0.9}'
+
+
 def test_the_errors_of_the_old_plan_go_with_a_new_prediction(tmp_path, capsys):
     """Evaluate, change the plan, predict: the report printed the old plan's errors."""
     path = write_head(tmp_path)
