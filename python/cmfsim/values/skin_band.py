@@ -30,7 +30,7 @@ class BandOptions:
     calibration : Calibration or None
         None makes an uncalibrated band.
     group : str or None
-        The calibration cases to use; None uses all of them.
+        The calibration cases to use; None uses all of them, and an uncalibrated band has none.
     source : str
         Where the calibration comes from, for the report: the name of its file.
     """
@@ -44,6 +44,11 @@ class BandOptions:
         if not 0.0 < self.coverage < 1.0:
             raise CalibrationError(
                 f"coverage is {self.coverage!r}: it must be above 0 and below 1 (90 % is 0.9)"
+            )
+        if self.group is not None and self.calibration is None:
+            raise CalibrationError(
+                f"group is {self.group!r}, but there is no calibration with cases to choose: give "
+                "one (--calibration, or calibration in [band]), or leave the group out"
             )
 
     def check(self, models: Sequence[str]) -> None:

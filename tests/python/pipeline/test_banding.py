@@ -178,6 +178,8 @@ def test_the_command_line_refuses_a_band_before_any_work(made, plain, tmp_path, 
     assert "none.json" in capsys.readouterr().err
     assert main(["predict", case, "--coverage", "90", "-q"]) == 2
     assert "coverage is 90" in capsys.readouterr().err
+    assert main(["predict", case, "--group", "bimaxillary", "-q"]) == 2
+    assert "group is 'bimaxillary', but there is no calibration" in capsys.readouterr().err
     cmfsim.write_calibration(path, calibration_for(plain))
     assert main(["predict", case, "--calibration", str(path), "--model", "H", "-q"]) == 2
     assert "calibration is for model M+S" in capsys.readouterr().err
