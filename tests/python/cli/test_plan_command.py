@@ -161,7 +161,7 @@ def test_wishes_that_are_none_are_refused_before_any_work(case, tmp_path, capsys
 
 
 def test_a_written_plan_is_read_back(case, tmp_path):
-    plan = {"mandible": MOTION, 'a "b"\n': np.eye(4)}
+    plan = {"mandible": MOTION, "pièce+2": np.eye(4)}
     cmfsim.write_plan(tmp_path / "plan.toml", {"mandible": MOTION}, made_for="0" * 64)
     loaded = cmfsim.Case.load(case).with_plan(tmp_path / "plan.toml")
     np.testing.assert_allclose(loaded.plan["mandible"].matrix, MOTION, atol=1e-15)
@@ -169,6 +169,8 @@ def test_a_written_plan_is_read_back(case, tmp_path):
     assert list(read_tables(tmp_path / "plan.toml").table("plan")) == list(plan)
     with pytest.raises(cmfsim.BoundaryError):
         cmfsim.write_plan(tmp_path / "plan.toml", {"mandible": 2 * np.eye(4)})
+    with pytest.raises(cmfsim.CaseError, match="is not a valid name"):
+        cmfsim.write_plan(tmp_path / "plan.toml", {'a "b"\n': np.eye(4)})
 
 
 def test_a_plan_of_another_head_is_warned_of(case):

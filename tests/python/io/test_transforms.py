@@ -320,3 +320,17 @@ def test_a_refused_transform_leaves_the_old_file(tmp_path):
         cmfsim.write_transform(tmp_path / "a.h5", np.eye(4))
     assert path.read_bytes() == old
     assert math.isclose(cmfsim.read_transform(path)[0, 0], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "plan", "words"),
+    [
+        ("plan.json", {"maxilla": np.eye(4)}, r"plan\.json: a plan is written as \.toml"),
+        ("plan.toml", {}, r"plan\.toml: the plan has no motion"),
+        ("plan.toml", {"max illa": np.eye(4)}, "segment 'max illa' of the plan is not a valid"),
+    ],
+)
+def test_a_plan_that_predict_would_refuse_is_not_written(name, plan, words, tmp_path):
+    with pytest.raises(cmfsim.CaseError, match=words):
+        cmfsim.write_plan(tmp_path / name, plan)
+    assert not [*tmp_path.iterdir()]

@@ -112,12 +112,18 @@ def _bones(table: Table, folder: Path) -> dict[str, Path]:
     return {checked_name(bones, name, name): bones.path(name, folder) for name in bones}
 
 
+NAME_RULE = "letters, digits, '_', '-' and '+', 64 at most"
+
+
+def is_segment_name(name: str) -> bool:
+    """Whether a bone or segment can have a name: it can stand in a file name."""
+    return 0 < len(name) <= 64 and all(c.isalnum() or c in "_-+" for c in name)
+
+
 def checked_name(table: Table, key: str, name: str) -> str:
     """A name that can stand in a file name: of a bone or segment."""
-    if not name or not all(c.isalnum() or c in "_-+" for c in name) or len(name) > 64:
-        table.fail(
-            key, f"is not a valid name ({name!r}): letters, digits, '_', '-' and '+', 64 at most"
-        )
+    if not is_segment_name(name):
+        table.fail(key, f"is not a valid name ({name!r}): {NAME_RULE}")
     return name
 
 
@@ -424,6 +430,9 @@ def write_plan(path: AnyPath, plan: Mapping[str, ArrayLike], *, made_for: str = 
     ------
     BoundaryError
         (also `ValueError`) A matrix that is not a rigid motion.
+    CaseError
+        (also `ValueError`) What `predict --plan` would refuse: another ending than `.toml`, no
+        segment, or a name that no segment can have.
     OSError
         The folder cannot be written to.
 
@@ -433,6 +442,14 @@ def write_plan(path: AnyPath, plan: Mapping[str, ArrayLike], *, made_for: str = 
     >>> motion = cmfsim.rigid_motion(translation=(0, -4, 0))
     >>> cmfsim.write_plan("plan.toml", {"maxilla": motion})
     """
+    path = Path(path)
+    if path.suffix.lower() != ".toml":
+        raise CaseInputError(f"{path.name}: a plan is written as .toml")
+    if not plan:
+        raise CaseInputError(f"{path.name}: the plan has no motion: give one of a segment")
+    for name in plan:
+        if not is_segment_name(name):
+            raise CaseInputError(f"segment {name!r} of the plan is not a valid name: {NAME_RULE}")
     lines = [
         "# Plan. Not a medical device.",
         "# Each matrix carries the bone from where it is to where it goes: LPS, mm.",
@@ -443,7 +460,7 @@ def write_plan(path: AnyPath, plan: Mapping[str, ArrayLike], *, made_for: str = 
     for name, motion in plan.items():
         matrix = rigid_matrix(motion, f"motion of {name!r}")
         lines += ["", plan_head(name), *matrix_rows(matrix)]
-    with replacing(Path(path)) as file:
+    with replacing(path) as file:
         file.write(("\n".join(lines) + "\n").encode())
 
 
