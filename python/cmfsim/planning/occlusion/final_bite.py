@@ -34,6 +34,8 @@ MOST_POINTS, SIZES = 3000, (0.6, 1.7)
 STEPS = 100
 # Overlap and gap of the rows in the final bite beyond which they are in no bite, mm.
 MOST_OVERLAP, MOST_GAP = 3.0, 2.0
+# Middles of both scans nearer than this are those of one scan, mm, or m.
+SAME_PLACE = 1e-6
 # Turns of a scan about the axis of the bite from which its position is sought, degrees.
 TURNS = (0.0, 90.0, 180.0, 270.0)
 
@@ -100,6 +102,10 @@ def final_bite(
     >>> plan["mandible_body"] = bite.following(plan["maxilla"])  # doctest: +SKIP
     """
     towards = upper_scan.vertices.mean(axis=0) - lower_scan.vertices.mean(axis=0)
+    if np.linalg.norm(towards) < SAME_PLACE:
+        raise CaseInputError(
+            "both scans lie in one place (bite-not-closed): was one file given for both jaws?"
+        )
     upper_fit, upper_mirrored = fitted_scan(upper, upper_scan, towards)
     lower_fit, lower_mirrored = fitted_scan(lower, lower_scan, -towards)
     if upper.segment == lower.segment:

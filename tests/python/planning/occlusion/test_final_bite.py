@@ -95,6 +95,7 @@ def test_scans_of_another_shape_frame_or_unit_are_refused_by_name(scans):
         ((narrow, lower), "bite-scan-poor"),
         ((upper, moved(lower, apart)), "bite-not-closed"),
         ((metres, lower), "bite-scan-size"),
+        ((upper, upper), "bite-not-closed.*one file given for both jaws"),
     ):
         with pytest.raises(cmfsim.CaseError, match=code):
             cmfsim.final_bite(*heads.closed_rows(), *pair)
