@@ -12,13 +12,18 @@ from cmfsim.io import Case, CaseOrPath, as_case, read_surface
 from cmfsim.io.results.predictions import is_prediction_file
 from cmfsim.pipeline.building.case_checks import cut_segments
 from cmfsim.pipeline.building.case_model import model_of, replanned
-from cmfsim.pipeline.building.inputs import case_key, check_output, input_hashes, plan_key
+from cmfsim.pipeline.building.inputs import (
+    case_key,
+    check_output,
+    input_hashes,
+    plan_key,
+    plan_of_other_case,
+)
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, build_options
 from cmfsim.planning.occlusion import final_bite, patient_rows
 from cmfsim.solving.models import solved_patient
 from cmfsim.values.case_parts import CaseBite, CaseMuscles
 from cmfsim.values.checks import check_one_of
-from cmfsim.values.finding import Finding
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import expected_stages
@@ -299,8 +304,7 @@ def build_patient(
     # Before the files are read: the key must be that of what is built.
     hashes = input_hashes(case)
     key, about = case_key(case, hashes), plan_key(case)
-    other = Finding("plan-other-case", where="the file of the plan")
-    strange = [other] if case.made_for not in {"", about} else []
+    strange = plan_of_other_case(case, about)
     options.observer.found(strange)
     patient = model_of(case_for_models(case, models), options)
     options.observer.found(patient.findings)

@@ -51,6 +51,16 @@ def test_a_closed_bite_ends_with_the_opening_that_makes_room(case, capsys):
     assert not [*(case.parent / "out").glob("splint-final*")]
 
 
+def test_a_splint_of_a_plan_for_another_head_is_warned_of(case, capsys):
+    plan = case.with_name("strange.toml")
+    cmfsim.write_plan(plan, {"maxilla": cmfsim.rigid_motion((0, -4, 0))}, made_for="0" * 64)
+    words = ["splint", str(case), "--intermediate", "mandible", "--plan", str(plan), "-q"]
+    assert main([*words, "--no-doctor"]) == 2
+    printed = capsys.readouterr().err
+    assert "splint-not-moved" in printed
+    assert "the plan was made for another case" in printed
+
+
 def test_a_jaw_that_stays_needs_no_splint(case, tmp_path_factory):
     text = case.read_text(encoding="utf-8").split("[plan.mandible_body]")[0]
     other = case.with_name("maxilla.toml")

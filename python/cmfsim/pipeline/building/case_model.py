@@ -32,6 +32,8 @@ from cmfsim.pipeline.building.case_checks import (
 from cmfsim.pipeline.building.inputs import (
     case_key,
     input_hashes,
+    plan_key,
+    plan_of_other_case,
     read_anatomy,
     read_case_landmarks,
 )
@@ -266,6 +268,7 @@ def planned_head(
 ) -> tuple[Head, PlannedBones, tuple[Finding, ...]]:
     """The head of a case and its bones with their motions, as `model_of` has them: no tissue."""
     stages = Stages(options)
+    stages.add(plan_of_other_case(case, plan_key(case)))
     head = _head(case, stages, options)
     bones = _bones(head, stages, options.after)[0]
     return head, bones, tuple(stages.findings)

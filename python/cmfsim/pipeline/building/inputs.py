@@ -306,6 +306,16 @@ def _path_from(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
 
+def plan_of_other_case(case: Case, key: str) -> list[Finding]:
+    """The finding about a plan whose file states another head that it was made for, if it does.
+
+    key: The `plan_key` of the case.
+    """
+    if case.made_for in {"", key}:
+        return []
+    return [Finding("plan-other-case", where="the file of the plan")]
+
+
 def check_output(case: Case, is_written: Callable[[str], bool] = is_model_file) -> None:
     """Finds before the work what would keep results from being written, or spoil an input.
 
