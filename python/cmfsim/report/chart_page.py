@@ -44,6 +44,8 @@ SITES = (
     *(f"{n} (skin)" for n in ("pronasale", "subnasale", "labiale_superius", "labiale_inferius")),
     "pogonion (skin)",
 )
+# Notes that the page states as well: its measures are those of points that nobody placed.
+UNPLACED = ("landmarks-proposed", "landmarks-filled")
 WIDTHS = ("half_width_mean_mm", "half_width_p95_mm", "half_width_largest_mm")
 ELSEWHERE = "… more in report.html"
 
@@ -187,7 +189,9 @@ def draw_chart_page(
     else:
         ends, room = [max(ends)], WHOLE
     y = page.heading(MARGIN, ends[0] + APART, "Warnings", room)
-    groups = [group for group in grouped(findings) if group.severity != "note"]
+    found_sites = [finding for finding in findings if finding.code in UNPLACED]
+    warnings = [finding for finding in findings if finding.severity != "note"]
+    groups = [*grouped(found_sites), *grouped(warnings)]
     lines = [f"{translated(group.severity)}: {group.text(translated)}" for group in groups] or [
         "None."
     ]

@@ -123,6 +123,23 @@ def test_texts_stay_on_the_page_and_apart(many, drawn):
     assert ("… more in report.html" in texts) == many
 
 
+@pytest.mark.parametrize("code", ["landmarks-proposed", "landmarks-filled"])
+def test_the_page_states_that_nobody_placed_the_points_it_measures(code):
+    found = "46 landmarks were found; expected error 2.9 mm"
+    figure = figures.Figure(A4)
+    findings = [
+        cmfsim.Finding(code, found),
+        cmfsim.Finding("rest-removed", "a note of another kind"),
+        cmfsim.Finding("ct-noise", "a warning", severity="warning"),
+    ]
+    draw_chart_page(figure, full(many=False), {}, findings)
+    texts = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert [t for t in texts if t.startswith(("note:", "warning:"))] == [
+        f"note: {found}",
+        "warning: a warning",
+    ]
+
+
 def test_the_command_writes_the_page_beside_the_report(case_results, capsys):
     assert main(["report", str(case_results), "--pdf"]) == 0
     assert "report.pdf" in capsys.readouterr().out
