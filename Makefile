@@ -16,6 +16,8 @@ export PYO3_PYTHON := $(PY)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Python compiles the few modules that it loads; pip would compile 8,400. It reads this as --no-compile = off.
 export PIP_NO_COMPILE := 0
+# Where the environment forbids this, every process of the tests would compile them again.
+unexport PYTHONDONTWRITEBYTECODE
 
 ENV_STAMP := $(VENV)/.cmfsim-env
 BUILD_STAMP := $(VENV)/.cmfsim-build
