@@ -108,12 +108,13 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(scope="module", autouse=True)
 def _remembered(request, tmp_path_factory):
     """Equal heads are drawn, read and searched once in a run, but where tests are about that."""
-    if request.path.parent.name in ("registration", "building", "surfaces", "meshing", "phantom"):
-        yield
-        return
     # It loads NumPy, whose threads are set above.
-    from shared_values import remember  # noqa: PLC0415
+    from shared_values import keep_muscles, remember  # noqa: PLC0415
 
+    about = request.path.parent.name
     with pytest.MonkeyPatch.context() as patch:
-        remember(patch, tmp_path_factory)
+        if about not in ("registration", "building", "surfaces", "meshing", "phantom"):
+            remember(patch, tmp_path_factory)
+        if about != "muscles":
+            keep_muscles(patch)
         yield

@@ -12,6 +12,7 @@ import os
 import pickle
 import threading
 import traceback
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -22,12 +23,14 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.lab.virtual.demo import write_demo_case
+from cmfsim.muscles import equivalent
 from cmfsim.phantom.model import PhantomHead
 from cmfsim.pipeline import proposing
 from cmfsim.pipeline.building import inputs
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 from cmfsim.processes.worker import Answer, WorkerFailedError
+from cmfsim.values.musculature import MuscleSurface
 
 try:
     import fcntl
@@ -36,6 +39,8 @@ except ImportError:  # Windows: two processes may make the same value, and eithe
 
 # Tet edges of the coarse patient, mm.
 COARSE_EDGE = 14.0
+# Muscles that a process keeps ready to be sampled: those of three heads, 50 MB each.
+MOST_MUSCLES = 3 * 38
 
 
 def shared(temporary: pytest.TempPathFactory, name: str, make: Callable[[Path], Any]) -> Any:
@@ -125,6 +130,28 @@ def _remembered(step: Callable[..., Any], temporary: pytest.TempPathFactory) -> 
         return shared(temporary, f"{step.__name__}-{digest}", lambda _: step(*given, **named))
 
     return call
+
+
+_ready, _ready_muscles = equivalent._ready, OrderedDict[str, Any]()
+
+
+def keep_muscles(patch: pytest.MonkeyPatch) -> None:
+    """Has the search trees and fibres of equal muscles be found once in this process.
+
+    They are the core's, and stay in it: more than a second for the muscles of a head.
+    """
+
+    def once(name: str, muscle: Any) -> Any:
+        if not isinstance(muscle, MuscleSurface):
+            return _ready(name, muscle)
+        digest = hashlib.sha256(pickle.dumps((name, muscle))).hexdigest()
+        found = _ready_muscles.pop(digest, None) or _ready(name, muscle)
+        _ready_muscles[digest] = found
+        while len(_ready_muscles) > MOST_MUSCLES:
+            _ready_muscles.popitem(last=False)
+        return found
+
+    patch.setattr(equivalent, "_ready", once)
 
 
 def without_drawings(patch: pytest.MonkeyPatch) -> None:
