@@ -224,7 +224,8 @@ def _jaw_angle(view: SideView, half: Floats, found: Sites) -> None:
 # Between the upper incisors and the front of the ramus, the upper second molar stands at this share
 # if the edge of the lower incisors is this far behind that of the upper ones, mm. Else the whole
 # lower jaw, ramus and molars, is as much farther back or forwards.
-MOLAR_SHARE, OVERJET = 0.803, 5.1
+# That is not known of a jaw whose incisors' crowns are less high than this, mm.
+MOLAR_SHARE, OVERJET, LEAST_CROWN = 0.803, 6.0, 6.0
 # From the plane where the molars meet up and down to the sites, and how far back the lower is, mm.
 OVER_MOLARS, UNDER_MOLARS, LOWER_BEHIND = 13.0, 19.5, 3.8
 # Where molars stand across, mm.
@@ -237,7 +238,9 @@ def _teeth_line(view: SideView, found: Sites) -> None:
     if lower is None or neck is None:
         return
     upper = found.get("_upper_edge")
-    behind = 0.0 if upper is None else float(lower[1] - upper[1]) - OVERJET
+    behind = 0.0
+    if upper is not None and float(neck[2] - upper[2]) > LEAST_CROWN:
+        behind = float(lower[1] - upper[1]) - OVERJET
     across = np.abs(view.mandible[:, 0])
     teeth = view.mandible[(across > MOLAR_ROW[0]) & (across < MOLAR_ROW[1])]
     level = float(lower[2]) + 4.0

@@ -138,6 +138,8 @@ def _nasal_end(z: Floats, top: Floats, centre: float) -> int | None:
 # Height of the crown of the upper incisors up to the bone, and of the rounding of a ridge without
 # teeth up to its front, mm.
 UPPER_CROWN, BARE_RIDGE = 12.0, 2.0
+# The edge of a crown is where it is foremost within this of its end, mm.
+EDGE = 3.0
 # From the edge of the upper incisors to the floor of the nose Legan and Burstone (1980) measured
 # 30.5 ± 2.1 mm in men and 27.5 ± 1.7 mm in women: what is this much lower has no incisors, mm.
 LEAST_WITH_TEETH = 20.0
@@ -168,7 +170,7 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
     if not np.isfinite(line[neck]):
         return
     found["supradentale"] = np.array([lean, line[neck], z[neck]])
-    found["_upper_edge"] = np.array([lean, line[edge], z[edge]])
+    found["_upper_edge"] = np.array([lean, _crown(line, z, edge), z[edge]])
     spine = neck
     while (
         spine + 1 < len(z)
@@ -180,6 +182,11 @@ def _upper_alveolus(views: SkullViews, found: Sites) -> None:
     half = z[neck] + 0.38 * (z[spine] - z[neck])
     at = int(np.argmin(np.abs(z - half)))
     found["mid_philtrum"] = np.array([lean, line[at], z[at]])
+
+
+def _crown(line: Floats, z: Floats, edge: int) -> float:
+    """How far forwards a crown reaches at its edge: the last cell may show what lies behind."""
+    return float(np.nanmin(line[np.abs(z - z[edge]) <= EDGE]))
 
 
 def _is_bare(front: DepthMap, lean: float, edge: int) -> bool:
@@ -235,7 +242,7 @@ def _jaw_profile(views: SkullViews, found: Sites) -> None:
     top, bottom = int(np.flatnonzero(known).max()), int(np.flatnonzero(known).min())
     crown = max(LOWER_CROWN, LOWER_SHARE * (z[top] - z[bottom]))
     neck = int(np.argmin(np.abs(z - z[top] + crown)))
-    found["_lower_edge"] = np.array([lean, line[top], z[top]])
+    found["_lower_edge"] = np.array([lean, _crown(line, z, top), z[top]])
     found["infradentale"] = np.array([lean, line[neck], z[neck]])
     chin = smoothed(front.column(chin_lean, 2.2), 0.8)
     low = views.mandible[
