@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cmfsim import SurfaceData, _core
+from cmfsim.values.landmark_sites import is_lower_site
 
 Points = Mapping[str, np.ndarray]
 Move = Callable[[np.ndarray], np.ndarray]
@@ -24,9 +25,6 @@ JAW_SHIFTS = {
     "prognathic, 10 mm": (0.0, -10.0, 0.0),
     "mandible 10 mm aside": (10.0, 0.0, 0.0),
 }
-OF_MANDIBLE = (
-    "infradentale", "supramentale", "pogonion", "menton", "gonion", "occlusal_line", "sub_m2",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +100,7 @@ def warped(head: KnownHead) -> Iterator[tuple[str, KnownHead]]:
 
 def with_jaw_shifted(head: KnownHead, shift: tuple[float, float, float]) -> KnownHead:
     """The head with its mandible displaced: teeth and body in whole, the joints where they are."""
-    skull, skin = head.truth
+    skull = head.truth[0]
     bite = 0.5 * (skull["supradentale"] + skull["infradentale"])
     joints = 0.5 * (skull["supraglenoid_L"] + skull["supraglenoid_R"])[2] - CONDYLE
 
@@ -113,17 +111,10 @@ def with_jaw_shifted(head: KnownHead, shift: tuple[float, float, float]) -> Know
     def soft(p: np.ndarray) -> np.ndarray:
         return np.asarray(p + 1.0 / (1.0 + np.exp((p[:, 2:] - bite[2]) / BAND)) * shift)
 
-    def carried(surface: SurfaceData, move: Move) -> SurfaceData:
-        return replace(surface, vertices=move(surface.vertices))
-
-    return KnownHead(
-        {n: carried(b, bone) if n == "mandible" else b for n, b in head.bones.items()},
-        carried(head.skin, soft),
-        (
-            {n: bone(p[None])[0] if n.startswith(OF_MANDIBLE) else p for n, p in skull.items()},
-            {n: soft(p[None])[0] for n, p in skin.items()},
-        ),
-    )
+    jaw, face = head.moved(bone), head.moved(soft)
+    sites = {n: jaw.truth[0][n] if is_lower_site(n) else p for n, p in skull.items()}
+    bones = {**head.bones, "mandible": jaw.bones["mandible"]}
+    return KnownHead(bones, face.skin, (sites, face.truth[1]))
 
 
 def _turned(size: float, angles: tuple[float, float, float]) -> Move:
