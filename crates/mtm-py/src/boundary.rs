@@ -27,8 +27,9 @@ const BOUNDARY: ErrorKind = ErrorKind::Boundary;
 /// contact : dict of str to Surface, optional
 ///     Contact surface of each segment with sliding nodes, at rest, normals out of the bone.
 /// gap : dict of str to float, (k,) array_like or "rest", optional
-///     Distance that sliding nodes keep from the surface, mm, negative behind it; 0 is on the surface,
-///     "rest" keeps the offset that each has at rest, moved with its segment.
+///     Distance that sliding nodes keep from the surface, mm, negative behind it. "rest", the default, keeps the
+///     offset that each has at rest, moved with its segment, so that no motion moves nothing; with 0, nodes that do
+///     not lie on the surface are pulled onto it.
 /// touching : sequence of (nodes, triangles), optional
 ///     Nodes that may touch a part of the tissue's own boundary, and separate again: (k,) int, and (m, 3) int, the
 ///     nodes of boundary triangles with outward normals. They may not enter the tissue behind these; no friction.
@@ -44,7 +45,8 @@ const BOUNDARY: ErrorKind = ErrorKind::Boundary;
 /// Raises
 /// ------
 /// BoundaryError
-///     A node of two kinds, a negative index, sliding nodes without a contact surface, an empty segment.
+///     A node of two kinds, a negative index, sliding nodes without a contact surface, an empty segment. By
+///     `StaticSolver`: nodes that keep their offset further from the surface than a quarter of the mesh's diagonal.
 #[pyclass(frozen, module = "cmfsim", name = "Boundary")]
 pub struct PyBoundary {
     pub core: Arc<Boundary>,
@@ -255,7 +257,7 @@ fn segment<'a>(segments: &'a mut Vec<Segment>, name: &str) -> &'a mut Segment {
             joined: Vec::new(),
             sliding: Vec::new(),
             contact: None,
-            gap: Gap::Uniform(0.0),
+            gap: Gap::Rest,
         });
         segments.len() - 1
     });

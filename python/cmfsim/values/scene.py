@@ -85,8 +85,8 @@ class SegmentData(checks.Frozen):
     contact : SurfaceData or None
         Contact surface (teeth, mucosa) at rest; it moves with the segment.
     gap : (s,) float64, mm, or float, or "rest"
-        Distance that each sliding node keeps from the surface, negative behind it; "rest" keeps its
-        offset from the surface in the undeformed tissue, carried by the segment.
+        Distance that each sliding node keeps from the surface, negative behind it; "rest", the
+        default, keeps its offset from it in the undeformed tissue, carried by the segment.
 
     Examples
     --------
@@ -105,7 +105,7 @@ class SegmentData(checks.Frozen):
         joined: ArrayLike = (),
         sliding: ArrayLike = (),
         contact: SurfaceData | None = None,
-        gap: ArrayLike | str = 0.0,
+        gap: ArrayLike | str = "rest",
     ) -> None:
         held, slides = checks.as_indices("joined", joined), checks.as_indices("sliding", sliding)
         if contact is not None:

@@ -351,3 +351,22 @@ def test_winding_number_tells_inside_from_outside():
     found = ball.winding_number(points)
     assert found[inside].min() > 0.95
     assert np.abs(found[outside]).max() < 0.05
+
+
+def test_no_motion_moves_nothing_though_the_surface_lies_off_the_nodes():
+    """Without a word about gaps, nodes keep the distance that they have, as tissue on bone does."""
+    nodes, tensors, boundary, low, _ = block(np.eye(3), height=-0.5)
+    assert boundary.gap["floor"] == "rest"
+    still = cmfsim.StaticSolver(tensors, boundary).solve({"top": np.eye(4), "floor": np.eye(4)})
+    assert np.abs(still.displacements).max() < 1e-12
+    pulled = block(np.eye(3), height=-0.5, gap=0.0)[2]
+    moved = cmfsim.StaticSolver(tensors, pulled).solve({"top": np.eye(4), "floor": np.eye(4)})
+    np.testing.assert_allclose((nodes + moved.displacements)[low, 2], -0.5, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("gap", [None, "rest"])
+def test_a_surface_in_another_frame_is_refused(gap):
+    """Nodes would slide along it at a distance that no tissue has."""
+    _, tensors, boundary, _, _ = block(np.eye(3), gap=gap, height=-50.0)
+    with pytest.raises(cmfsim.ContactError, match=r"\"floor\" lies 50\.0 mm from sliding node \d+"):
+        cmfsim.StaticSolver(tensors, boundary)

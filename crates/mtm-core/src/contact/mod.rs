@@ -26,6 +26,8 @@ const MOSTLY: f64 = 0.5;
 /// Rounding error of the area vector around a node, relative to the areas summed: a shorter vector has no
 /// direction.
 const FACING_ROUNDING: f64 = 1e-12;
+/// Distance at rest, over the diagonal of the mesh, beyond which a surface is none that nodes can slide on.
+const FARTHEST: f64 = 0.25;
 
 /// Lattice spacing of a contact field over the mean edge of the adjacent tissue: the nodes of the tissue cannot
 /// follow sharper features.
@@ -249,6 +251,15 @@ impl Sliding {
             let closest = surface.closest(&positions);
             let normals: Vec<[f64; 3]> = closest.iter().map(|c| c.normal).collect();
             check_facing(mesh, &segment.name, &segment.sliding, surface, &normals, mode)?;
+            let far = closest.iter().position(|c| c.distance > FARTHEST * sliding.diagonal);
+            if let (Gap::Rest, Some(i)) = (&segment.gap, far) {
+                let (node, away) = (segment.sliding[i], closest[i].distance);
+                let problem = format!(
+                    "lies {away:.1} mm from sliding node {node}, more than {FARTHEST} of the mesh's diagonal: are \
+                     both in the same frame and unit? A gap in mm instead of \"rest\" pulls the nodes to it"
+                );
+                return Err(MtmError::ContactSurface { segment: segment.name.clone(), problem });
+            }
             for (i, &node) in segment.sliding.iter().enumerate() {
                 sliding.gaps.push(match &segment.gap {
                     Gap::Uniform(value) => Some(*value),

@@ -114,8 +114,7 @@ impl RigidMotion {
     }
 }
 
-/// The rigid matrix nearest to `matrix` (4×4, row by row): the only check of whether a matrix may be called
-/// rigid.
+/// The rigid matrix nearest to `matrix` (4×4, row by row): the only check of whether a matrix is rigid.
 ///
 /// R is replaced by the rotation nearest to it (its polar factor), the bottom row by 0 0 0 1; t is kept. A
 /// matrix that is already rigid to rounding is returned unchanged in every bit, so the function may be applied

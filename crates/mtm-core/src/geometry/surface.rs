@@ -259,8 +259,7 @@ impl Surface {
         self.topology.is_closed
     }
 
-    /// Enclosed volume, mm³, negative if the normals point inward; none for a surface that is not
-    /// closed.
+    /// Enclosed volume, mm³, negative if the normals point inward; none if the surface is open.
     pub fn volume(&self) -> Option<f64> {
         self.topology.is_closed.then_some(self.shape.volume)
     }

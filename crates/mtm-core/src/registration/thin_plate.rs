@@ -28,8 +28,7 @@ pub const MOST_LANDMARKS: usize = 4096;
 /// Distance of two landmarks over the longest extent below which they count as the same point.
 pub const COINCIDENT_DISTANCE: f64 = 1e-6;
 
-/// Number of refinement steps on the residual of the solved system: one reduces it to rounding, the second is a
-/// reserve.
+/// Refinement steps on the residual of the solved system: one reduces it to rounding, the second is a reserve.
 const REFINEMENTS: usize = 2;
 
 /// Points evaluated together: their sums stay in the vector registers.

@@ -325,7 +325,7 @@ def _segment(
             joined=np.flatnonzero((kinds == NODE_KINDS.index("joined")) & mine),
             sliding=np.flatnonzero((kinds == NODE_KINDS.index("sliding")) & mine),
             contact=contact,
-            gap=table.plain("gap") if "gap" in table else 0.0,
+            gap=table.plain("gap") if "gap" in table else "rest",
         )
 
 
