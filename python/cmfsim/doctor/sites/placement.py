@@ -245,7 +245,8 @@ def _check_within_image(
         where=evidence.case.where(f"landmarks.{key}"),
         fix="correct coordinateSystem in the file (LPS or RAS)"
         if is_frame
-        else "check that landmarks and image are from one patient, and that the scan is complete",
+        else "check that landmarks and image are from one patient and in mm, and that the scan is "
+        "complete",
     )
 
 
