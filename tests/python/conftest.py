@@ -91,9 +91,9 @@ LONGEST = (
 def pytest_sessionstart():
     """Arrays reuse the memory of earlier ones, as in a command: their pages need not be cleared."""
     # It loads NumPy, whose threads are set above.
-    from cmfsim.cli import _keep_freed_memory  # noqa: PLC0415
+    from cmfsim.processes.memory import keep_freed_memory  # noqa: PLC0415
 
-    _keep_freed_memory()
+    keep_freed_memory()
 
 
 # Collecting makes millions of objects and no garbage; looking for some took a third of its time.

@@ -6,7 +6,6 @@ Exit codes: 0 done, 1 failed, 2 bad input, 141 where standard output was closed.
 
 import argparse
 import contextlib
-import ctypes
 import gc
 import io
 import json
@@ -18,18 +17,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cmfsim.errors import CmfsimError, error_text
+from cmfsim.processes.memory import keep_freed_memory
 
 __all__ = ["BAD_INPUT", "CLOSED", "DONE", "FAILED", "main"]
 
 # The last is what shells report of a program that a closed pipe ended: 128 and the signal's number.
 DONE, FAILED, BAD_INPUT, CLOSED = 0, 1, 2, 141
-# Parameters of mallopt, from glibc's malloc.h.
-TRIM_THRESHOLD, MMAP_THRESHOLD, ARENA_MAX = -1, -3, -8
-# Freed memory that is kept for the next arrays, bytes: about five images of a head on the working
-# grid. With more, the largest amount in use grows as well.
-KEPT = 256 << 20
-# Blocks that get a mapping of their own from this size on, bytes: none.
-LARGEST = (1 << 31) - 1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
     if arguments is None:
         # The process is this command's; a caller's stays as it is.
-        _keep_freed_memory()
+        keep_freed_memory()
         # What a command loads first is no garbage: looking for some took a tenth of that time.
         gc.disable()
         # The products here are thin: numpy's own threads only wait for each other, and keep
@@ -181,20 +174,3 @@ def _drop_output() -> None:
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, sys.stdout.fileno())
         os.close(nothing)
-
-
-def _keep_freed_memory() -> None:
-    """Lets large arrays reuse the memory of earlier ones, where the C library is glibc.
-
-    By default each array of an image is mapped from the kernel and given back: clearing its pages
-    takes as long as the work on them, above all in a virtual machine. One arena serves all threads,
-    so that they share what is kept. Other C libraries keep their own ways.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    library = ctypes.CDLL(None)
-    # musl has neither.
-    if not (hasattr(library, "gnu_get_libc_version") and hasattr(library, "mallopt")):
-        return
-    for parameter, value in ((ARENA_MAX, 1), (MMAP_THRESHOLD, LARGEST), (TRIM_THRESHOLD, KEPT)):
-        library.mallopt(parameter, value)

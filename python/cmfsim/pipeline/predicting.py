@@ -21,6 +21,7 @@ from cmfsim.pipeline.building.inputs import (
 )
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, build_options
 from cmfsim.planning.occlusion import final_bite, patient_rows
+from cmfsim.processes.memory import release_freed_memory
 from cmfsim.solving.models import solved_patient
 from cmfsim.values.case_parts import CaseBite, CaseMuscles
 from cmfsim.values.checks import check_one_of
@@ -223,6 +224,8 @@ def predictions_of(
     if patient.muscles is not None:
         options.observer.muscles(patient.muscles, patient.segments)
     options.observer.built(patient)
+    # Solvers need more at once than any stage of the build.
+    release_freed_memory()
     known = set(patient.findings)
     # By tissue: models of the same tissue differ in their conditions alone.
     kept: dict[str, MassTensors] = {}
