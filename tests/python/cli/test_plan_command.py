@@ -147,6 +147,15 @@ def test_predict_takes_the_plan_of_a_page(case, answer, wished, capsys, monkeypa
     assert (after - before)[nearest][1] == pytest.approx(2.0, abs=0.5)
     report = (case.parent / "out/report.html").read_text("utf-8")
     assert '<a href="plan.html">Planning page</a>' in report
+    # A page of another head stays: somebody may have planned in it. It is no longer linked.
+    page = case.parent / "out/plan.html"
+    kept = page.read_bytes()
+    state = kept.partition(b'"cmfsim-made-for" content="')[2][:64]
+    page.write_bytes(kept.replace(state, b"0" * 64))
+    assert main(["report", str(case)]) == 0
+    page.write_bytes(kept)
+    assert "plan.html shows another head" in capsys.readouterr().err
+    assert "Planning page" not in (case.parent / "out/report.html").read_text("utf-8")
 
 
 def test_wishes_that_are_none_are_refused_before_any_work(case, tmp_path, capsys):

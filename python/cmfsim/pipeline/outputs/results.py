@@ -350,9 +350,8 @@ def _warn_of_removed(output: Path, names: Sequence[str]) -> None:
     # The files that state what the others are.
     stated = [name for name in names if name.endswith((".json", ".html"))] or names
     _log.warning(
-        "%s: removed %d files that belong to another plan, other inputs or another version: %s",
+        "%s: removed the results of another plan, of other inputs or of another version: %s",
         output,
-        len(names),
         ", ".join(stated),
     )
     if EVALUATION_FILE in names:
@@ -547,6 +546,8 @@ def _document(
     state = page_state(folder / PAGE_FILE)
     # Compared one by one: a file that was changed may hold anything there.
     fits = state is not None and all(entry.get("plan_key") == state for entry in found.values())
+    if state is not None and not fits:
+        _log.warning("%s shows another head or other cuts: run cmfsim plan again", PAGE_FILE)
     return replace(document, links={"Planning page": PAGE_FILE} if fits else {})
 
 
