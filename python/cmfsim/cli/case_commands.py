@@ -34,10 +34,11 @@ from cmfsim.io import Case, read_parts, read_result, read_scene, read_surface
 from cmfsim.io.results.populations import read_calibration
 from cmfsim.io.results.predictions import predictions_of
 from cmfsim.io.results.result_files import is_model_file
-from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, segment_colours, view_parts
+from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, view_parts
 from cmfsim.pictures.window import OVER_BONES, prediction_parts
 from cmfsim.pipeline.predicting import case_for_models, prepare
 from cmfsim.report import Table
+from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.case_parts import EDGE_LENGTHS
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.finding import SEVERITIES, Finding

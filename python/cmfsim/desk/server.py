@@ -30,6 +30,7 @@ from cmfsim.planning.landmark_page import landmark_page_text
 from cmfsim.planning.page import PageContent
 from cmfsim.planning.page.document import Document, document_text, shown_values
 from cmfsim.planning.server import SOLVE, LocalServer, RefusedError, Reply, solved_reply
+from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.checks import Floats
 from cmfsim.values.motion import plan_digits, rigid_motion
@@ -364,6 +365,7 @@ def desk_text(session: Session, bones: Sequence[str]) -> str:
         "taken": session.made["set_up"].values if "set_up" in session.made else [],
         "procedures": procedure_choices(),
         "bones": list(bones),
+        "colours": segment_colours([name for made in PROCEDURES.values() for name in made]),
         "cuts": {},
         "moves": {},
         "kept": [],

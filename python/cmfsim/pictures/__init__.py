@@ -1,12 +1,10 @@
 """Pictures of a case, drawn off screen: anatomy, muscles, segments, node kinds, errors."""
 
 from cmfsim.pictures.anatomy import KIND_COLOURS as KIND_COLOURS
-from cmfsim.pictures.anatomy import SEGMENT_COLOURS as SEGMENT_COLOURS
 from cmfsim.pictures.anatomy import SKIN_COLOUR as SKIN_COLOUR
 from cmfsim.pictures.anatomy import picture_anatomy as picture_anatomy
 from cmfsim.pictures.anatomy import picture_muscles as picture_muscles
 from cmfsim.pictures.anatomy import picture_node_kinds as picture_node_kinds
-from cmfsim.pictures.anatomy import segment_colours as segment_colours
 from cmfsim.pictures.canvas import Picture as Picture
 from cmfsim.pictures.charts import MODEL_COLOURS as MODEL_COLOURS
 from cmfsim.pictures.charts import chart_errors as chart_errors

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures.canvas import SIZE, Shown, View, bounds, draw, polydata
-from cmfsim.values.anatomy import BoneSegment
+from cmfsim.values.anatomy import BoneSegment, segment_colours
 from cmfsim.values.checks import AnyPath, Floats, as_index_rows, as_rows
 from cmfsim.values.musculature import MuscleSurface, Musculature
 from cmfsim.values.scene import NODE_KINDS, NodeKinds
@@ -26,13 +26,6 @@ KIND_COLOURS: Mapping[str, str] = MappingProxyType(
 )
 # Their nodes that are not attached.
 LIP_COLOURS: Mapping[str, str] = MappingProxyType({"upper": "#8e3b9e", "lower": "#2a9d5c"})
-SEGMENT_COLOURS: Mapping[str, str] = MappingProxyType({
-    "cranium": "#e6dcc3", "skull": "#e6dcc3", "midface": "#f2a33a", "maxilla": "#f2a33a",
-    "mandible": "#5aa469", "mandible_body": "#5aa469", "ramus_left": "#4e79a7",
-    "ramus_right": "#a678b8", "chin": "#d9534f",
-})  # fmt: skip
-# For segments of other names, in their order.
-OTHER_COLOURS = ("#76b7b2", "#b6992d", "#d37295", "#79706e", "#86bcb6", "#9d7660")
 
 
 def picture_anatomy(
@@ -151,12 +144,6 @@ def _corners_of_kind(
         centre, half_ab, half_ac = middle[mine], 0.5 * (a + b), 0.5 * (a + c)
         parts += [np.stack([a, half_ab, centre], 1), np.stack([a, centre, half_ac], 1)]
     return np.concatenate(parts)
-
-
-def segment_colours(names: Sequence[str]) -> dict[str, str]:
-    """The colour of each segment, by name; the same for the same names."""
-    others = iter(OTHER_COLOURS * (1 + len(names) // len(OTHER_COLOURS)))
-    return {n: SEGMENT_COLOURS[n] if n in SEGMENT_COLOURS else next(others) for n in names}
 
 
 def add_bone(plotter: Any, surface: SurfaceData, colour: str) -> Any:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.pictures import canvas
-from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone, segment_colours
+from cmfsim.pictures.anatomy import SKIN_COLOUR, add_bone
 from cmfsim.processes.worker import run_program
+from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.checks import AnyPath, Floats
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.patient_model import PatientModel

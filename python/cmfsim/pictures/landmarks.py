@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures import canvas
-from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
+from cmfsim.pictures.anatomy import SKIN_COLOUR
+from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.checks import AnyPath, Floats, check_one_of
 from cmfsim.values.surface_data import SurfaceData
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.pictures import canvas
-from cmfsim.pictures.anatomy import SKIN_COLOUR, segment_colours
+from cmfsim.pictures.anatomy import SKIN_COLOUR
+from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.checks import AnyPath, Floats
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.surface_data import SurfaceData, joined_surface

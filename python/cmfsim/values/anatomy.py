@@ -5,8 +5,9 @@ images*: positive inside, negative outside, zero on the surface between voxels, 
 known better than its voxels and cutting a bone by a plane is a minimum of two numbers.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 
@@ -26,6 +27,21 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.shown_region import ShownRegion
 from cmfsim.values.surface_data import SurfaceData
+
+# Of segments, in pictures and pages alike.
+SEGMENT_COLOURS: Mapping[str, str] = MappingProxyType({
+    "cranium": "#e6dcc3", "skull": "#e6dcc3", "midface": "#f2a33a", "maxilla": "#f2a33a",
+    "mandible": "#5aa469", "mandible_body": "#5aa469", "ramus_left": "#4e79a7",
+    "ramus_right": "#a678b8", "chin": "#d9534f",
+})  # fmt: skip
+# For segments of other names, in their order.
+OTHER_COLOURS = ("#76b7b2", "#b6992d", "#d37295", "#79706e", "#86bcb6", "#9d7660")
+
+
+def segment_colours(names: Sequence[str]) -> dict[str, str]:
+    """The colour of each segment, by name; the same for the same names."""
+    others = iter(OTHER_COLOURS * (1 + len(names) // len(OTHER_COLOURS)))
+    return {n: SEGMENT_COLOURS[n] if n in SEGMENT_COLOURS else next(others) for n in names}
 
 
 @dataclass(frozen=True, eq=False)

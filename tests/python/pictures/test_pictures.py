@@ -10,6 +10,7 @@ import pytest
 import cmfsim
 from benches.scenes import meshes
 from cmfsim import pictures
+from cmfsim.values.anatomy import segment_colours
 
 pv = pytest.importorskip("pyvista")
 SIZE = (800, 300)
@@ -103,7 +104,7 @@ def test_segments_and_anatomy_show_each_bone_in_its_colour(tmp_path):
     draw_bones(tmp_path / "bones.png", bones)
     image = read(tmp_path / "bones.png")
     for name in ("maxilla", "ramus_left"):
-        assert painted(image, pictures.SEGMENT_COLOURS[name], slice(266, None)) > 500
+        assert painted(image, segment_colours([name])[name], slice(266, None)) > 500
     skin = segment("skin", 25.0, (0, 0, 0)).surface
     pictures.picture_anatomy(tmp_path / "head.png", skin, bones, size=SIZE)
     through = read(tmp_path / "head.png")
@@ -118,7 +119,7 @@ def test_left_of_the_patient_is_right_in_the_front_view(tmp_path):
     bones = [segment("ramus_left", 5.0, (20, 0, 0)), segment("ramus_right", 5.0, (-20, 0, 0))]
     draw_bones(tmp_path / "bones.png", bones)
     front = read(tmp_path / "bones.png")[:-70, 266:532]
-    left, right = (pictures.SEGMENT_COLOURS[n] for n in ("ramus_left", "ramus_right"))
+    left, right = segment_colours(["ramus_left", "ramus_right"]).values()
     assert painted(front, left, slice(133, None)) > 50
     assert painted(front, left, slice(0, 133)) == 0
     assert painted(front, right, slice(0, 133)) > 50

@@ -1,7 +1,7 @@
 // The desk: the head with the planes of its cuts, and the steps to a plan.
 
 import { Camera } from "./camera.js";
-import { DISTINCT, SKIN, STILL_BONE, rgb } from "./colours.js";
+import { SKIN, STILL_BONE, rgb } from "./colours.js";
 import { CutPanel } from "./cut_panel.js";
 import { WorkView, call, findingList } from "./desk_calls.js";
 import { Drawing } from "./drawing.js";
@@ -14,16 +14,15 @@ import { unpack } from "./unpacking.js";
 import { addViews, slider } from "./view_panel.js";
 
 const BACKGROUND = [0.933, 0.945, 0.961];
-// The bone that stays, then a colour for each piece.
-const COLOURS = [STILL_BONE, ...DISTINCT.map((c) => rgb(c).map((v) => 0.35 + 0.65 * v))];
-
 class App {
   constructor(page, arrays) {
     this.page = page;
     this.seen = null;
     this.overlay = document.getElementById("overlay");
     this.opacity = { bones: 1, skin: 0.15 };
-    this.drawing = new Drawing(document.getElementById("drawing"), COLOURS);
+    // The bone that stays, then a colour for each piece.
+    this.colours = [STILL_BONE, ...Object.values(page.colours).map(rgb)];
+    this.drawing = new Drawing(document.getElementById("drawing"), this.colours);
     this.camera = new Camera(page.target ?? [0, 0, 0], page.span ?? 200);
     this.surfaces = page.surfaces.map(({ name, part }, i) => {
       const [places, triangles] = [arrays[`surface_${i}`].values, arrays[`surface_${i}_triangles`].values];
@@ -161,9 +160,10 @@ class App {
 
   /** Colours the bones by the pieces that the planes make of them. */
   colour(pieces) {
-    const count = COLOURS.length;
+    const known = Object.keys(this.page.colours);
     const names = [...new Set(pieces.flatMap(({ name, rest }) => [name, rest]))].filter((n) => !this.page.bones.includes(n));
-    const share = (name) => (Math.max(-1, names.indexOf(name)) % (count - 1) + 1.5) / count;
+    const place = (name) => (names.includes(name) ? known.indexOf(name) + 1 : 0);
+    const share = (name) => (place(name) + 0.5) / this.colours.length;
     for (const { name, part, places, amounts, drawn } of this.surfaces) {
       if (part === "skin") continue;
       const own = pieces.filter((piece) => piece.part === name);
@@ -180,7 +180,7 @@ class App {
       this.drawing.recolour(drawn, amounts);
     }
     this.redraw();
-    return Object.fromEntries(names.map((name) => [name, COLOURS[names.indexOf(name) % (count - 1) + 1]]));
+    return Object.fromEntries(names.map((name) => [name, this.colours[place(name)]]));
   }
 }
 

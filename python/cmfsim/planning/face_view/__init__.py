@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from cmfsim.planning.page.arrays import Arrays, add_surface, framing
 from cmfsim.planning.page.document import view_markup
+from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.checks import Floats
 from cmfsim.values.skin_motion import carried_points
 from cmfsim.values.surface_data import SurfaceData
@@ -38,12 +39,11 @@ def face_view(parts: Parts, colours: NDArray[np.uint8] | None = None) -> tuple[s
     shown: list[dict[str, Any]] = []
     bones = parts.get("bones", {})
     count = sum(len(surface.triangles) for surface, _ in bones.values())
-    moving = 0
+    own = segment_colours(list(bones))
     for name, (surface, after) in bones.items():
         most = max(LEAST_BONE, BONE_TRIANGLES * len(surface.triangles) // count)
         moves = float(np.linalg.norm(after - surface.vertices, axis=1).max()) > STAYS
-        shown.append({"kind": "bones", "colour": moving if moves else None})
-        moving += moves
+        shown.append({"kind": "bones", "colour": own[name] if moves else None})
         _pack(arrays, name, surface, after, most)
     ((skin, after),) = parts["skin"].values()
     shown.append({"kind": "skin", "colour": None})

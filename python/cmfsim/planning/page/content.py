@@ -33,6 +33,7 @@ from cmfsim.planning.replanning import (
     segment_boxes,
 )
 from cmfsim.surfaces.depth import barycentric
+from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.prediction import Prediction
@@ -251,6 +252,7 @@ def _bones(
     """All bones, including those that stay; each is simplified by the same ratio."""
     segments = planning.patient.segments
     counts = [len(segment.surface.triangles) for segment in segments]
+    colours = segment_colours([segment.name for segment in segments])
     found: list[dict[str, Any]] = []
     for number, segment in enumerate(segments):
         most = max(LEAST_BONE, BONE_TRIANGLES * counts[number] // sum(counts))
@@ -260,6 +262,7 @@ def _bones(
             {
                 "name": segment.name,
                 "segment": planning.segments.index(segment.name) if moves else None,
+                "colour": colours[segment.name],
             }
         )
     return found

@@ -1,7 +1,7 @@
 // A face before and after an operation, to turn, within a report.
 
 import { Camera } from "./camera.js";
-import { SKIN, STILL_BONE, DISTINCT, mapped, rgb } from "./colours.js";
+import { SKIN, STILL_BONE, mapped, rgb } from "./colours.js";
 import { Drawing, vertexNormals } from "./drawing.js";
 import { _, cleared } from "./elements.js";
 import { Ruler } from "./measuring.js";
@@ -16,7 +16,7 @@ const GROUND = [0.933, 0.945, 0.961];
 class Moving {
   constructor(drawing, { kind, colour }, before, triangles, shift, paint) {
     Object.assign(this, { drawing, kind, before, triangles, shift });
-    this.colour = paint ? [1, 1, 1] : kind === "skin" ? SKIN : colour === null ? STILL_BONE : rgb(DISTINCT[colour % DISTINCT.length]).map((v) => 0.45 + 0.55 * v);
+    this.colour = paint ? [1, 1, 1] : kind === "skin" ? SKIN : colour === null ? STILL_BONE : rgb(colour);
     this.still = drawing.surface(before, triangles, paint);
     this.now = drawing.surface(before, triangles, paint);
     this.places = Float32Array.from(before);

@@ -5,7 +5,7 @@ const VIRIDIS = [
   [68, 1, 84], [72, 36, 117], [65, 68, 135], [53, 95, 141], [42, 120, 142], [33, 145, 140],
   [34, 168, 132], [68, 191, 112], [122, 209, 81], [189, 223, 38], [253, 231, 37],
 ];
-// Okabe and Ito (2008), for segments and variants.
+// Okabe and Ito (2008), for variants.
 export const DISTINCT = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000"];
 export const SKIN = [0.91, 0.75, 0.65];
 export const STILL_BONE = [0.9, 0.87, 0.8];

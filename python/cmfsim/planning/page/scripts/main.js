@@ -2,7 +2,7 @@
 
 import { BandPanel } from "./band_panel.js";
 import { Camera } from "./camera.js";
-import { SKIN, STILL_BONE, DISTINCT, mapped, rgb } from "./colours.js";
+import { SKIN, STILL_BONE, mapped, rgb } from "./colours.js";
 import { DeskPanel } from "./desk_panel.js";
 import { Drawing, vertexNormals } from "./drawing.js";
 import { _, element } from "./elements.js";
@@ -54,10 +54,10 @@ class App {
     this.handles = new Handles(this.overlay);
     this.skin = this.drawing.surface(before, triangles);
     this.skinBefore = this.drawing.surface(before, triangles);
-    this.bones = page.bones.map(({ segment }, i) => ({
+    this.bones = page.bones.map(({ segment, colour }, i) => ({
       segment, places: arrays[`bone_${i}`].values, triangles: arrays[`bone_${i}_triangles`].values,
       surface: this.drawing.surface(arrays[`bone_${i}`].values, arrays[`bone_${i}_triangles`].values),
-      colour: segment === null ? STILL_BONE : rgb(DISTINCT[segment % DISTINCT.length]).map((v) => 0.45 + 0.55 * v),
+      colour: segment === null ? STILL_BONE : rgb(colour),
     }));
     this.solver = new ExactSolver(this);
     this.build();
