@@ -22,11 +22,9 @@ from cmfsim.values.solver_options import MODELS
 
 @dataclass(frozen=True)
 class Source:
-    """A source of uncertainty.
+    """A source of uncertainty and its prior, with the reference for its standard deviation.
 
-    sd: Standard deviation, above 0.
     unit: "log": of the natural logarithm; "1", "share", "degrees" or "mm".
-    reference: Where the standard deviation comes from.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """The parts of a patient case as its file states them: files, cuts, motions, region, mesh.
 
-Nothing here is read from disk: the files that a case names may be missing, which `cmfsim doctor`
-says. `cmfsim.Case` holds the whole.
+docs/formats.md has every key with its meaning; here is what it does not say. Nothing is read from
+disk here: files may be missing, which `cmfsim doctor` says. `cmfsim.Case` holds the whole.
 """
 
 from collections.abc import Iterable, Mapping
@@ -95,12 +95,7 @@ def stated(
 
 @dataclass(frozen=True, eq=False)
 class Plane(checks.Frozen):
-    """A plane in space.
-
-    point: (3,), mm, LPS.
-    normal: (3,). Unit vector; given at any length but zero.
-    Raises `CaseError`: Not three finite numbers, a normal of length zero.
-    """
+    """A plane through a point (3,), mm, LPS. Its normal is made a unit vector: never zero."""
 
     point: checks.Floats
     normal: checks.Floats
@@ -117,14 +112,7 @@ class Plane(checks.Frozen):
 
 @dataclass(frozen=True)
 class Region:
-    """The part of the head that is meshed: the face, in front of a posterior plane.
-
-    posterior_plane: Its normal points out of the region, backwards.
-    posterior_depth: mm. Distance of a coronal plane behind the roots of the zygomatic arches
-        (`supraglenoid_L` and `_R`); below 0 in front of them. 10 mm if neither it nor the plane is
-        given.
-    lower, upper: mm. Heights (S axis) that bound the region; None keeps what the skin has.
-    """
+    """The part of the head that is meshed, in front of a posterior plane (its normal backwards)."""
 
     posterior_plane: Plane | None = None
     posterior_depth: float | None = stated(None, "mm", -200.0, 200.0)
@@ -136,11 +124,9 @@ class Region:
             raise CaseInputError(f"lower is {self.lower:g}, upper {self.upper:g}: lower < upper")
 
     def plane(self, landmarks: Mapping[str, ArrayLike], foremost: float, hindmost: float) -> Plane:
-        """The posterior plane: as given, or coronal, from landmarks or from the head's depth.
+        """The posterior plane: as given, or coronal, from skull landmarks or from the head's depth.
 
-        landmarks: mapping of str to (3,), mm. Skull landmarks; may be empty.
         foremost, hindmost: mm. P coordinates of the skin's first and last point.
-        Returns: Its normal points backwards, out of the region.
         """
         if self.posterior_plane is not None:
             return self.posterior_plane
@@ -161,10 +147,7 @@ class Region:
 
 @dataclass(frozen=True)
 class CaseBite:
-    """Intraoral scans of the teeth: those of the CT, or in the bite that a plan is meant to give.
-
-    upper, lower: In occlusion, in one frame: any; mm.
-    """
+    """Intraoral scans in occlusion, in one frame: those of the CT, or in the bite of a plan."""
 
     upper: Path = field(metadata=PLAIN)
     lower: Path = field(metadata=PLAIN)
@@ -172,17 +155,7 @@ class CaseBite:
 
 @dataclass(frozen=True)
 class CaseImage:
-    """A CT and how to read tissue from it; None stands for the default of the imaging stage.
-
-    file: NRRD, NIfTI, MetaImage, or a folder of DICOM slices.
-    skin_threshold, bone_threshold, metal_threshold: HU.
-    working_spacing: mm.
-    series: UID or number of the DICOM series that is meant, where the folder holds several.
-    rescale: Slope and intercept from the image's values to HU, where they are not HU.
-    bones: Closed surfaces of the bones in mm, instead of those that the image shows, such as those
-        of a label image; the skin is the image's.
-    teeth: Intraoral scans whose crowns replace those of the image, which metal may have streaked.
-    """
+    """A CT and how to read tissue from it; None stands for the default of the imaging stage."""
 
     file: Path = field(metadata=PLAIN)
     skin_threshold: float | None = stated(None, "HU", *TISSUE_HU)
@@ -200,12 +173,7 @@ class CaseImage:
 
 @dataclass(frozen=True)
 class CaseSurfaces:
-    """Ready surfaces of skin and bones.
-
-    units: Of the numbers in every file: "mm", "cm", "m", "um", "inch".
-    frame: Of the numbers in every file: "LPS" or "RAS". None: what each file's header states, and
-        LPS where it states none.
-    """
+    """Surfaces of skin and bones. `frame` None: as each header states, LPS where none does."""
 
     skin: Path = field(metadata=PLAIN)
     bones: Mapping[str, Path]
@@ -227,10 +195,8 @@ FEW_SITES = 12
 class CaseLandmarks:
     """Files of landmarks, 3D Slicer's `.mrk.json` or `.fcsv`.
 
-    frame: The frame of files that do not state theirs.
     automatic: Whether landmarks are found automatically where neither file is given, and the others
         where the one of the skull has fewer than twelve; "missing": whatever the files lack.
-    templates: Folders of heads whose landmarks are known, for finding them; see docs/landmarks.md.
     """
 
     skull: Path | None = stated(None)
@@ -257,13 +223,10 @@ class CaseLandmarks:
 
 @dataclass(frozen=True)
 class CaseMesh:
-    """Options of the mesh of the soft tissue, or the source of its tets.
+    """Options of the mesh of the soft tissue; none is used where a file has the tets.
 
-    edge_length: mm.
-    refine: Smaller tets where tissue is thin, and at the mouth.
     cleft: mm. Tissue of which two segments that part are less than this away, taken together, is
         left out: between tooth rows and at cuts. 0: none.
-    file: Tets from elsewhere; edge length, refinement and cleft are then not used.
     """
 
     edge_length: float = stated(EDGE_LENGTH, "mm", *EDGE_LENGTHS)
@@ -276,12 +239,8 @@ class CaseMesh:
 class CaseLips:
     """Whether the lips of a case are separated, and where; see `lip_seam` and `lip_regions`.
 
-    contact: The tissue is separated between the lips, and neither lip enters the other or the
-        teeth.
     seam: "auto": from the gap or crease that the skin shows, else from landmarks; "landmarks"; or
         the file of a surface between the lips, its normals towards the upper lip.
-    depth: mm. How far the seam continues past the teeth, between their rows.
-    height: mm. How far from the seam the lips reach.
     """
 
     contact: bool = stated(LIP_CONTACT)
@@ -292,13 +251,7 @@ class CaseLips:
 
 @dataclass(frozen=True)
 class CaseBand:
-    """Whether a prediction comes with a band that states how far to trust it.
-
-    asked: The case has a table [band].
-    calibration: File of a calibration; None makes an uncalibrated band.
-    coverage: Share of cases that are to lie within it: 0.9 for 90 %.
-    group: The calibration cases to use; None uses all of them.
-    """
+    """Whether a prediction comes with a band (`asked`: the case has a table [band]), and which."""
 
     asked: bool = False
     calibration: Path | None = stated(None)
@@ -310,11 +263,8 @@ class CaseBand:
 class CaseOsteotomy:
     """One cut: a standard procedure placed from landmarks, or a plane through a bone.
 
-    procedure: "le_fort_1", "le_fort_3", "bsso" or "genioplasty".
     options: Adjustments of the procedure, as the osteotomy stage takes them.
-    plane: The side to which its normal points becomes the new segment.
-    bone: The bone that the plane cuts.
-    name: The name of the new segment.
+    plane: The side to which its normal points becomes the new segment, `name`, of `bone`.
     """
 
     procedure: str | None = None
@@ -346,11 +296,8 @@ class CaseMotion(checks.Frozen):
     """The motion of one segment: a matrix, a transform file, or a surface before and after.
 
     matrix: (4, 4), mm, or None, in LPS, whatever the frame of the case file's own numbers.
-    transform: ITK `.tfm` or `.h5`, or a text of 4 × 4 numbers.
-    surface, moved_surface: Files with the same triangles.
     centre: (3,), mm, LPS, or None. The centre of the turn, where the case states one.
-    direction: What the numbers of the transform file do: one of `DIRECTIONS`; stated for ITK's
-        files.
+    direction: Of the transform file: one of `DIRECTIONS`; stated for ITK's files.
     frame: The frame in which the case file, or the transform file, has its numbers, where stated.
     typed: Whether the motion is given by translation, angle, axis and centre.
     """
@@ -365,10 +312,7 @@ class CaseMotion(checks.Frozen):
     typed: bool = False
 
     def source(self, understood: str = "") -> str:
-        """Where the motion comes from and what was assumed, in words; empty for a typed one.
-
-        understood: How the transform file was understood, where it is known.
-        """
+        """Where the motion comes from, how its file was `understood`, in words; empty if typed."""
         if self.transform is not None:
             return f"{self.transform.name}{f': {understood}' if understood else ''}"
         if self.moved_surface is not None:
@@ -424,13 +368,7 @@ class CaseMuscles:
 
 @dataclass(frozen=True)
 class CasePhoto:
-    """The 3D photo whose colours the skin gets.
-
-    file: OBJ with its MTL and texture, or PLY with colours.
-    landmarks: Skin landmarks on it, three at least, in its own frame, by which it is registered.
-    aligned: Whether it lies in the frame of the other data already.
-    units: Of the photo and its landmarks.
-    """
+    """The 3D photo whose colours the skin gets; its landmarks are in its own unit and frame."""
 
     file: Path = field(metadata=PLAIN)
     landmarks: Path | None = stated(None)
@@ -443,16 +381,9 @@ class CasePhoto:
 
 @dataclass(frozen=True)
 class CasePostoperative:
-    """The post-operative data.
+    """The post-operative data: a CT, or surfaces, which have `units` and `frame`.
 
-    skin: Surface of the skin after the operation.
-    image: CT after the operation, instead of skin and bones.
-    landmarks: Skin landmarks on it, for correspondences.
     bones: Surfaces of bones or segments, by name, for the achieved plan.
-    aligned: Whether it lies in the frame of the data before the operation already.
-    units: Of the surface files.
-    frame: Of the surface files, as in `CaseSurfaces`.
-    series: UID or number of the DICOM series of the image, where its folder holds several.
     verified: Whether the user states that this is the patient after this operation: findings that
         it is another face, or the face before, are then warnings, not errors.
     """

@@ -251,10 +251,7 @@ def planned_motion(
 
 
 def plan_lines(plan: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The lines that state a plan: one for each segment that moves, one for those that stay.
-
-    plan: `ClinicalMotion.as_dict()` by segment.
-    """
+    """The lines that state a plan of `ClinicalMotion.as_dict()`: what moves, then what stays."""
     lines = []
     for name, motion in plan.items():
         if motion["text"] != "stays":

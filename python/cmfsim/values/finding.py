@@ -99,10 +99,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class FindingGroup:
-    """Findings of one severity and code, in their order.
-
-    findings: At least one.
-    """
+    """Findings of one severity and code, at least one, in their order."""
 
     findings: tuple[Finding, ...]
 
@@ -228,7 +225,6 @@ def findings_text(
 ) -> str:
     """The findings as lines, with a count at the end.
 
-    colour: Whether the severity is coloured, for a terminal.
     width: Columns at which lines wrap; 0 keeps each finding's parts on one line.
     escape: Makes a text from a file harmless for the terminal.
     """

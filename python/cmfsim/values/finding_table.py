@@ -17,12 +17,10 @@ BLANK = re.compile(r"\{(\w+)(?:!r)?(?::[^}]*)?\}")
 
 @dataclass(frozen=True)
 class FindingKind:
-    """What findings of one code have in common.
+    """What findings of one code have in common; `meaning` is the fact, `why` its effect.
 
-    severity: "error", "warning" or "note"; several joined by " or " where it depends on the size.
-    meaning, why, fix: The fact, its effect on the result, and what to do.
-    several: What several findings have in common, on one line; empty: the worst of them stands for
-        all.
+    severity: Several joined by " or " where it depends on the size.
+    several: One line for several findings; empty: the worst of them stands for all.
     """
 
     severity: str

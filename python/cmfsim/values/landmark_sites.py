@@ -84,13 +84,10 @@ def label_key(label: str) -> str:
 class CephalometricSite:
     """A landmark under the names of cephalometry and of Slicer's automatic tools.
 
-    short: Its abbreviations without a side ("LGo" and "Go_L" are the left gonion); the first is
-        written.
-    kind: "skull" or "skin".
-    name: In words.
+    short: Its abbreviations without a side ("LGo" and "Go_L" are the left gonion), the first of
+        which is written.
     site: Of `SKULL_LANDMARKS` or `SKIN_LANDMARKS` without its side; empty if only `cephalometry`
         uses it.
-    where: Its definition in cephalometry.
     """
 
     short: tuple[str, ...]
@@ -107,9 +104,8 @@ CEPHALOMETRY: tuple[CephalometricSite, ...] = tuple(
 
 
 def named_site(label: str, kind: str) -> str | None:
-    """The site of a kind that a label stands for, in any spelling or by an abbreviation.
+    """The site of a kind that a label stands for, in any spelling or abbreviation; None if none is.
 
-    Returns: None if it is none of cmfsim's.
     Raises `LandmarkError`: A paired site without its side.
     """
     key = label_key(label)

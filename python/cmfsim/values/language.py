@@ -72,12 +72,6 @@ def translated(text: str) -> str:
 
     A text with its values filled in is found by its message, and its values are translated as
     well. A text without a message is translated sentence by sentence, or item by item.
-
-    Examples
-    --------
-    >>> from cmfsim.values.language import translated
-    >>> translated("The skin moves by up to 8.1 mm.")
-    'The skin moves by up to 8.1 mm.'
     """
     known = catalogue()
     if not known or len(text) > MOST_CHARACTERS or not any(map(str.isalpha, text)):

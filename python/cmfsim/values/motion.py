@@ -214,13 +214,10 @@ def _sine_cosine(degrees: float) -> tuple[float, float]:
 
 
 def plan_digits(motions: Mapping[str, NDArray[np.float64] | MovedSurface]) -> str:
-    """Eight hexadecimal digits that plans of other motions do not share.
+    """Eight hexadecimal digits that plans of other motions do not share; what stays does not count.
 
-    The planning page writes the same digits into the plans that it saves. Segments that stay do
-    not count.
-
-    motions: mapping of str to (4, 4), mm, by segment; or the motion of its vertices, (n, 3) or a
-        surface.
+    The planning page writes the same digits into the plans that it saves.
+    motions: By segment: (4, 4), mm; or the motion of its vertices, (n, 3) or a surface.
     """
     texts = []
     for name, motion in motions.items():

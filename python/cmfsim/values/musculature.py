@@ -152,10 +152,7 @@ def is_template_name(name: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TemplateData(Frozen):
-    """The contents of a template, with its names checked.
-
-    `MuscleTemplate` is what works with it, and describes the attributes.
-    """
+    """The contents of a template with its names checked, as `MuscleTemplate` describes them."""
 
     name: str
     muscles: tuple[MuscleSurface, ...]

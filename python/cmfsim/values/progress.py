@@ -91,8 +91,7 @@ def expected_stages(*after: str) -> dict[str, float]:
 class TimeLeft:
     """The time that a work of known stages still takes, estimated as its stages begin.
 
-    `expected` are the stages in order with their typical seconds; those that do not occur count as
-    skipped when a later one begins.
+    `expected`: Typical seconds of the stages, in order; those that do not occur are skipped.
     """
 
     def __init__(self, expected: Mapping[str, float]) -> None:

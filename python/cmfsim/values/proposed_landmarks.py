@@ -34,11 +34,9 @@ ORIGINS = {
 
 @dataclass(frozen=True)
 class SiteState:
-    """Where a landmark comes from.
+    """Where a landmark comes from: a key of `ORIGINS`, and the reason to check it, if any.
 
-    origin: A key of `ORIGINS`.
     error: mm. Expected distance from where a person would place it; 0 where one did.
-    doubt: The reason to check it; empty if there is none.
     """
 
     origin: str = PLACED
@@ -72,12 +70,9 @@ def site_state(description: str) -> SiteState:
 
 @dataclass(frozen=True, eq=False)
 class ProposedSite:
-    """A proposed landmark.
+    """A proposed landmark (3,), mm, on the surface of the bone or skin, in the frame of the head.
 
-    point: (3,), mm, on the surface of the bone or skin, in the frame of the head.
-    error: mm. Expected distance from where a person would place it.
-    doubt: The reason to check it; empty if there is none.
-    origin: A key of `ORIGINS`: "proposed", or who placed, moved or filled it in.
+    Error, doubt and origin are those of its `SiteState`.
     """
 
     point: Floats
@@ -98,15 +93,11 @@ class ProposedSite:
 
 @dataclass(frozen=True, eq=False)
 class ProposedLandmarks:
-    """Landmarks that were found automatically.
+    """Landmarks that were found automatically, in the order of the lists; the missing with reasons.
 
-    skull, skin: By label, in the order of `SKULL_LANDMARKS` and `SKIN_LANDMARKS`; sites that were
-        not found are absent.
-    missing_skull, missing_skin: The sites that were not found, with the reason.
     impossible_jaw: Why the bone taken for the mandible cannot be one; empty if it can.
     doubtful_jaw: Everything that speaks against it, including doubts; empty if nothing does.
-    separation: mapping of str to (3,), mm. Points from which the jaws of an image can be separated
-        again.
+    separation: mapping of str to (3,), mm. Where the jaws of an image can be separated again.
     """
 
     skull: Mapping[str, ProposedSite]

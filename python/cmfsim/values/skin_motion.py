@@ -27,25 +27,20 @@ ROUNDS = 100
 class SkinEnd(Frozen):
     """The skin next to a plane on which the tissue ends, which moves as the skin before it does.
 
-    The tissue is fixed on that plane because the model ends there, not the patient. The row of
-    skin nodes on the plane would stay, and the row before it move by almost as much as the bone
-    below. The nodes of the end therefore take the mean of their neighbours, while those farther
-    from the plane keep their solution; the skin behind the plane, which has no tets, then fades
-    out (`attachment`).
+    The tissue is fixed there because the model ends, not the patient: the row of nodes on the plane
+    would stay, and the row before it move by almost as much as the bone below. So nodes of the end
+    take the mean of their neighbours, those farther off keep their solution, and the skin behind
+    the plane, which has no tets, fades out (`attachment`).
 
-    vertices: (z,) int64. Vertices of the skin.
-    edges: (e, 2) int64. Pairs of a place in `vertices`, and a neighbour among the vertices of the
-        skin.
+    vertices: (z,) int64, of the skin.
+    edges: (e, 2) int64. Pairs of a place in `vertices` and a neighbour among the skin's vertices.
     """
 
     vertices: NDArray[np.int64]
     edges: NDArray[np.int64]
 
     def continued(self, field: Floats) -> Floats:
-        """The displacements of all vertices of the skin, (k, …), with those of the end replaced.
-
-        Linear in its argument, so the columns of a plan operator may be given as well.
-        """
+        """The displacements (k, …) of the skin, those of the end replaced: a linear map."""
         if not len(self.vertices):
             return field
         found = np.array(field)
@@ -59,11 +54,7 @@ class SkinEnd(Frozen):
 
 
 def skin_end(skin: SurfaceData, held: ArrayLike) -> SkinEnd:
-    """The part of a skin that ends on planes which hold it, and what it is continued from.
-
-    skin: The mesh's skin.
-    held: (k,) bool. Its vertices on those planes.
-    """
+    """The part of a mesh's skin that ends on planes which hold its vertices `held`, (k,) bool."""
     on_plane = np.asarray(held, dtype=bool)
     triangles = skin.triangles.astype(np.int64)
     rim = triangles[on_plane[triangles].any(axis=1)]
@@ -83,10 +74,8 @@ def skin_end(skin: SurfaceData, held: ArrayLike) -> SkinEnd:
 
 @dataclass(frozen=True, eq=False)
 class Attachment(Frozen):
-    """Where points on or near a mesh's skin are attached to it.
+    """Where k points on or near a mesh's skin are attached to it: triangles and closest points.
 
-    triangles: (k,) integers, of the skin, with the closest point of each.
-    closest: (k, 3), mm.
     places: (k, 3), mm. The points themselves, those farther away than an edge drawn nearer to the
         skin: rotations of a triangle are followed no farther out.
     share: (k,), of the movement of their places that the points follow: 1 up to two edges from the
@@ -100,11 +89,7 @@ class Attachment(Frozen):
 
 
 def attachment(skin: Surface, points: ArrayLike) -> Attachment:
-    """Where points are attached to a mesh's skin.
-
-    skin: The mesh's skin.
-    points: (k, 3), mm.
-    """
+    """Where points (k, 3), mm, are attached to a mesh's skin."""
     places = as_rows("points", points, 3)
     closest, _, triangles = skin.closest(places)
     edge = _mean_edge(skin.vertices[skin.triangles])
@@ -118,14 +103,10 @@ def attachment(skin: Surface, points: ArrayLike) -> Attachment:
 
 
 def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike) -> Floats:
-    """How points on or near a mesh's skin move, (k, 3) mm: as its closest point.
+    """How points (k, 3), mm, on or near a mesh's skin move, as its closest point: (k, 3) mm.
 
     What lies away from the tissue that was simulated, as the back of the head, stays: from two
-    edges off its movement fades, over 25 mm.
-
-    before: The mesh's skin.
-    displacements: (v, 3), mm, of its vertices.
-    points: (k, 3), mm.
+    edges off its movement fades, over 25 mm. `displacements`: (v, 3), mm, of the skin's vertices.
     """
     skin = before.searched
     found = attachment(skin, points)

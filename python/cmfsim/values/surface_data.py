@@ -23,12 +23,9 @@ from cmfsim.values.checks import (
 
 
 def used_nodes(cells: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The nodes that triangles or tets use, ascending, and the same cells in those numbers.
+    """The nodes that cells use, (k,) ascending, and the cells (c, 3) or (c, 4) in those numbers.
 
-    cells: (c, 3) or (c, 4) unsigned or signed integers. Nodes, or vertices of a surface; none is
-        negative.
-    Returns `nodes`: (k,) int64. Rows to keep of whatever is stored by node.
-    Returns `cells`: as `cells`, int64. Indices into `nodes`.
+    Both int64. Cells may be signed or not, none negative, of nodes or of a surface's vertices.
     """
     used = np.zeros(int(cells.max(initial=0)) + 1, dtype=bool)
     used[cells] = True
@@ -37,10 +34,9 @@ def used_nodes(cells: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64
 
 
 def are_among(keys: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which keys of edges are among others, which ascend: a third of the time of `np.isin`.
+    """Which keys of edges (k,) are among others, which ascend: a third of the time of `np.isin`.
 
-    keys: (k,). Empty if `others` is.
-    others: (n,), ascending.
+    `keys` must be empty if `others` is.
     """
     places = np.minimum(np.searchsorted(others, keys), len(others) - 1)
     found: NDArray[np.bool_] = others[places] == keys

@@ -36,11 +36,7 @@ def plain_line(text: str) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a heading; columns of numbers are set right.
-
-    numeric: Whether all columns but the first hold numbers.
-    gap: Between the columns of plain text.
-    """
+    """Rows of text under a heading; set right if all columns but the first are `numeric`."""
 
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
