@@ -66,10 +66,7 @@ def shift_text(offset: Floats) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A surface of the case, as read and as it would be repaired.
-
-    name: "skin", or the bone's.
-    """
+    """A surface of the case, "skin" or a bone by name, as read and as it would be repaired."""
 
     name: str
     where: str
@@ -119,10 +116,8 @@ def distances_from(bodies: Iterable[Body], points: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What could be read of a case.
+    """What could be read of a case; what could not be read is empty.
 
-    skull_landmarks, skin_landmarks: mapping of str to (3,), mm. Empty where there are none, or none
-        could be read.
     motions: mapping of str to (4, 4), mm, of the segments whose plan is a matrix.
     transforms: How the transform files of the plan were understood, by segment.
     """
@@ -158,10 +153,7 @@ class Evidence:
         return found
 
     def in_region(self, points: Floats) -> NDArray[np.bool_]:
-        """Which of (n, 3) points lie in the part of the head that is meshed.
-
-        Where there is no skin, all of them.
-        """
+        """Which of (n, 3) points lie in the part that is meshed; without a skin, all of them."""
         if self.skin is None:
             return np.ones(len(points), dtype=bool)
         depths = self.skin.repaired.vertices[:, 1]

@@ -31,11 +31,7 @@ def legible(name: str) -> str:
 
 
 def quoted(text: str) -> str:
-    """A TOML string.
-
-    Raises `UnicodeEncodeError`: The text is the name of a file that is not UTF-8: no case can name
-        it.
-    """
+    """A TOML string; `UnicodeEncodeError` where a name is not UTF-8: no case can hold it."""
     text.encode()
     kept = (c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in text)
     return f'"{"".join(kept)}"'
@@ -43,10 +39,7 @@ def quoted(text: str) -> str:
 
 @dataclass
 class Text:
-    """A case file as it is written, line by line, and the questions in it.
-
-    questions: The key and the question of each line that a person has to decide.
-    """
+    """A case file as it is written, line by line, and the key and text of each question in it."""
 
     lines: list[str] = field(default_factory=list)
     questions: list[str] = field(default_factory=list)
@@ -81,7 +74,6 @@ class Text:
     def ask(self, key: str, question: str, choices: Sequence[str], value: str = '"?"') -> None:
         """A key that a person decides: `doctor` refuses the file and repeats question and choices.
 
-        choices: What may be written instead.
         value: TOML that holds "?".
         """
         place = f"{self._table}.{key}".lstrip(".")
@@ -104,9 +96,8 @@ OFFSET_RANGE = (1500.0, 5000.0)
 class Images:
     """The CT of a case, the one after the operation, and what was noticed.
 
-    question: Which of several images is the CT, with the choices.
-    rescale: The question what takes the values to HU.
-    scale: What does, where that is clear.
+    question: Which of several images is the CT; `rescale`: what takes the values to HU; both with
+        the choices. `scale` is what does, where that is clear.
     """
 
     ct: ImageFind | None = None
@@ -192,11 +183,7 @@ def _said(find: ImageFind) -> str:
 
 @dataclass
 class Marks:
-    """The landmarks of a case.
-
-    frame: What the case states for files that state none.
-    questions: By key of [landmarks].
-    """
+    """The landmarks of a case, their frame in files that state none, and questions by key."""
 
     skull: LandmarkFind | None = None
     skin: LandmarkFind | None = None
@@ -310,12 +297,7 @@ SAMPLES = 300
 
 @dataclass(frozen=True)
 class Question:
-    """A decision about a key that a person has to make.
-
-    key: Below [surfaces].
-    text: The question.
-    choices: What may be written: the file of a surface, or none, and words about it.
-    """
+    """A person's decision about a key below [surfaces]; choices: a file or none, with words."""
 
     key: str
     text: str

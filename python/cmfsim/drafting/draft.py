@@ -90,11 +90,8 @@ def draft_case(
     """The case file of what was gathered.
 
     unpacked: Where the files of a bundle lie for now.
-    name: Of the case.
-    typed: Cuts and motions besides those that files state.
     sites: Landmarks of the skull that were found automatically, about which typed motions turn.
-    Raises `CaseError`: What is there makes no case: neither a CT, nor a skin with a bone; cuts or
-        motions that do not suit it.
+    Raises `CaseError`: There is neither a CT, nor a skin with a bone; unsuitable cuts or motions.
     """
     typed = typed or motions.TypedPlan()
     draft = _decide(found, unpacked)
@@ -408,10 +405,7 @@ def _write_motion(text: Text, name: str, motion: motions.DraftMotion) -> None:
 
 
 def _write_place_after(draft: Draft) -> str | None:
-    """Unit and frame of surfaces after the operation, and whether they lie where the head was.
-
-    Returns the frame of the files that state none, as far as it is known.
-    """
+    """Unit, frame and place of surfaces after the operation; returns the frame of silent files."""
     text, anatomy = draft.text, draft.anatomy
     silent = [find for find in anatomy.after if find.stated is None]
     if (asked := anatomy.asks("units")) is not None and anatomy.after:

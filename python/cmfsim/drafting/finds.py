@@ -51,9 +51,8 @@ SEEN = "is a link to a folder that holds this one, or that was read already"
 
 @dataclass(frozen=True, eq=False)
 class Find:
-    """Something that was found: what reports call it, what its name says, and its file.
+    """Something that was found: its path, or its scene and node; what its name says; its file.
 
-    label: Its path, or its scene and node.
     to_world: (4, 4), mm, LPS. What its scene applies to it.
     chain: The names of the transforms that do, the nearest first.
     """
@@ -100,10 +99,8 @@ class ImageFind(Find):
     """A CT, or another image; `path` is a folder for DICOM.
 
     modality: Of DICOM; empty where the file does not state it.
-    values: Lowest and highest.
     words: Its size and spacing.
     box: (2, 3), mm, LPS. Its lowest and highest corner.
-    error: Why it cannot be read; empty if it can.
     series: UID of the DICOM series that is meant, where the folder holds several.
     is_labels: Whether its values are labels of segments, and not those of a CT.
     to_hu: Slope and offset to HU and the expected error at bone, HU, where the values are not HU
@@ -134,10 +131,7 @@ class TransformFind(Find):
 
 @dataclass(frozen=True, eq=False)
 class LooseMotion:
-    """A transform of a scene that is applied to nothing: hardened, or never used.
-
-    matrix: (4, 4), mm, LPS.
-    """
+    """A transform (4, 4), mm, LPS, of a scene, applied to nothing: hardened, or never used."""
 
     label: str
     role: NameRole
@@ -185,13 +179,10 @@ def unused(label: str, why: str, paths: tuple[Path, ...] = ()) -> Taken:
 
 @dataclass
 class Gathered:
-    """What was found, by kind.
+    """What was found, by kind; `seen` is every file of the folder.
 
-    scene: The label of the scene that was read; empty if there is none.
-    by_slicer: Whether 3D Slicer saved any of the files.
-    seen: Every file of the folder.
     names: Those with the names of labels.
-    scene_files: Those that the scene names.
+    scene_files: Those that the scene names; without a scene its label is empty.
     links: The transforms of the scene, with what lies directly under each.
     """
 
@@ -220,11 +211,7 @@ class Gathered:
 
 @dataclass
 class Listing:
-    """The paths in a folder, by what their endings say.
-
-    unread: What no case reads, by its folder and the reason.
-    seen: Every file, read or not.
-    """
+    """The paths in a folder, by their endings; those that no case reads, by folder and reason."""
 
     surfaces: list[Path] = field(default_factory=list)
     images: list[Path] = field(default_factory=list)
@@ -254,10 +241,7 @@ class Listing:
 
 
 def listing(folder: Path) -> Listing:
-    """The files of a folder and those below it, by kind.
-
-    Raises `CaseError`: More files than a case has.
-    """
+    """The files of a folder and those below it, by kind; `CaseError` if they are too many."""
     found = Listing()
     dicom: dict[Path, None] = {}
     for path in _files(folder, found):
@@ -336,10 +320,7 @@ def _is_utf8(name: str) -> bool:
 
 
 def surface_find(path: Path, label: str) -> SurfaceFind:
-    """A surface file, read.
-
-    Raises `CaseError`: As `read_surface`.
-    """
+    """A surface file, read; raises as `read_surface`."""
     read = surface_as_stored(path)
     is_silent = read.frame is None
     stated = "LPS" if is_silent and is_own_file(path) else read.frame
@@ -411,9 +392,6 @@ def _are_turned_labels(path: Path, findings: tuple[Finding, ...]) -> bool:
 
 
 def landmark_find(path: Path, label: str) -> LandmarkFind:
-    """A file of landmarks, read.
-
-    Raises `LandmarkError`: As `read_landmarks`.
-    """
+    """A file of landmarks, read; raises as `read_landmarks`."""
     name = path.name.partition(".")[0]
     return LandmarkFind(label, name_role(name), path, read_landmark_file(path))

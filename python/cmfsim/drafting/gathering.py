@@ -30,8 +30,7 @@ def gather(
 
     scene: The scene that is meant; else the only one of the folder.
     unpacked: An empty folder for the files of a bundle.
-    Raises `CaseError`: Several scenes; a scene that is damaged or hostile; a transform of a scene
-        that is not rigid.
+    Raises `CaseError`: Several scenes, one that is damaged or hostile, or moves something bent.
     """
     found = finds.Gathered(folder)
     paths = finds.listing(folder)

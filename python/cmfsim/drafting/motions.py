@@ -34,12 +34,10 @@ class DraftMotion:
     """The motion of a segment as the case will have it.
 
     words: What it does, such as "moves the maxilla 4.0 mm forwards at the upper incisors".
-    source: Where it comes from and how it was understood.
     matrix: (4, 4), mm, LPS, or None.
-    transform: A TOML value instead of a matrix.
+    transform, typed: TOML instead of a matrix: a value, or keys of the table with theirs.
     question: Why a person has to decide; empty if not.
     shown: (4, 4), mm, LPS, or None. The motion that `words` describes.
-    typed: Keys of the table and their TOML, instead of a matrix.
     """
 
     words: str
@@ -56,7 +54,6 @@ class DraftMotion:
 class Plan:
     """The motions of a case by segment, and what was noticed.
 
-    anatomy: The surfaces that move.
     landmarks: mapping of str to (3,), mm, LPS, of the skull, before the operation.
     links: The names of the transforms of the scene that are motions of segments.
     sites: Landmarks that were found automatically, where no file has any.
@@ -91,11 +88,9 @@ def scene_motions(
 ) -> None:
     """Adds the motions that a scene applies to segments, relative to the rest of the head.
 
-    moved: Segments by name.
     loose: Transforms that are applied to nothing.
     reference: (4, 4), mm, LPS. What the scene applies to what does not move.
-    in_image: Whether the case is in the coordinates of its image, rather than in those of the
-        world.
+    in_image: Whether the case is in the coordinates of its image, not in those of the world.
     """
     back = np.linalg.inv(reference)
     # Surfaces about which there are questions, by the bone's name.
@@ -193,10 +188,7 @@ def _add_loose(plan: Plan, motion: LooseMotion) -> None:
 
 
 def file_motions(plan: Plan, found: Sequence[TransformFind], *, by_slicer: bool) -> None:
-    """Adds the motions in transform files, by the segment in the file's name.
-
-    by_slicer: Whether other files of the folder were saved by 3D Slicer.
-    """
+    """Adds the motions in transform files, perhaps 3D Slicer's, by the segment in each name."""
     by_part: dict[str, list[TransformFind]] = {}
     for find in found:
         part = find.role.part
@@ -242,10 +234,7 @@ def _ask_segment(plan: Plan, find: TransformFind) -> None:
 
 
 def _of_file(plan: Plan, name: str, find: TransformFind, *, by_slicer: bool) -> DraftMotion:
-    """The motion in a file, with its direction and frame as far as they are known.
-
-    Raises `CaseError`: As `read_transform_file`.
-    """
+    """The motion in a file, in its direction and frame; raises as `read_transform_file`."""
     file = f"file = {quoted(find.label)}"
 
     def read_as(direction: str) -> Floats:
@@ -302,11 +291,10 @@ def _of_text(plan: Plan, name: str, find: TransformFind) -> DraftMotion:
 
 @dataclass(frozen=True)
 class TypedPlan:
-    """What a person wants cut and moved.
+    """What a person wants cut, by procedures, and moved: numbers by word for each segment.
 
-    cuts: Procedures.
-    moves: Numbers by word for each segment: forwards, backwards, up, down, left, right in mm, and
-        pitch (front up), yaw (front to the left), roll (left side up) in degrees.
+    Forwards, backwards, up, down, left, right in mm; in degrees pitch (front up), yaw (front to
+    the left), roll (left side up).
     """
 
     cuts: tuple[str, ...] = ()
@@ -332,11 +320,7 @@ class TypedPlan:
 
 
 def read_moves(given: Iterable[Iterable[str]]) -> dict[str, dict[str, float]]:
-    """The numbers of `--move SEGMENT WORD=NUMBER …`, by segment.
-
-    Raises `CaseError`: No segment or no number, a text that is no number, a segment or a word given
-        twice.
-    """
+    """The numbers of `--move SEGMENT WORD=NUMBER …`, by segment; `CaseError` for anything else."""
     moves: dict[str, dict[str, float]] = {}
     for segment, *texts in given:
         if "=" in segment:
@@ -367,9 +351,8 @@ def add_typed(plan: Plan, typed: TypedPlan, bones: Iterable[str], *, is_turned: 
 
     bones: That the case has before it is cut.
     is_turned: Whether a scene turns the case, so that its landmarks lie elsewhere.
-    Raises `CaseError`: A segment that no bone is and no procedure makes, that a cut divides, or
-        that a file moves already; a cut whose pieces are there already; a turn about a point that
-        is not known.
+    Raises `CaseError`: A segment that does not exist, that a cut divides, or that a file moves; a
+        cut whose pieces are there; a turn about a point that is not known.
     """
     bones = set(bones)
     for cut in typed.cuts:

@@ -35,14 +35,11 @@ UPPER_QUADRANTS = "1256"
 
 @dataclass(frozen=True)
 class NameRole:
-    """The meaning of a name.
+    """The meaning of a name, and the word in it that says so; `is_after`: after the operation.
 
     part: "skin", "bone" (a skull with its jaw), "cranium", one of `MOVING`, "upper teeth", "lower
-        teeth", "teeth" (of which jaw, the name does not say), "other" (no bone of a case), or
-        empty: the name does not say it.
-    is_after: Of the patient after the operation.
+        teeth", "teeth" (of an unknown jaw), "other" (no bone of a case), or empty: not said.
     registers: Of a transform: it brings data together, and is no plan.
-    word: What in the name says it.
     """
 
     part: str

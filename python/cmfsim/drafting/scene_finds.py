@@ -57,9 +57,7 @@ def segment_finds(
 
     Teeth are added to the jaw that their name says, where both have the same grid; so are the bones
     that a label image cuts out of its skin.
-
-    files: Files of segments or labels, each with what reports call it. One mask per file is a
-        segment that is named after its file.
+    files: Each with what reports call it; one mask per file is named after its file.
     """
     masks: list[_Mask] = []
     others: list[finds.Taken] = []
@@ -173,8 +171,7 @@ def _surface(name: str, mask: NDArray[np.bool_], read: Segmentation) -> SurfaceD
 def scene_finds(found: finds.Gathered, scene: SlicerScene, label: str) -> None:
     """Adds the models, segments, volumes, markups and transforms of a scene.
 
-    Raises `CaseError`: What a case would be made of lies under a transform that is not rigid, or
-        that cannot be read.
+    Raises `CaseError`: What a case needs lies under a transform that is not rigid or not readable.
     """
     for node in scene.nodes.values():
         if node.file is not None:

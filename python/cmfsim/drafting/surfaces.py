@@ -127,8 +127,7 @@ def choose_surfaces(
 ) -> Anatomy:
     """Skin and bones among surfaces; what is not clear becomes a question.
 
-    boxes: sequence of (str, (2, 3)). What lies in LPS mm for certain, by name, with its lowest and
-        highest corner.
+    boxes: sequence of (str, (2, 3)). What certainly lies in LPS mm, with its corners.
     """
     anatomy = Anatomy()
     before = [find for find in found if not find.role.is_after]

@@ -39,12 +39,11 @@ SAME = 1e-9
 
 @dataclass
 class Shown:
-    """Where everything lies, and how it moves, as a draft reports it.
+    """Where everything lies, LPS mm, and how it moves, as a draft reports it.
 
-    surfaces: dict of str to (v, 3), mm, LPS, by the path that the case names.
-    landmarks: dict of str to mapping of str to (3,), mm, LPS, by "skull", "skin" and
-        "landmarks_after".
-    motions: dict of str to (4, 4), mm, LPS, by segment.
+    surfaces: Vertices (v, 3) by the path that the case names.
+    landmarks: Points by label, under "skull", "skin" and "landmarks_after".
+    motions: (4, 4) by segment.
     """
 
     surfaces: dict[str, Floats] = field(default_factory=dict)
@@ -79,10 +78,8 @@ def unaccounted(found: Gathered, plan: Plan, taken: Sequence[Taken]) -> list[Tak
 def check_written(file: Path, shown: Shown, *, is_open: bool) -> None:
     """Loads a case that was written, and compares it with what was shown.
 
-    file: The case file.
     is_open: Whether questions are left: the case cannot be loaded as a whole, then.
-    Raises `CaseError`: Something is missing, or lies or moves otherwise.
-    Raises `CaseInputError`: The case cannot be loaded, although no question is left.
+    Raises `CaseError`: Something is missing, lies or moves otherwise; cannot be loaded.
     """
     if not is_open:
         try:
@@ -154,8 +151,7 @@ def _motions(plan: Any, folder: Path, shown: Shown) -> Iterator[str]:
 class Place:
     """How the surfaces of a table of the case are placed.
 
-    frame: What the table states.
-    shown: The frame of the files that state none.
+    frame: What the table states; `shown`: that of the files that state none.
     matrix: What carries a surface from its own coordinates to those of the case, LPS mm.
     """
 

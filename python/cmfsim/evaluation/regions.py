@@ -355,10 +355,8 @@ class Skin:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Vertices of one skin with their partners on another.
+    """Vertices of one skin, (k,), that were kept, with their partners (k, 3), mm, on another.
 
-    vertices: (k,) int64. Those that were kept.
-    partners: (k, 3), mm.
     signed: (k,), mm. Distance to the partner; negative where the vertex lies behind the other skin.
     n_border: Left out because the partner lies on the other skin's border.
     """

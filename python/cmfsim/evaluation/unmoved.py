@@ -25,11 +25,9 @@ MOST_CHANGE = 0.5
 
 @dataclass(frozen=True)
 class ThicknessChange(Plain):
-    """The change of the soft tissue's thickness, as one fraction of its depth.
+    """The change of the soft tissue's thickness, as one fraction of its depth, at n vertices.
 
-    share: Of the depth; negative where it became thinner.
-    n: Vertices that it was fitted at.
-    depth: mm. Mean depth of the soft tissue there.
+    share: Of the depth; negative where it became thinner. `depth`: on average there, mm.
     before, after: mm. Mean |distance| there without and with the change.
     """
 
@@ -46,12 +44,11 @@ def compare_unmoved(
     regions: Mapping[str, ArrayLike],
     moved: Floats,
 ) -> SkinComparison | None:
-    """The face before against the face after, where nothing was operated on.
+    """The face before against the face after by closest points, where nothing was operated on.
 
     regions: mapping of str to (v,) bool, of the pre-operative skin: `unmoved_regions`.
     moved: (v,), mm. How far each vertex is moved by the model that moves it most.
-    Returns: By closest points: nothing slides along itself there. None where fewer than 20 vertices
-        of the regions stay, as on a mesh that ends below the forehead.
+    Returns: None where under 20 vertices of the regions stay: the mesh ends below the forehead.
     Raises `RegistrationError`: None of them has a partner: the scan after ends below the forehead.
     """
     still = moved < STILL

@@ -121,8 +121,6 @@ def check_landmarks(
 ) -> list[Finding]:
     """Findings about the landmarks of one kind; each landmark is named once.
 
-    key: "skull" or "skin".
-    landmarks: mapping of str to (3,), mm.
     where: The line of the case that names their file.
     nearest: Closest points on the bones or the skin; without it distances are not checked.
     """

@@ -53,12 +53,9 @@ def _everywhere(points: Floats) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class BonePart:
-    """A bone or segment with its motion.
+    """A bone or segment of the "lower" or "upper" jaw with its motion, (4, 4) mm or MovedSurface.
 
-    jaw: "lower" or "upper".
-    where: Of its motion in the case file.
     surface: Closed; of a segment that of its bone.
-    motion: (4, 4), mm, or MovedSurface.
     owns: Which of (n, 3) points within its bone are its own.
     """
 
@@ -112,10 +109,7 @@ def _sampled(vertices: Floats, triangles: NDArray[np.uint32]) -> Floats:
 
 
 def check_jaws(parts: Sequence[BonePart], landmarks: Mapping[str, Floats]) -> tuple[Finding, ...]:
-    """Findings about jaws that a plan moves through each other, apart, or out of the joint.
-
-    landmarks: mapping of str to (3,), mm, of the skull.
-    """
+    """Findings about jaws that a plan moves through each other, apart, or out of the joint."""
     joints = _joints(parts)
     return (
         *_check_overlap(parts, [joint.before for joint in joints]),

@@ -220,10 +220,7 @@ def _owners(evidence: Evidence, bone: str, points: Floats) -> NDArray[np.object_
 
 
 def _piece(evidence: Evidence, name: str) -> Floats | None:
-    """Points on the surface of a bone or segment, (k, 3) mm, with the unit normals, (k, 6) in all.
-
-    None if nothing is known of it.
-    """
+    """Points on a bone or segment and their unit normals, (k, 6), mm; None if none is known."""
     found = []
     for bone, body in evidence.bones.items():
         own = body.samples[_owners(evidence, bone, body.samples) == name]
@@ -276,11 +273,7 @@ def pieces_of(evidence: Evidence) -> dict[str, Floats | None]:
 def check_plan(
     evidence: Evidence, plan: Mapping[str, ClinicalMotion], pieces: Mapping[str, Floats | None]
 ) -> Iterator[Finding]:
-    """Findings about what the plan does to each bone.
-
-    plan: As `state_plan` gives it.
-    pieces: mapping of str to (k, 6) or None. As `pieces_of` gives it.
-    """
+    """Findings about what a plan of `state_plan` does to each bone, by points of `pieces_of`."""
     case = evidence.case
     # A motion that cannot be read is reported where files are.
     known = not case.achieved and set(case.plan) == set(evidence.motions)

@@ -40,15 +40,11 @@ BENT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class SizedMotion:
-    """A rigid motion of a segment with what its size is judged by.
+    """A rigid motion of a segment, (4, 4) mm, with what its size is judged by.
 
-    name: Of the segment.
-    matrix: (4, 4), mm.
-    where: Its place in the case file.
     points: (k, 3), mm, or None, on the segment's surface, where one is known.
     point: (3,), mm, or None. One point of the segment, where no surface is known.
-    typed: Whether it was given by translation, angle, axis and centre.
-    centre: (3,), mm, or None, where it was given.
+    typed: Whether it was given by translation, angle, axis and, perhaps, centre.
     """
 
     name: str
@@ -134,10 +130,7 @@ def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
 
 
 def nothing_moves(where: str, measured: float | None = None) -> Finding:
-    """The warning about a plan that moves no segment.
-
-    measured: How far bones moved at most, mm, where that was measured.
-    """
+    """The warning about a plan that moves no segment; `measured`: how far at most, mm."""
     if measured is None:
         return Finding("plan-still", "no segment moves", where=where)
     what = f"no segment moved by more than {measured:.2g} mm between the two scans"
@@ -184,8 +177,7 @@ def state_plan(
     """The motion of each segment that the plan names and that can be read, by name.
 
     An achieved plan is empty here: it is read off the bones when the case is built.
-
-    vertices: mapping of str to (k, 3), mm, or None, of the surface of each segment, where known.
+    vertices: Of the surface of each segment, (k, 3), mm, where known.
     """
     found: dict[str, ClinicalMotion] = {}
     for name, given in evidence.case.plan.items():
