@@ -195,9 +195,8 @@ class AchievedPlan(Frozen):
 def motion_by_vertices(
     before: SurfaceData, after: SurfaceData, *, centre: ArrayLike | None = None
 ) -> AchievedMotion:
-    """The motion between two surfaces with the same triangles, vertex by vertex.
+    """The motion between surfaces with the same vertices and triangles in order, vertex by vertex.
 
-    before, after: The same vertices and triangles in the same order, in one frame.
     centre: (3,), mm, about which the turn is written. Default: the middle of the vertices before.
     Raises `RegistrationError`: Other triangles; vertices that lie on one line.
     """
@@ -239,10 +238,8 @@ def measure_pair(
     operated on keeps its change along the normals. Otherwise the vertices are followed in rigid
     pieces (`coherent_motion`). `fit` is None if the shapes cannot be compared.
 
-    before, after: The same vertices and triangles in the same order, in one frame.
-    centre: (3,), mm, about which the turn is written. Default: the middle of the vertices before.
+    centre: As in `motion_by_vertices`, which raises the same.
     is_still: Whether the bone was not operated on: changes on it are then no motion of the bone.
-    Raises `RegistrationError`: See `motion_by_vertices`.
     """
     found = motion_by_vertices(before, after, centre=centre)
     if found.is_rigid:

@@ -158,9 +158,7 @@ def sheet_departure(
 ) -> tuple[float, float, float]:
     """How far a sheet lies from the bone where nodes slide: mean, 95th percentile and largest, mm.
 
-    nodes: (n, 3), mm. Those that slide: the bone's points closest to them are compared with the
-        sheet.
-    Returns: All 0 where no node is given.
+    At the bone's points closest to the nodes, (n, 3) mm; all 0 where no node is given.
     """
     points = as_rows("nodes", nodes, 3)
     if not len(points):
@@ -172,10 +170,7 @@ def sheet_departure(
 
 
 class _Grid:
-    """A grid along an arch: axes to the left, ahead, and from the roots past the edges of teeth.
-
-    Its third coordinate is zero at the plane of the edges.
-    """
+    """A grid along an arch: to the left, ahead, and from roots to bite, 0 at the edges of teeth."""
 
     def __init__(self, name: str, bone: ImageData, arch: DentalArch, options: SheetOptions) -> None:
         across, forwards, out = arch.axes()

@@ -45,13 +45,10 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class RemovedBone(Plain):
-    """A patch of bone that is missing after the operation.
+    """A patch of bone that is missing after the operation, by vertices of the surface before.
 
     area: mm², of the surface before.
-    depth: mm. The largest distance of a vertex from where the motion of the rest would have moved
-        it.
-    place: (3,), mm. That vertex, before.
-    vertices: (n,) int64, of the surface before, that lie in the patch.
+    depth: mm. The largest distance of a vertex, `place` before, from where the rest would take it.
     """
 
     area: float = field(metadata=in_files("area_mm2"))
@@ -61,10 +58,9 @@ class RemovedBone(Plain):
 
 
 def sound_motion(motion: MovedSurface) -> MovedSurface:
-    """The motion without degenerate triangles, before or after, and without duplicates.
+    """The motion without triangles that are degenerate, before or after, or duplicates.
 
     Surface files contain some; points near them move with the triangles around them.
-
     Raises `BoundaryError`: No triangle is left.
     """
     here, there = motion.surface.vertices, motion.moved_vertices
@@ -86,9 +82,7 @@ def torn_pieces(motion: MovedSurface) -> tuple[MovedSurface, ...]:
     """The pieces of bone, each of which moved as one, the largest first; without torn triangles.
 
     A piece is connected by edges that are not torn. Those that moved alike are one piece, connected
-    or not: islands of a skull stay with it.
-
-    motion: Without triangles that have no area (`sound_motion`).
+    or not: islands of a skull stay with it. For a motion of `sound_motion`.
     """
     here, there = motion.surface.vertices, motion.moved_vertices
     triangles = motion.surface.triangles.astype(np.int64)
@@ -129,13 +123,11 @@ def moves_as_one(one: MovedSurface, other: MovedSurface) -> bool:
 def missing_patches(
     segment: SurfaceData, bone: Surface, moved: Floats, *, shown: float = SHOWN
 ) -> tuple[RemovedBone, ...]:
-    """Patches of a segment that are missing from the post-operative bone after registration.
+    """Patches of a segment that are missing from the bone after, registered, the largest first.
 
-    segment: Before.
-    bone: After; a surface that is not closed encloses nothing, so nothing is found with it.
+    bone: A surface that is not closed encloses nothing, so nothing is found with it.
     moved: (n, 3), mm, where the motion of the segment takes its vertices, with its change of size.
     shown: mm. What lies further from the post-operative bone may be outside its scan, not removed.
-    Returns: The largest first; without what lies too far away for the post-operative scan to show.
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)

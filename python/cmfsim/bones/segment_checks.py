@@ -35,10 +35,9 @@ SAMPLES = 20_000
 def check_segments(segments: Sequence[BoneSegment], given: Collection[str] = ()) -> None:
     """Raises an error if a segment has another's surface, or one that does not match its level.
 
-    given: Names of segments whose level was made from the surface instead of the reverse: the level
-        is filled, so the surface may have more walls, and another volume.
-    Raises `CaseError`: Two segments have the same surface; the surface of a segment does not lie on
-        the zero set of its level, or encloses another volume. The message names the segments.
+    given: Segments whose level was made from the surface, and filled: the surface may have more
+        walls, and another volume.
+    Raises `CaseError`: With the names; the surface encloses another volume, or lies off the level.
     """
     known: dict[bytes, str] = {}
     for segment in segments:

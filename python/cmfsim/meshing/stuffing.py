@@ -26,9 +26,8 @@ MAX_REFINEMENTS = 3
 
 @dataclass(frozen=True, eq=False)
 class SeparatedMesh:
-    """A mesh that was separated, and where its new nodes come from.
+    """A mesh that was separated: nodes keep their numbers, and new ones follow.
 
-    mesh: Nodes keep their numbers; new ones follow.
     parents: (k, 2) uint32, of each new node, the ends of the edge that was cut there, or twice the
         node that it is a copy of.
     """
@@ -38,10 +37,7 @@ class SeparatedMesh:
 
 
 def separated_mesh(mesh: TetMesh, surface: SurfaceData) -> SeparatedMesh:
-    """The mesh separated along an open surface, as `part_mesh`, with the origin of its new nodes.
-
-    Raises `MeshError`: The surface runs through no tissue.
-    """
+    """The mesh separated along an open surface, as by `part_mesh`, and its nodes' origin."""
     return SeparatedMesh(*_core.part_mesh(mesh, Surface(surface.vertices, surface.triangles)))
 
 

@@ -17,15 +17,13 @@ HALVES = 2
 
 
 class Blur:
-    """Averages of values of tets over their neighbours, repeated until they are as wide as asked.
+    """Averages of values of tets over their neighbours, repeated until they are `width` wide.
 
     One round gives each node the mean of its tets, weighted by volume, and each tet the mean of its
     nodes. It keeps constants, bounds and Σ V p, is the same for every order of the tets, and does
     not cross the gap between lips, where nodes are separate. k rounds widen k times the variance of
-    one, which is measured on the mesh.
-
-    weights: (m,). The share of muscle: where it is, the width of a round is measured.
-    width: mm. Standard deviation along each axis; rounded to a whole number of rounds.
+    one, which is measured on the mesh where `weights`, (m,), the share of muscle, has any. The
+    width, mm, is a standard deviation along each axis, rounded to a whole number of rounds.
     """
 
     def __init__(self, mesh: TetMesh, weights: Floats, width: float) -> None:
@@ -63,17 +61,12 @@ class Blur:
 def blurred(
     mesh: TetMesh, fraction: Floats, fibre: Floats, tissue: TissueData, width: float
 ) -> tuple[Floats, Floats, TissueData]:
-    """The muscle fraction, fibres and tissue of each tet, blurred by a width.
+    """The muscle fraction (m,), fibres (m, 3) and tissue of each tet, blurred by a width.
 
     Muscles are placed with an error of some millimetres: the expected share of muscle at a place is
     the share blurred by that error. Constants mix linearly in the shares, so they are blurred
-    alike. The fibre is the principal direction of the blurred Σ p a aᵀ.
-
-    fraction: (m,).
-    fibre: (m, 3). Unit vectors, zero where there is no muscle.
-    tissue: Of each tet, made of both.
+    alike. The fibre is the principal direction of the blurred Σ p a aᵀ, zero without muscle.
     width: mm. Standard deviation of the blur along each axis; 0 for none.
-    Returns: tuple of (m,), (m, 3) and TissueData.
     """
     if width == 0.0 or not fraction.any():
         return fraction, fibre, tissue

@@ -35,9 +35,7 @@ def _tissue(
     With the share p_i of muscle i in the tet and p = Σ p_i: "moduli" mixes
     E = E_fat (1 − p) + Σ p_i E_i along and across the mean fibre, and ν likewise; "stiffness" mixes
     C = C_fat (1 − p) + Σ p_i C_i(a_i). Both are the rules of the presets where all E_i are equal.
-
-    names: Of the muscles, in the order of the shares.
-    Returns: None for "stiffness", whose arrays are those of the tissue, and for a preset.
+    Arrays are None for "stiffness", whose are those of the tissue, and for a preset.
     """
     if moduli.is_preset(preset):
         return shares.tissue(preset, mixing=mixing), None
@@ -77,11 +75,7 @@ def _by_stiffness(shares: MuscleShares, table: Floats, fat: Tissue) -> Tissue:
 
 
 def check_muscle_names(moduli: TissueModuli, names: Sequence[str]) -> None:
-    """Raises an error if moduli are given for a muscle that is not there.
-
-    names: Of the muscles.
-    Raises `MaterialError`: With the nearest name, and all of them.
-    """
+    """`MaterialError`, with the nearest name, for moduli of a muscle that is not there."""
     for name in moduli.muscles:
         if name not in names:
             known = ", ".join(names) or "none"
@@ -92,10 +86,7 @@ def check_muscle_names(moduli: TissueModuli, names: Sequence[str]) -> None:
 
 
 def moduli_findings(moduli: TissueModuli, preset: str, where: str = "") -> Iterator[Finding]:
-    """A note of moduli that are not the preset's; a warning of those that no muscle has.
-
-    where: Of what states them.
-    """
+    """A note of moduli that are not the preset's; a warning of those that no muscle has."""
     if moduli.is_preset(preset):
         return
     own = moduli.resolved(preset)
@@ -135,22 +126,14 @@ Muscles = HasMuscles | Sequence[Muscle]
 
 @dataclass(frozen=True, eq=False)
 class PreparedMuscles:
-    """Muscles with what is found on them before a mesh is known.
-
-    named: SurfaceData or Surface.
-    ready: Of each, in the same order.
-    """
+    """Muscles with what is found on each, in the same order, before a mesh is known."""
 
     named: Mapping[str, Muscle]
     ready: Sequence[tuple[Surface, MuscleFibres]]
 
 
 def prepared_muscles(muscles: Muscles) -> PreparedMuscles:
-    """The muscles with their search trees and fibres, to be sampled in a mesh later.
-
-    muscles: morphed template, or sequence of MuscleSurface, SurfaceData or Surface.
-    Raises `MeshError`: As `equivalent_material`.
-    """
+    """The muscles with search trees and fibres; raises as `equivalent_material`."""
     return _prepared(_named(muscles))
 
 

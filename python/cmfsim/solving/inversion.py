@@ -13,18 +13,8 @@ def least_volume_ratios(tensors: MassTensors, displacements: ArrayLike) -> Float
 
     det F, which is one number for a linear tet. In a quadratic one it varies: the least of its
     middle and its corners is taken, so that what inverts between these alone is not seen.
-
     displacements: (n, 3), mm, of every node of `tensors.nodes`: `Solution.all_displacements`.
     Raises `MeshError`: Displacements of another number of nodes, or not finite.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> from cmfsim.solving.inversion import least_volume_ratios
-    >>> mesh = cmfsim.TetMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
-    >>> tensors = cmfsim.MassTensors(mesh, cmfsim.Tissue.isotropic(0.003, 0.46))
-    >>> least_volume_ratios(tensors, [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, -1.5]])
-    array([-0.5])
     """
     u = np.asarray(displacements, dtype=np.float64)
     ratios: Floats = 1.0 + tensors.volume_change(u)
@@ -59,25 +49,11 @@ def _middles(
 
 
 def inversion_finding(tensors: MassTensors, displacements: ArrayLike) -> tuple[int, Finding | None]:
-    """The number of tets inverted at equilibrium, and a warning if there are any.
+    """The number of tets inverted at equilibrium, and a warning, "inverted-tets", if there are any.
 
     Linear kinematics has no use for it: its tets keep their strain however they turn, and a
-    negative volume is an error of the linear model rather than of the solution.
-
-    displacements: (n, 3), mm. As for `least_volume_ratios`, of a solution by "corotational" or
-        "hyperelastic" kinematics.
-    Returns: The finding's code is "inverted-tets".
-    Raises `MeshError`: As `least_volume_ratios`.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> from cmfsim.solving.inversion import inversion_finding
-    >>> mesh = cmfsim.TetMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
-    >>> tensors = cmfsim.MassTensors(mesh, cmfsim.Tissue.isotropic(0.003, 0.46))
-    >>> found = inversion_finding(tensors, [[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, -1.5]])
-    >>> found[0], found[1].what
-    (1, '1 of 1 tets are inverted at equilibrium; the worst is tet 0, at -0.5 of its volume')
+    negative volume is an error of the linear model rather than of the solution. Arguments and
+    errors are those of `least_volume_ratios`.
     """
     ratios = least_volume_ratios(tensors, displacements)
     count = int(np.count_nonzero(ratios <= 0.0))

@@ -119,7 +119,6 @@ def solved_patient(
 ) -> SolvedPatient:
     """The prediction of `predict_patient`, with its solver and solution.
 
-    solver: As for `predict_patient`.
     tensors: Of its mesh and tissue, if another model has them already.
     """
     scene = model_scene(patient, model)
@@ -269,27 +268,11 @@ def _stays(motion: Floats | MovedSurface) -> bool:
 
 
 def tear_finding(skin: SurfaceData, displacements: Floats) -> Finding | None:
-    """The warning that a predicted skin is torn or folded over, if it is anywhere.
+    """The warning, "skin-torn", that displacements (v, 3), mm, tear a skin or fold it over.
 
-    skin: Before the operation.
-    displacements: (v, 3), mm, of its vertices.
-    Returns: The finding's code is "skin-torn".
-
-    Notes
-    -----
     An edge counts as torn if it is stretched by more than half, and becomes longer by at least
     1.5 mm; a triangle as turned over if its normal turns by more than a right angle, and if it has
     at least 0.5 mm² before the operation.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> from cmfsim.solving.models import tear_finding
-    >>> skin = cmfsim.SurfaceData([[0, 0, 0], [2, 0, 0], [0, 2, 0]], [[0, 1, 2]])
-    >>> tear_finding(skin, 0.2 * skin.vertices) is None
-    True
-    >>> tear_finding(skin, 0.8 * skin.vertices).code
-    'skin-torn'
     """
     before, triangles = skin.vertices, skin.triangles.astype(np.int64)
     after = before + displacements

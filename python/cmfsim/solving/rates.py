@@ -40,12 +40,8 @@ AXES = np.eye(3)
 class TissueParts:
     """The share of fat and of muscle in the constants of each tet.
 
-    With the fraction p of muscle, E = E_fat (1 − p) + E_m along and across, ν likewise.
-
-    fat_young: MPa.
-    fraction: (m,).
+    With the fraction p of muscle, (m,), E = E_fat (1 − p) + E_m along and across, ν likewise.
     along, across, poisson: (m,). What muscle adds, Σ p_i E_i in MPa and Σ p_i ν_i.
-    fibre: (m, 3). Unit vectors.
     """
 
     fat_young: float
@@ -58,10 +54,7 @@ class TissueParts:
     law: str
 
     def tissue(self) -> Tissue:
-        """The tissue of all tets.
-
-        Raises `MaterialError`: A stiffness that is not positive definite.
-        """
+        """The tissue of all tets; `MaterialError` unless every stiffness is positive definite."""
         rest = 1.0 - self.fraction
         fat, poisson = rest * self.fat_young, rest * self.fat_poisson + self.poisson
         if not self.fraction.any():
@@ -70,11 +63,7 @@ class TissueParts:
         return Tissue.transversely_isotropic(along, across, poisson, self.fibre, law=self.law)
 
     def changed(self, source: str, by: float) -> "TissueParts":
-        """The parts with one source changed.
-
-        source: Name of one of `TISSUE`.
-        by: In its unit; degrees for directions.
-        """
+        """The parts with one source of `TISSUE` changed, in its unit; degrees for directions."""
         return _CHANGES[source](self, by)
 
     @property
@@ -123,8 +112,6 @@ def tissue_parts(
 ) -> TissueParts | None:
     """Fat and muscle of a scene's tissue; None where they cannot be told apart.
 
-    data: Of the scene.
-    fat: Between the muscles.
     fraction: (m,) or None. Share of muscle in each tet; None in a patient without.
     """
     if data.kind == "stiffness" or (data.kind == "preset" and data.mixing != "moduli"):
@@ -165,11 +152,9 @@ def tissue_parts(
 
 @dataclass(frozen=True, eq=False)
 class SkinRates:
-    """Displacements of the skin by one standard deviation of each source.
+    """Displacements of the skin by one standard deviation of each source, (k, 3), mm, by its name.
 
-    rates: mapping of str to (k, 3), mm, by source; those of a plan are called "SEGMENT: SOURCE".
-    sources: By the same names.
-    left_out: Sources that the scene does not allow, with the reason.
+    Those of a plan are called "SEGMENT: SOURCE"; `left_out`: what the scene forbids, and why.
     """
 
     rates: Mapping[str, Floats]
@@ -183,8 +168,7 @@ def skin_rates(
 ) -> SkinRates:
     """The derivatives of the skin with respect to tissue and plan, each times its prior's sd.
 
-    scene: What was solved: `model_scene` of the patient.
-    solution: Of the scene's plan.
+    scene: What was solved, its plan's solution: `model_scene` of the patient.
     Raises `CaseError`: Kinematics that are not linear, or lips in contact: no linear map.
     Raises `SolverError`: A linear solve that fails.
     """
@@ -236,11 +220,9 @@ def scene_parts(patient: PatientModel, scene: Scene) -> TissueParts | None:
 def tissue_load(
     tensors: MassTensors, u: Floats, forces: Floats, parts: TissueParts, source: Source
 ) -> Floats:
-    """−(∂K/∂p) u times the standard deviation, (n, 3) N.
+    """−(∂K/∂p) u times the standard deviation of a source of the tissue as it is, (n, 3) N.
 
-    tensors: Of the tissue as it is.
     u, forces: (n, 3), mm and N. Displacements, and their forces K u.
-    source: One of `parts.sources`.
     """
     tissue = parts.changed(source.name, STEP * source.sd).tissue()
     changed = MassTensors(tensors.mesh, tissue, element=tensors.element)
@@ -271,8 +253,7 @@ def _plan_changes(
 def motion_rates(matrix: Floats, middle: Floats, sizes: ArrayLike) -> list[Floats]:
     """The changes of x ↦ R x + t, (4, 4) each: shifts to the left, back, up, and turns about these.
 
-    middle: (3,), mm. What the turns leave in place, after the motion.
-    sizes: (6,), mm and radians.
+    By sizes (6,), mm and radians; `middle` (3,), mm, stays where it is after the motion.
     """
     found = []
     for number, size in enumerate(np.asarray(sizes, dtype=np.float64)):

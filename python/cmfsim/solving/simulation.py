@@ -210,10 +210,7 @@ def _check_solver(solver: StaticSolver, scene: Scene) -> None:
 
 
 def solved_scene(scene: Scene, solver: StaticSolver) -> tuple[SceneResult, Solution]:
-    """The result of a scene as `solve_scene` has it, and the core's solution, which can go on.
-
-    solver: Of this scene, whatever its plan.
-    """
+    """The result of a scene as `solve_scene` has it, and the core's solution, to go on from."""
     solution = solver.solve(scene_plan(scene), loads=scene.loads)
     _log.info(
         "solved: residual %.2e, error %.2e mm (estimated)",
@@ -346,24 +343,13 @@ def _tissue(data: TissueData) -> Tissue:
 
 
 def slip_finding(scene: Scene, displacements: ArrayLike) -> Finding | None:
-    """The warning that sliding nodes went further along their bone than bones moved, if any did.
+    """The warning, "contact-slipped-far", that nodes slid further along a bone than bones moved.
 
     A node slips because its bone moves under tissue that is held elsewhere, or because other bones
     move that tissue: by about the motion of its bone at its place plus the largest of any other. A
     node that slips by more has usually gone round an edge, and the plan may have another
-    equilibrium in which it has not.
-
-    scene: Segments that follow surfaces are left out, and so is unilateral contact, where nodes may
-        leave the bone.
-    displacements: (n, 3), mm, of the nodes of the scene.
-    Returns: The finding's code is "contact-slipped-far".
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> from cmfsim.solving.simulation import slip_finding
-    >>> result = cmfsim.solve_scene(scene)
-    >>> slip_finding(scene, result.displacements)
+    equilibrium in which it has not. Segments that follow surfaces are left out, and so is
+    unilateral contact, where nodes may leave the bone.
     """
     if scene.options.contact != "bilateral":
         return None

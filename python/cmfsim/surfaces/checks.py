@@ -27,12 +27,7 @@ SLIVER_HEIGHT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class BorderLoop:
-    """One closed border of a surface.
-
-    vertices: (k,) int64, in the direction of the triangles along the border.
-    length: mm.
-    centre: (3,), mm. Mean of the vertices.
-    """
+    """One closed border: vertices in the direction of its triangles, their mean, length, mm."""
 
     vertices: NDArray[np.int64]
     length: float
@@ -41,12 +36,9 @@ class BorderLoop:
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """One connected piece of a surface, by shared edges.
+    """One connected piece of a surface, by shared edges; mm.
 
-    area: mm².
-    volume: mm³. Signed, with the triangles oriented as they are; meaningful only if the piece is
-        closed.
-    centre: (3,), mm.
+    volume: Signed, with the triangles oriented as they are; meaningful only if the piece is closed.
     """
 
     n_triangles: int
@@ -115,10 +107,7 @@ class SurfaceReport:
 
 
 def check_extent(vertices: Floats) -> None:
-    """Raises an error for coordinates so large that areas and volumes would overflow.
-
-    Raises `CaseError`: A coordinate above 1e90 mm; the message names its vertex.
-    """
+    """Raises `CaseError` for a coordinate above 1e90 mm: areas and volumes would overflow."""
     far = np.argwhere(np.abs(vertices) > MAX_COORDINATE)
     if len(far):
         vertex, axis = far[0]

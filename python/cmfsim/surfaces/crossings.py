@@ -26,11 +26,9 @@ MAX_CELLS = 2**20
 
 
 def crossing_pairs(vertices: Floats, triangles: Integers) -> Integers | None:
-    """The pairs of triangles that cut through each other, or None if too many lie in one place.
+    """The pairs of triangles that cut through each other, (k, 2), or None if too many lie there.
 
-    vertices: (v, 3).
-    triangles: (t, 3) int64. None without area.
-    Returns: (k, 2) int64 or None. The lower number first, in order.
+    triangles: (t, 3) int64. None without area. The lower number of a pair stands first.
     """
     if len(triangles) < 2:
         return np.zeros((0, 2), dtype=np.int64)

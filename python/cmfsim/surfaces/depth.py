@@ -18,7 +18,6 @@ MOST_DEPTH = 30.0
 def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
     """The distance of each point of the skin from the closest bone, (k,) mm, 30 mm at most.
 
-    points: (k, 3), mm.
     Raises `MeshError`: No bone is given.
     """
     places = as_rows("points", points, 3)
@@ -34,12 +33,7 @@ def tissue_depth(points: ArrayLike, bones: Iterable[SurfaceData]) -> Floats:
 
 
 def moved_outward(skin: Surface, vertices: Floats, outward: Floats) -> Floats:
-    """The vertices of a moved skin, each shifted outward along its normal.
-
-    skin: Gives the triangles.
-    vertices: (v, 3), mm.
-    outward: (v,), mm.
-    """
+    """The vertices of a moved skin of the triangles of `skin`, shifted along their normals, mm."""
     normals = skin.moved(vertices).vertex_normals
     shifted: Floats = vertices + outward[:, None] * normals
     return shifted
@@ -54,11 +48,7 @@ def distances(points: Floats, surface: Surface) -> Floats:
 
 
 def barycentric(corners: Floats, points: Floats) -> Floats:
-    """The weights of each triangle's corners at a point in its plane, (k, 3).
-
-    corners: (k, 3, 3). Triangle, corner, coordinate.
-    points: (k, 3).
-    """
+    """The weights (k, 3) of the corners (k, 3, 3) of triangles at a point in the plane of each."""
     a, b, c = (corners[:, i] for i in range(3))
     normal = np.cross(b - a, c - a)
     square = (normal * normal).sum(axis=1)
@@ -68,11 +58,7 @@ def barycentric(corners: Floats, points: Floats) -> Floats:
 
 
 def at_closest(surface: Surface, values: ArrayLike, points: ArrayLike) -> Floats:
-    """A field of a surface's vertices at the points of it that are closest to others, (k,).
-
-    values: (v,), of its vertices.
-    points: (k, 3), mm.
-    """
+    """A field of a surface's vertices at its points that are closest to others, (k,)."""
     closest, _, triangles = surface.closest(points)
     vertices, corners = surface.vertices, surface.triangles[triangles]
     # Rounding puts points of an edge a little beyond it.

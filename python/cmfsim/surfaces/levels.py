@@ -36,11 +36,9 @@ _MADE: WeakKeyDictionary[ImageData, Future[SurfaceData]] = WeakKeyDictionary()
 class SurfaceOptions:
     """Options of the surface of a level.
 
-    max_triangles: Surfaces with more are decimated (quadrics; Garland and Heckbert 1997) to about
-        this many.
+    max_triangles: About what finer ones are decimated to, 100 at least (Garland and Heckbert 1997).
     smoothing: Rounds of Taubin smoothing (1995), which take away the steps of the voxels and keep
-        the volume; 0 for none.
-    Raises `CaseError`: Fewer than 100 triangles, rounds below 0 or above 100.
+        the volume, 0 to 100.
     """
 
     max_triangles: int = 30_000
@@ -59,10 +57,7 @@ def surface_of_level(
     """The zero surface of a level, closed also where the level reaches the image's border.
 
     Marching cubes (Lewiner 2003, scikit-image), smoothed, and decimated where it is too fine.
-
-    name: Of the bone, for messages.
-    level: Positive inside.
-    Returns: Outward normals, mm.
+    level: Positive inside; normals point outward.
     Raises `CaseError`: A level without an inside; scikit-image is missing.
     """
     options = options or SurfaceOptions()
@@ -195,10 +190,8 @@ def _without_slits(
 
 
 def simplified_surface(name: str, surface: SurfaceData, max_triangles: int) -> SurfaceData:
-    """The surface with about as many triangles as wanted, open where it was (Garland 1997).
+    """The surface in as many triangles as wanted or fewer (Garland 1997); borders stay open.
 
-    name: For messages.
-    max_triangles: A surface that has no more is given back as it is.
     Raises `CaseError`: Nothing is left of the surface.
     """
     if len(surface.triangles) <= max_triangles:

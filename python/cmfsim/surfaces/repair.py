@@ -50,10 +50,7 @@ class RepairOptions:
 
 
 def clean_surface(surface: SurfaceData) -> SurfaceData:
-    """The surface without triangles that have no area or repeat others, and without stray vertices.
-
-    The result is valid input for `cmfsim.Surface`; it may have no triangles.
-    """
+    """The surface without flat or repeated triangles and stray vertices; it may be empty."""
     vertices = surface.vertices
     triangles = surface.triangles.astype(np.int64)
     keep = np.ones(len(triangles), dtype=bool)
@@ -338,13 +335,9 @@ def _outward(vertices: Floats, triangles: Integers) -> tuple[Integers, int]:
 def cap_loop(vertices: Floats, loop: Integers) -> tuple[Integers, float]:
     """The triangles of a cap and the largest distance of its border from the plane that fits best.
 
-    vertices: (v, 3), mm.
     loop: (k,) int64. Vertices in the order in which the triangles at the border run.
-    Returns: (k − 2, 3) int64. They run through the border the other way, so that the closed surface
-        is consistent.
+    Returns: (k − 2, 3) int64. They run through the border the other way: the surface is consistent.
 
-    Notes
-    -----
     Ear clipping (Meisters 1975) in the best plane. A loop that crosses itself there has no ears at
     some stage; the corner with the shortest new edge is then cut off, which still closes it.
     """

@@ -15,15 +15,12 @@ MOST_CUBED = 1 << 21
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """The edges of a surface and the triangles at them.
+    """The edges of a surface, (e, 2), the lower vertex first, and the triangles at them; int64.
 
-    ends: (e, 2) int64. Vertices of each edge, the lower first.
-    counts: (e,) int64. Number of triangles at each edge.
-    pairs: (p, 2) int64. Triangles on the two sides of each edge that has exactly two.
-    opposed: (p,) bool. Whether they run through that edge in opposite directions, as in a
-        consistent surface.
-    border: (b, 2) int64. Edges with a single triangle, in its direction.
-    border_triangles: (b,) int64. That triangle.
+    counts: (e,). Number of triangles at each edge.
+    pairs: (p, 2). Triangles on the two sides of each edge that has exactly two.
+    opposed: (p,) bool. Whether they run through that edge in opposite directions, consistently.
+    border: (b, 2). Edges with a single triangle, `border_triangles`, in its direction.
     """
 
     ends: Integers
@@ -92,10 +89,8 @@ def connected_labels(pairs: Integers, count: int) -> Integers:
 def loops_of(edges: Integers, starts: Iterable[int]) -> tuple[list[list[int]], list[list[int]]]:
     """Directed edges (k, 2) as loops that pass each vertex once, and the paths that are left.
 
-    A walk ends a loop where it returns to a vertex, so two loops that touch at a vertex stay
-    separate.
-
-    starts: The vertices where walks begin, one after the other.
+    Walks begin at `starts` and end a loop where they return to a vertex, so two loops that touch at
+    a vertex stay separate.
     """
     onward: dict[int, list[int]] = {}
     for start, end in edges.tolist():
@@ -145,10 +140,7 @@ def orientation_flips(edges: Edges, n_triangles: int) -> tuple[NDArray[np.bool_]
 
 
 def tet_bodies(tets: NDArray[Any]) -> Integers:
-    """The number of the body of each tet; bodies are connected through faces.
-
-    A part attached by a single edge or node would move without resistance.
-    """
+    """The number of the body of each tet, connected by faces: a mere edge or node can turn."""
     corners = np.sort(tets.astype(np.int64), axis=1)
     faces = corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
     # One number for each face is sorted much faster than a row of three.

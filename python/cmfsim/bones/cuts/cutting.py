@@ -392,8 +392,7 @@ def part_segment(
     """The pieces of a segment: each has the bone that lies nearest to its surface.
 
     pieces: Parts of the segment's own surface by name, the largest first; they need not be closed.
-    Returns: Without pieces that hold less than 100 mm³ of the segment.
-    Raises `CaseError`: No piece holds as much.
+    Returns: Those of 100 mm³ or more; `CaseError` where none holds as much.
     """
     level = segment.level
     values = level.single

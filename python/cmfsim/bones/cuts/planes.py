@@ -58,8 +58,6 @@ class CuttingPlane(Plane):
 class Cut:
     """A piece to be cut from a bone: it lies where all planes of any one group are positive.
 
-    segment: Name of the piece.
-    groups: Each group is a convex region; the piece is their union.
     sources: The piece is cut from the first of these bones or segments that exists.
     rest: What the source is called afterwards; None leaves its name.
     joined: Where the source is a "skull" whose jaws could not be separated, the piece also lies on

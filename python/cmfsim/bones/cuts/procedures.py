@@ -74,8 +74,7 @@ def with_missing_sites(
 ) -> tuple[dict[str, Floats], tuple[Finding, ...]]:
     """The sites of a procedure, missing ones estimated, and a warning that lists those.
 
-    Raises `LandmarkError`: The known sites do not place the others; it names at most three to
-        place, which do.
+    Raises `LandmarkError`: Too few are known; it names at most three to place, which do.
     """
     points = {name: landmarks[name] for name in NEEDED[kind] if name in landmarks}
     missing = [name for name in NEEDED[kind] if name not in points]

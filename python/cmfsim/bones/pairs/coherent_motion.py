@@ -81,11 +81,7 @@ class MatchOptions:
 
 
 def lay_on(name: str, segment: SurfaceData, bone: Surface, options: MatchOptions) -> ShapeFit:
-    """The fit of a segment, known by its name, to the post-operative bone.
-
-    Raises `RegistrationError`: It does not fit, or too little of it does; the search does not
-        converge.
-    """
+    """The fit of a segment, called by its name, to the bone after, or a `RegistrationError`."""
     try:
         moving = Surface(segment.vertices, segment.triangles, crease_angle=segment.crease_angle)
         found = icp(
@@ -211,12 +207,7 @@ INWARDS = -0.7
 
 @dataclass(frozen=True, eq=False)
 class RigidPiece(Plain, Frozen):
-    """A part of a bone that moved as one.
-
-    matrix: (4, 4), mm. Its rigid motion.
-    area: mm².
-    vertices: (n,) int64, of the surface, that lie in it.
-    """
+    """A part of a bone that moved as one, by a rigid motion (4, 4): its area, mm², and vertices."""
 
     matrix: Floats
     area: float = field(metadata=in_files("area_mm2"))
@@ -225,11 +216,8 @@ class RigidPiece(Plain, Frozen):
 
 @dataclass(frozen=True, eq=False)
 class CoherentMotion:
-    """The motion of a bone in pieces.
+    """The motion of a bone in pieces, without noise, slip and removed bone; largest first.
 
-    motion: Without noise, slip and removed bone.
-    pieces: The largest first.
-    removed: The largest first.
     slip: mm. How far vertices slid along the bone: the rms of what was taken off.
     noise: mm. The rms of the noise that was averaged out; 0 where it is too small to matter.
     """
@@ -242,16 +230,10 @@ class CoherentMotion:
 
 
 def coherent_motion(motion: MovedSurface) -> CoherentMotion:
-    """The motion of a bone in rigid pieces.
+    """The motion of a bone in rigid pieces (see `rigid_pieces`), of a motion of `sound_motion`.
 
-    motion: Without triangles that have no area (`sound_motion`).
-    Raises `BoundaryError`: scipy is missing.
-
-    Notes
-    -----
-    See `rigid_pieces` for the pieces. What deviates from them is slip as far as bending does not
-    explain it (Wiener's filter); bone is removed where the bone after lies off the place to which
-    the surroundings went.
+    What deviates from the pieces is slip as far as bending does not explain it (Wiener's filter);
+    bone is removed where the bone after lies off the place to which the surroundings went.
     """
     paired = PairedBone(motion)
     matrices, piece = rigid_pieces(paired)

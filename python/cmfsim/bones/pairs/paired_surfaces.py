@@ -66,15 +66,13 @@ RIGID_SHARE, LEAST_LYING = 0.95, 0.6
 
 @dataclass(frozen=True, eq=False)
 class StrayPatch(Plain):
-    """A patch of a segment that lies off the bone after the operation.
+    """A patch of a segment that lies off the bone after the operation, by vertices before.
 
     area: mm², of the surface before.
-    distance: mm, from the post-operative bone, after the segment's motion; median of the patch's
-        vertices.
+    distance: mm, from the post-operative bone, after the segment's motion; median of the vertices.
     place: (3,), mm. The vertex nearest to the middle of the patch, before.
     has_bone: Whether bone lies within reach that may be this patch, displaced, or what is left of
         it after grinding; else it was removed, lies outside the scan, or moved further.
-    vertices: (n,) int64, of the segment, that lie in the patch.
     """
 
     area: float = field(metadata=in_files("area_mm2"))
@@ -91,15 +89,11 @@ def stray_patches(
     rms: float,
     beside: Sequence[SurfaceData] = (),
 ) -> tuple[tuple[StrayPatch, ...], Floats]:
-    """The patches of a segment that lie off the bone, and how far off each vertex is.
+    """The patches of a segment that lie off the bone after, largest first, and each vertex's mm.
 
-    segment: Before.
-    bone: After.
     matrix: (4, 4), mm. The motion of the segment.
     rms: mm. Residual of the fit over the vertices that it keeps.
     beside: The other segments before: what touches them was cut, and is not searched for.
-    Returns `patches`: The largest first.
-    Returns `off`: (n,), mm. Distance of each vertex from the bone.
     """
     here = segment.vertices
     triangles = segment.triangles.astype(np.int64)
@@ -141,11 +135,7 @@ def stray_patches(
 
 
 class AlongSurface:
-    """A surface along which values are averaged.
-
-    areas: (n,), mm², of the vertices, above 0.
-    ends: (m, 2) int64. The two vertices of each edge.
-    """
+    """A surface along which values are averaged: vertices' areas, mm², above 0, and edges."""
 
     def __init__(self, surface: SurfaceData) -> None:
         self.here = surface.vertices
@@ -215,8 +205,7 @@ class PairedShape:
     bent: (n,), mm. How far the bone after lies off along the normals, on average over neighbours,
         with the change of size removed: how it bent. 0 where it was removed.
     slip: mm. How far vertices slid along the surface, median.
-    slid_free: (n, 3), mm. The vertices after without slip and change of size: each where the rigid
-        motion takes it, and from there as far along the normal as the bone after lies off.
+    slid_free: (n, 3), mm. The vertices after without slip and change of size.
     """
 
     fit: ShapeFit
@@ -229,10 +218,8 @@ class PairedShape:
 
 
 def paired_shape(before: SurfaceData, after: SurfaceData) -> PairedShape:
-    """The registration by shape of a bone to the same mesh after the operation.
+    """The registration by shape of a bone to the same mesh after; raises as `fit_shape`.
 
-    before, after: The same triangles in the same order.
-    Raises `RegistrationError`: Vertices that lie on one line; see `fit_shape` too.
     Raises `MeshError`: A triangle without area after.
     """
     here, there = before.vertices, after.vertices

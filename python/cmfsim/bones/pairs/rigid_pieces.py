@@ -155,8 +155,6 @@ def _step(points: Floats, normals: Floats, off: Floats, weight: Floats, ratio: f
 def rigid_pieces(paired: PairedBone) -> tuple[list[Floats], Integers]:
     """The rigid motions of the pieces, largest first, and the number of the piece of each vertex.
 
-    Notes
-    -----
     Motions are fitted with Tukey's biweight (Huber 1981); deviations along the surface count less
     by the ratio in which they are larger. One becomes a piece if it lowers the mean square of what
     the others leave, in units of the usual deviation of a neighbourhood, by more than chance, and

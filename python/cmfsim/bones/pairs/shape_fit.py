@@ -45,10 +45,9 @@ LEAST_SIZE, MOST_SIZE = 0.85, 1.15
 class OpenDirection(Frozen):
     """A motion of a bone that its shape hardly determines, such as the rotation of a ball.
 
-    turn, shift: (3,). The turn about the middle of the bone, times the radius of the bone, and the
-        shift; both together of unit length.
-    ratio: How well the shape determines it, relative to the direction that it determines best: the
-        ratio of eigenvalues of the normal equations.
+    turn, shift: (3,). The turn about the bone's middle, times its radius, and the shift; together
+        of unit length.
+    ratio: Of the eigenvalues of the normal equations, to the direction that is determined best.
     """
 
     turn: Floats
@@ -79,17 +78,14 @@ class OpenDirection(Frozen):
 class ShapeFit(Plain, Frozen):
     """The registration of a bone to the post-operative bone, by shape.
 
-    matrix: (4, 4), mm. The rigid motion. A change of size is about the centre of the segment's
-        vertices, which it does not move further.
-    scale: Size after, as a share of the size before.
-    scale_interval: Low and high end of its 95 % interval: block jackknife, and a surface that is
-        known to 0.1 mm all round.
+    matrix: (4, 4), mm. The rigid motion; a change of size, `scale`, is about the `middle` of the
+        vertices before, which it does not move further.
+    scale_interval: 95 %: block jackknife, and a surface that is known to 0.1 mm all round.
     eigenvalue_ratio: Of the normal equations of the rigid motion: smallest to largest.
     open: What the shape does not determine; in these directions the motion is that of the start.
     sigma: mm. Standard deviation of the distances along normals, robust.
     off: (n,), mm. Distance of each vertex, moved and scaled, from the bone after.
     kept: (n,) bool. Vertices that count: near enough, on bone with a similar normal.
-    middle: (3,), mm, of the segment's vertices, before.
     """
 
     matrix: Floats = field(metadata=in_files(None))
@@ -135,17 +131,11 @@ def fit_shape(
 ) -> ShapeFit:
     """The motion that registers a segment to the post-operative bone, by the shape of both.
 
-    segment: Before.
-    bone: After.
-    start: (4, 4), mm. Rigid motion to start from. Directions that the shape does not determine keep
-        its value.
+    start: (4, 4), mm. Rigid motion to start from, kept where the shape determines none.
     max_angle: degrees, between normals of partners.
-    most_points: Vertices used in the fit.
     Raises `RegistrationError`: Fewer partners than unknowns; sizes that differ too much for one
         bone.
 
-    Notes
-    -----
     Steps to tangent planes (Chen & Medioni 1992) of a similarity, weighted by area and Tukey's
     biweight of the distances (Huber 1981; as iterative closest points, Fitzgibbon 2003). Directions
     in which the normal equations have small eigenvalues are not solved for (Zhang et al. 2016).

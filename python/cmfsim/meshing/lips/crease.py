@@ -42,15 +42,13 @@ SMOOTH = 4.0
 
 @dataclass(frozen=True, eq=False)
 class MouthFrame:
-    """Axes of a mouth, with its origin half-way between the fronts of the two arches.
+    """Axes of a mouth, with its origin half-way between the fronts of the two arches; mm.
 
-    origin: (3,), mm.
     axes: (3, 3). Rows: unit vectors to the left, ahead and up, at right angles. The frame is
         left-handed in LPS, where ahead is −y.
-    reach_up, reach_down: mm. Heights of the fronts of the upper and lower arch: between them the
-        lips meet.
-    half_width: mm. Half the distance between the second molars.
-    molars: mm. Forward position of the second molars relative to the origin; negative.
+    reach_up, reach_down: Heights of the fronts of both arches: between them the lips meet.
+    half_width: Half the distance between the second molars.
+    molars: Forward position of the second molars relative to the origin; negative.
     """
 
     origin: Floats
@@ -70,10 +68,7 @@ class MouthFrame:
 
 
 def mouth_frame(arches: Mapping[str, DentalArch]) -> MouthFrame:
-    """The frame of a mouth from its two dental arches.
-
-    arches: "upper" and "lower".
-    """
+    """The frame of a mouth from its "upper" and "lower" dental arch."""
     upper, lower = arches["upper"], arches["lower"]
     up = upper.out - lower.out
     up = up / np.linalg.norm(up)
@@ -126,20 +121,14 @@ class SkinProfiles:
 
 @dataclass(frozen=True, eq=False)
 class MouthLine:
-    """The line where the lips meet on the skin, from the right corner to the left.
-
-    across, ahead, heights: (k,), mm, in the mouth's frame.
-    """
+    """The line where lips meet on the skin, from right to left, (k,) mm in the mouth's frame."""
 
     across: Floats
     ahead: Floats
     heights: Floats
 
     def between(self, right: float, left: float, profiles: SkinProfiles) -> "MouthLine":
-        """The line from one corner to another, (to the left, mm), with points at both ends.
-
-        Beyond its own ends it continues over the skin at the same height.
-        """
+        """The line between corners, mm to the left; beyond its ends over the skin at one height."""
         columns = profiles.across
         inner = columns[(columns > right + 0.5 * COLUMN) & (columns < left - 0.5 * COLUMN)]
         at = np.concatenate([[right], inner, [left]])
@@ -150,10 +139,7 @@ class MouthLine:
 
 
 def skin_profiles(anatomy: Anatomy, frame: MouthFrame) -> SkinProfiles:
-    """The profiles of the skin in front of a mouth.
-
-    anatomy: Cavities that open to the front count as outside.
-    """
+    """The profiles of the skin in front of a mouth; cavities open to the front are outside."""
     count = round(ASIDE / COLUMN)
     across = np.linspace(-COLUMN * count, COLUMN * count, 2 * count + 1)
     low, high = frame.reach_down - ROOM, frame.reach_up + ROOM
@@ -204,9 +190,7 @@ def _chord_depth(ahead: Floats) -> Floats:
 def crease_line(profiles: SkinProfiles, frame: MouthFrame) -> MouthLine | None:
     """The line where the lips meet, found in the profiles; None if they show no crease.
 
-    It ends at the corners of the mouth, where the crease ends.
-
-    frame: Lips meet between the fronts of its arches.
+    It ends at the corners of the mouth, where the crease ends, and lies between the arches' fronts.
     """
     heights = profiles.heights
     between = (heights >= frame.reach_down) & (heights <= frame.reach_up)

@@ -155,11 +155,7 @@ def _region(mine: Indices, other: Indices, kinds: NodeKinds, held: NDArray[np.bo
 
 
 def seam_faces(nodes: ArrayLike, triangles: ArrayLike) -> NDArray[np.bool_]:
-    """Which boundary triangles lie on a seam, (t,): those that face another at the same place.
-
-    nodes: (n, 3), mm, at rest.
-    triangles: (t, 3) uint32. Boundary of a mesh.
-    """
+    """Which boundary triangles lie on a seam, (t,): they face another there, at rest."""
     points = as_rows("nodes", nodes, 3)
     corners = as_index_rows("boundary triangles", triangles, 3, len(points), "nodes")
     _, place = np.unique(points, axis=0, return_inverse=True)

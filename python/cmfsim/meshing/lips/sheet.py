@@ -44,11 +44,9 @@ LEAST_GAP, WITHIN = 3.0, 1.0
 
 @dataclass(frozen=True, eq=False)
 class LipSheet:
-    """The sheet between the lips, and what is known of it.
+    """The sheet between the lips, open, its normals up, and what is known of it.
 
-    surface: Open, with normals pointing up.
-    thickness: mm. Median length of its rows from the mouth's line to the arches: the thickness of
-        the lips.
+    thickness: mm. Median length of its rows from the mouth's line to the arches: of the lips.
     opening: mm. Median height of the gap between the lips in the middle of the mouth, close to its
         end; 0 where they are closed.
     """

@@ -40,10 +40,9 @@ DEPTH = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Septum:
-    """The nodes of the septum.
+    """The nodes of the septum, (k,) uint32, including those that lie on the skull.
 
     kinds: Of all nodes; those of the septum that were free stay with the skull.
-    nodes: (k,) uint32. Nodes of the septum, including those that lie on the skull.
     """
 
     kinds: NodeKinds
@@ -62,16 +61,12 @@ def septum(
 ) -> Septum:
     """The septum of a nose whose floor was cut off the skull; empty if nothing was.
 
-    nodes: (n, 3), mm.
     moved: Names of the segments that are cut or moved.
-    landmarks: mapping of str to mapping of str to (3,), mm. "skull": nasion, rhinion, mid_philtrum,
-        supradentale; "skin": pronasale, subnasale.
+    landmarks: "skull": nasion, rhinion, mid_philtrum, supradentale; "skin": pronasale, subnasale.
     by_vertex: Names of the segments that are followed vertex by vertex. If the skull is one of
         them, there is no septum: it lies up to 15 mm off the bone, where the noise of a triangle's
         rotation would move it by millimetres.
 
-    Notes
-    -----
     Cartilage (2.7 MPa; Griffin et al. 2016) is a thousand times as stiff as fat, so the septum
     moves as a rigid body. In a Le Fort I osteotomy it is separated from the maxilla and stays with
     nasal bones, perpendicular plate and vomer.
@@ -237,10 +232,8 @@ def cut_off_skull(
 ) -> tuple[BoneSegment, list[BoneSegment]]:
     """The skull, and the segments that were cut off it, whatever their names.
 
-    The skull is the segment that reaches highest. What was cut off it has a face in common with it;
-    jaws and teeth that touch it have not.
-
-    moved: Names of the segments that are cut or moved.
+    The skull is the segment that reaches highest. What was cut off it, being cut or `moved`, has a
+    face in common with it; jaws and teeth that touch it have not.
     """
     skull = max(segments, key=lambda segment: float(segment.surface.vertices[:, 2].max()))
     others = [s for s in segments if s is not skull and s.name in moved]

@@ -286,12 +286,7 @@ def _renamed(findings: tuple[Finding, ...], name: str) -> list[Finding]:
 
 
 def atlas_course(name: str, side: str, surface: SurfaceData) -> tuple[Floats, ...]:
-    """The fibre lines of a muscle of the atlas, from origin to insertion; none where boxes do.
-
-    name: Without side.
-    side: "L" or "R".
-    Returns: tuple of (n, 3), mm.
-    """
+    """The fibre lines (n, 3), mm, of an atlas muscle, origin to insertion; none for boxes."""
     vertices = surface.vertices
     mirror = np.array([-1.0 if side == "R" else 1.0, 1.0, 1.0])
     if name == "temporalis":

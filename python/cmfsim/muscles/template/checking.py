@@ -35,9 +35,7 @@ def template_names() -> tuple[str, ...]:
 
 
 def template_path(folder_or_name: str | os.PathLike[str]) -> Path:
-    """The folder or archive of a template.
-
-    A text that is the name of a built-in template means that one; `./default` means a folder.
+    """The folder or archive of a template; a built-in name comes first, `./default` means a folder.
 
     Raises `FileNotFoundError`: Neither a name nor a folder or archive.
     Raises `CaseError`: A name that no file can have.

@@ -24,7 +24,6 @@ def fan_lines(
 ) -> tuple[Floats, ...]:
     """Lines from a broad origin that meet at a tip, such as those of temporalis at the coronoid.
 
-    tip: (3,), mm, where the fibres meet.
     normal: (3,). Direction that the fan is looked at along.
     Returns: tuple of (n, 3), mm, from origin to tip, in the middle of the muscle.
     Raises `MeshError`: Less than two lines meet the muscle.
@@ -50,12 +49,9 @@ def fan_lines(
 def lane_lines(
     surface: SurfaceData, along: ArrayLike, normal: ArrayLike, *, lines: int = LINES
 ) -> tuple[Floats, ...]:
-    """Parallel lines along a sheet, such as those of buccinator from behind to the mouth.
+    """Parallel lines along a sheet, from origin to insertion, such as those of buccinator forwards.
 
-    along: (3,), from origin to insertion.
-    normal: (3,). Direction that the sheet is looked at along.
-    Returns: tuple of (n, 3), mm, from origin to insertion, in the middle of the muscle.
-    Raises `MeshError`: Less than two lines meet the muscle.
+    normal: (3,). Direction that the sheet is looked at along. Returns and raises as `fan_lines`.
     """
     view = _View(surface, normal)
     ahead = view.axes @ np.asarray(along, dtype=np.float64)

@@ -385,10 +385,7 @@ def _listed(names: Sequence[str]) -> str:
 def missing_landmarks(
     template: TemplateData, used: Collection[str], where: str = "landmarks"
 ) -> tuple[Finding, ...]:
-    """A warning that names the template's landmarks that a patient lacks; none if there are all.
-
-    used: The template's names of the landmarks that the patient has.
-    """
+    """A warning with the template's landmarks that a patient lacks, who has those `used`."""
     missing = [name for name in template.landmarks if name not in used]
     if not missing:
         return ()
