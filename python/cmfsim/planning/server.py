@@ -63,21 +63,16 @@ NOT_FOUND = RefusedError(404, "not found")
 
 
 def check_token(given: str, token: str) -> None:
-    """Refuses any token but that of this launch, in constant time.
-
-    Raises `RefusedError`.
-    """
+    """Refuses, by `RefusedError`, any token but that of this launch, in constant time."""
     if not hmac.compare_digest(given.encode(), token.encode()):
         raise NOT_FOUND
 
 
 def check_headers(headers: Mapping[str, str], address: str, *, sends: bool) -> None:
-    """Refuses requests that the page at this address did not send.
+    """Refuses, by `RefusedError`, requests that the page at this address did not send.
 
     headers: With names in lower case.
     address: Host and port, such as "127.0.0.1:8765".
-    sends: Whether the request sends something.
-    Raises `RefusedError`.
     """
     if headers.get("host") != address:
         raise RefusedError(403, "wrong host")
@@ -134,11 +129,7 @@ def _are_numbers(given: object) -> bool:
 
 @dataclass(frozen=True)
 class Reply:
-    """What a request is answered with.
-
-    kind: Its media type.
-    headers: Besides `SAFE_HEADERS`.
-    """
+    """What a request is answered with: a media type, and headers besides `SAFE_HEADERS`."""
 
     body: bytes
     kind: str = "text/html; charset=utf-8"
@@ -150,10 +141,8 @@ class LocalServer:
 
     pages: What GET is answered with, by the name behind the token; "" is the first page.
     calls: What POST of a body is answered with. It may raise `RefusedError` or a `CmfsimError`.
-    port: 0 picks a free one; or what `open_port` returned.
+    port: 0 picks a free one; or what `open_port` returned, which raises the same.
     url: Address of the first page, including the token of this launch.
-    Raises `CaseError`: Starlette or Uvicorn, of the extra `serve`, is not installed.
-    Raises `OSError`: The port is taken.
     """
 
     def __init__(

@@ -104,10 +104,7 @@ def cephalometry(
 
 
 def known_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
-    """The landmarks as points, mm.
-
-    Raises `LandmarkError`: One is not three finite numbers.
-    """
+    """The landmarks as points, mm; `LandmarkError` unless each is three finite numbers."""
     try:
         return {name: as_point(f"landmark {name}", place) for name, place in landmarks.items()}
     except CaseInputError as error:
@@ -115,10 +112,7 @@ def known_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
 
 
 def value_of(measure: Measure, places: Mapping[str, Floats]) -> float | None:
-    """The value of a measure by one of `FORMULAS`, mm or degrees; None if a site is missing.
-
-    places: (2,) mm each, by name, as `projected` has them.
-    """
+    """A measure by one of `FORMULAS` of `projected` places, mm or degrees; None without one."""
     sites = [places[name] for name in measure.sites if name in places]
     whole = len(sites) == len(measure.sites)
     return FORMULAS[measure.formula][0](*sites) if whole else None

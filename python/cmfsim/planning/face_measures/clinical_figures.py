@@ -102,10 +102,7 @@ def clinical_figures(prediction: Prediction) -> dict[str, Any]:
 
 
 def lateral_sites(prediction: Prediction) -> tuple[dict[str, Floats], dict[str, Floats], BiteFrame]:
-    """The sites of bone and skin in the lateral view before and as planned, and its frame.
-
-    Returns: (2,) mm each, forwards and up, by abbreviation.
-    """
+    """The sites of bone and skin in the lateral view, (2,) mm, before and as planned; its frame."""
     bone, skin = bone_sites(prediction.patient), prediction.patient.landmarks.get("skin", {})
     at_rest = {name: site.place for name, site in bone.items()}
     before = projected(at_rest)

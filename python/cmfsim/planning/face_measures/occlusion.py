@@ -62,10 +62,7 @@ EDGE_ERROR = WORSE = 1.0
 
 
 def poor_bite(rows: Iterable[Mapping[str, Any]]) -> list[Finding]:
-    """A finding with what a plan takes out of `BITE_LIMITS`, or further out; empty if nothing.
-
-    rows: As `clinical_figures` has them: "before" and "planned" of each of `OCCLUSAL_MEASURES`.
-    """
+    """A finding on what a plan takes (further) out of `BITE_LIMITS`, in `clinical_figures`."""
     texts = []
     for measure, row in zip(OCCLUSAL_MEASURES, rows, strict=False):
         was, now = row["before"], row["planned"]
@@ -126,10 +123,7 @@ def occlusion(
 
 @dataclass(frozen=True, eq=False)
 class BiteFrame:
-    """The directions of a head, (3,) each, and where its midsagittal plane cuts that to the left.
-
-    middle: mm; None without sites of the cranium.
-    """
+    """The directions of a head, (3,), and where its midsagittal plane cuts left, mm, if known."""
 
     forwards: Floats
     up: Floats
@@ -139,11 +133,9 @@ class BiteFrame:
 
 @dataclass(frozen=True, eq=False)
 class OcclusalTerm:
-    """How a measure is taken: a formula of points that are means of sites.
+    """How a measure is taken: a formula of points that are means of sites, less an offset, mm.
 
-    formula: "along", "across", "left" or "cant".
     weights: (p, n). Of each of n sites in each point.
-    offset: mm. Subtracted from the formula.
     """
 
     formula: str
@@ -206,10 +198,7 @@ def occlusal_terms(landmarks: Collection[str]) -> dict[str, OcclusalTerm]:
 def missing_for_occlusion(
     landmarks: Mapping[str, ArrayLike], unfound: Mapping[str, str]
 ) -> dict[str, str]:
-    """Why each of `OCCLUSAL_MEASURES` has no value, by its key; empty if it has one.
-
-    unfound: Why molars were not found, by the key of their relation.
-    """
+    """Why each of `OCCLUSAL_MEASURES` has no value, by key; `unfound`: why molars have no place."""
     edges = "edges of upper and lower incisors, or the occlusal plane: not given or found"
     middle = "central incisors of both sides, the bone between them, or sites of the cranium"
     reasons = {

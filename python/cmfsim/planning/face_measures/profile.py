@@ -19,11 +19,10 @@ DEPTH = 110.0
 
 @dataclass(frozen=True, eq=False)
 class MidlineProfile:
-    """A polyline whose points lie on edges of a surface and move with it.
+    """A polyline of points (n, 3), mm, from top to bottom, on edges of a surface that moves them.
 
     ends: (n, 2) uint32. Vertices of the edge on which each point lies.
     share: (n,). Position along the edge, from 0 at its first vertex to 1.
-    points: (n, 3), mm, from top to bottom.
     """
 
     ends: NDArray[np.uint32]
@@ -32,13 +31,10 @@ class MidlineProfile:
 
 
 def midline_profile(surface: SurfaceData, landmarks: Mapping[str, ArrayLike]) -> MidlineProfile:
-    """The profile of a face in the plane through its midline landmarks.
+    """The profile of a face in the plane through its midline landmarks, two or more of `MIDLINE`.
 
     The plane contains the direction P and the line that fits the landmarks best from above: a head
     that is tilted to the side has a tilted plane.
-
-    surface: The skin.
-    landmarks: mapping of str to (3,), mm, on the skin; two or more of `MIDLINE`.
     Raises `LandmarkError`: Fewer midline landmarks, or a plane that does not cut the skin there.
     """
     known = [np.asarray(landmarks[name], dtype=np.float64) for name in MIDLINE if name in landmarks]

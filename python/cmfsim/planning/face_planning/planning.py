@@ -48,11 +48,8 @@ OPEN, OPEN_SHARE = 1e3, 0.25
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """The result of a search.
+    """The result of a search: x (n,), residuals (m,), their derivatives (m, n).
 
-    x: (n,).
-    residuals: (m,).
-    jacobian: (m, n).
     converged: Whether the next step is too small to matter, before the steps ran out.
     """
 
@@ -66,12 +63,7 @@ class Minimum:
 def bounded_least_squares(
     residuals: Callable[[Floats], Floats], start: Floats, low: Floats, high: Floats, *, steps: int
 ) -> Minimum:
-    """The minimum of a sum of squares within bounds, found from a starting point.
-
-    residuals: Maps (n,) numbers to (m,) residuals.
-    start, low, high: (n,).
-    steps: Maximum number of steps.
-    """
+    """The least sum of squares of residuals of n numbers within bounds, in `steps` at most."""
     x = np.clip(start, low, high)
     r = residuals(x)
     jacobian = _jacobian(residuals, x, r)

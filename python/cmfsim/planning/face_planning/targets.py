@@ -156,9 +156,8 @@ Target: TypeAlias = PointTarget | MeasureTarget | SurfaceTarget
 
 @dataclass(frozen=True, eq=False)
 class Wish:
-    """A target ready for the search.
+    """A target ready for the search, with the points of the face before that it needs, if any.
 
-    points: (n, 3), mm, of the face before the operation; may be none.
     rows: Of their places (n, 3), mm, and the plan: the residuals in standard deviations.
     """
 
@@ -169,8 +168,7 @@ class Wish:
 def wish_of(planning: PlanningModel, target: Target) -> Wish:
     """A target with the points of a patient's face on which it depends.
 
-    Raises `CaseError`: A measure whose sites the face lacks; points away from the tissue that is
-        simulated; a surface without a partner for any point.
+    Raises `CaseError`: Sites of a measure, or tissue or partners at its points, are missing.
     """
     if isinstance(target, PointTarget):
         return _points_wish(planning, target)
@@ -180,10 +178,7 @@ def wish_of(planning: PlanningModel, target: Target) -> Wish:
 
 
 class CarriedPoints:
-    """Displacements of a few points under plans, from the columns and triangles that carry them.
-
-    Equals `PlanningModel.carried`, but costs no more than the points need.
-    """
+    """As `PlanningModel.carried`, for a few points: costs no more than these need."""
 
     def __init__(self, planning: PlanningModel, points: Floats) -> None:
         before = planning.skin_before

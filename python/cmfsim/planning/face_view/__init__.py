@@ -32,8 +32,7 @@ PICTURE = (
 def face_view(parts: Parts, colours: NDArray[np.uint8] | None = None) -> tuple[str, str]:
     """The markup of the view of a prediction, and what its page must allow scripts from.
 
-    parts: As `read_parts` has them: "skin" and "bones", each with its vertices after the operation.
-    colours: Of the vertices of the skin.
+    parts: As `read_parts` has them; `colours`: of the vertices of the skin.
     """
     arrays: Arrays = {}
     shown: list[dict[str, Any]] = []

@@ -36,14 +36,10 @@ SPAN_SHARE = 1.1
 
 @dataclass(frozen=True, eq=False)
 class PageSite:
-    """A landmark of the page.
+    """A landmark of the page, of the skull or skin; a missing one is "filled", with the reason.
 
-    kind, name: "skull" or "skin", and the label.
     point: (3,), mm. Where it is, or for a missing site where the others place it.
-    state: "filled" if it is missing.
-    why: Why it is missing; empty otherwise.
     placed: (3,), mm, or None. Where a person has placed or accepted it already.
-    placed_origin: "placed" or "accepted".
     """
 
     kind: str
@@ -65,12 +61,9 @@ def landmark_content(
     placed_std: float,
     built_for: str = "",
 ) -> PageContent:
-    """The content of the page of a head.
+    """The content of the page of a head, of bones and perhaps "skin", LPS mm.
 
-    case: Its name.
-    surfaces: Bones, and "skin" where there is one; LPS mm.
-    covariance: (3 n, 3 n), mm². Of the errors of their points: it says how sites follow one that is
-        placed.
+    covariance: (3 n, 3 n), mm². Of the errors of the sites: how they follow one that is placed.
     average: The head in which the page shows where each site is.
     placed_std: mm. How far a person's own point lies from the site, along each axis.
     built_for: The state of the case.
@@ -156,15 +149,7 @@ def site_view(name: str) -> dict[str, float]:
 
 
 def landmark_page_text(content: PageContent) -> str:
-    """The text of a page of landmarks, which loads nothing and sends nothing.
-
-    Raises `CaseError`: Numbers that are not finite.
-
-    Examples
-    --------
-    >>> import cmfsim
-    >>> text = cmfsim.landmark_page_text(content)  # doctest: +SKIP
-    """
+    """The text of a page of landmarks, which loads and sends nothing; `CaseError` if not finite."""
     case, version = content.values["case"], content.values["version"]
     return document_text(
         Document(

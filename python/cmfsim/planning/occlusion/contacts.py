@@ -22,10 +22,7 @@ TOUCH = 0.2
 
 
 def signed_gaps(points: ArrayLike, surface: SurfaceData) -> Floats:
-    """Distance of points from a closed surface, (n,) mm: negative inside.
-
-    points: (n, 3), mm.
-    """
+    """Distance of points (n, 3), mm, from a closed surface, (n,) mm: negative inside."""
     places = as_rows("points", points, 3)
     gaps = distances(places, surface.searched)
     return np.where(surface.searched.winding_number(places) > 0.5, -gaps, gaps)
@@ -101,10 +98,7 @@ def contact_map(upper: ToothRow, lower: ToothRow) -> ContactMap:
 
 
 def planned_contacts(patient: PatientModel) -> ContactMap:
-    """The contacts of the tooth rows of a patient, as planned.
-
-    Raises `CaseError`: The case has no tooth rows, or doubtful ones.
-    """
+    """The contacts of a patient's tooth rows as planned; `CaseError` where these are doubtful."""
     plan, rows = patient.scene.plan, patient_rows(patient)
     return contact_map(*(row.moved(rigid_of(plan.get(row.segment))) for row in rows))
 

@@ -347,9 +347,8 @@ def _letters(
 def _without_thin(grid: ImageData, level: NDArray[np.float32]) -> NDArray[np.float32]:
     """The level opened by a ball as thick as the thinnest wall: what such balls reach inside it.
 
-    So edges between teeth and of the slab are blunt, and no sheet is left where bone behind the
-    molars grazes the splint. Distances are those from surfaces: from voxels they would be wrong by
-    half a voxel.
+    So edges are blunt, and no sheet is left where bone behind the molars grazes the splint.
+    Distances are those from surfaces: from voxels they would be wrong by half a voxel.
     """
     core = _distances(grid, level) - np.float32(BALL)
     if not (core > 0.0).any():

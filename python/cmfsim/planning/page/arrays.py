@@ -51,10 +51,7 @@ def indices(rows: Any) -> NDArray[np.uint32]:
 def add_surface(
     arrays: Arrays, key: str, name: str, surface: SurfaceData, most: int
 ) -> tuple[SurfaceData, float]:
-    """The surface in as many triangles as are drawn, added to arrays, and how far it is off, mm.
-
-    name: For messages.
-    """
+    """The surface in as many triangles as are drawn, added to arrays, and how far it is off, mm."""
     fewer = simplified_surface(name, surface, most)
     arrays[key] = singles(fewer.vertices)
     arrays[f"{key}_triangles"] = indices(fewer.triangles)

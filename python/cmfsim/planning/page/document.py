@@ -58,15 +58,12 @@ VIEW = """<style>@style@</style>
 
 @dataclass(frozen=True, eq=False)
 class Document:
-    """The parts of a page.
+    """The parts of a page; `made_for` is the state of the case.
 
     stage, panel, picture: What the drawing, the fields next to it and the picture itself are, for
         screen readers.
-    made_for: The state of the case.
-    values: Plain values, ready for JSON.
-    arrays: float32, float16 and uint32.
-    package: The package that has the first script, and a style of its own, besides the shared ones.
-    main: The first script.
+    values, arrays: Plain values, ready for JSON; float32, float16 and uint32.
+    package: The package that has the first script, `main`, and a style besides the shared ones.
     is_served: Whether the page asks the program that serves it; otherwise it makes no connection.
     """
 
@@ -85,10 +82,7 @@ class Document:
 
 
 def document_text(document: Document) -> str:
-    """The text of a page.
-
-    Raises `CaseError`: Numbers that are not finite; scripts that cannot be joined.
-    """
+    """The text of a page; `CaseError` unless numbers are finite and scripts can be joined."""
     texts = ("title", "facts", "footer", "stage", "panel", "picture")
     packages = tuple(dict.fromkeys((SHARED, document.package)))
     parts = _parts(document.values, document.arrays, packages, document.main)
@@ -113,9 +107,7 @@ def view_markup(
 ) -> tuple[str, str]:
     """The markup of a picture to turn, for a page of another kind, and its script's source policy.
 
-    package, main: The package that has the first script, and its name.
-    picture: What it is, for screen readers.
-    Raises `CaseError`: As `document_text`.
+    picture: What it is, for screen readers; otherwise, and in what it raises, as `document_text`.
     """
     parts = _parts(values, arrays, (package,), main)
     fields = {**parts, "picture": html.escape(translated(picture))}
@@ -175,8 +167,7 @@ def _template(name: str) -> str:
 def joined_scripts(modules: Mapping[str, str], main: str = MAIN) -> str:
     """The first module and those that it imports as one script, each after those that it needs.
 
-    Raises `CaseError`: Modules import each other in a circle, or one that is not there; two define
-        the same name.
+    Raises `CaseError`: Imports in a circle or of no module; two that define the same name.
     """
     order: list[str] = []
 
@@ -227,10 +218,7 @@ def _json_in_html(values: Mapping[str, object]) -> str:
 
 
 def packed_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[str, list[dict[str, Any]]]:
-    """The text of arrays, and where each of them starts: `name`, `type`, `shape`, `start`.
-
-    Raises `CaseError`: A number that is not finite, or too large for its precision.
-    """
+    """The text of arrays, and where each starts; `CaseError` for numbers beyond its precision."""
     table: list[dict[str, Any]] = []
     block = bytearray()
     for name, array in arrays.items():

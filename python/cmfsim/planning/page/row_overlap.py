@@ -22,11 +22,10 @@ MOST_POINTS, MARGIN, SPACING = 4000, 8.0, 1.0
 
 @dataclass(frozen=True, eq=False)
 class RowOverlap:
-    """The lower row's points and the depth inside the upper row's bone.
+    """The lower row's crowns, (n, 3) mm, at rest, and the depth inside the upper row's bone.
 
     upper, lower: The segments that bear them; a segment that the plan does not move stays.
-    points: (n, 3), mm. Of the lower crowns, before the operation.
-    depth: Depth inside the upper row's bone, mm, up to `MARGIN`; 0 outside of it.
+    depth: mm, up to `MARGIN`; 0 outside of the bone.
     """
 
     upper: str
@@ -35,10 +34,7 @@ class RowOverlap:
     depth: ImageData
 
     def passing(self, plan: Mapping[str, ArrayLike]) -> float:
-        """How deep the lower row reaches into the upper one under a plan, mm; 0 where it does not.
-
-        plan: mapping of str to (4, 4), mm. Segments that it does not name stay.
-        """
+        """How deep the lower row reaches into the upper under a plan, mm; others stay."""
         up = np.asarray(plan.get(self.upper, np.eye(4)), dtype=np.float64)
         low = np.asarray(plan.get(self.lower, np.eye(4)), dtype=np.float64)
         both = np.linalg.inv(up) @ low

@@ -52,10 +52,7 @@ ARCHES = {
 
 @dataclass(frozen=True, eq=False)
 class SegmentPoint:
-    """A point at which a segment's movement is stated.
-
-    place: (3,), mm, before the operation.
-    """
+    """A point (3,), mm, before the operation, at which a segment's movement is stated."""
 
     label: str
     place: Floats
@@ -64,11 +61,7 @@ class SegmentPoint:
 def segment_points(
     segment: str, landmarks: Mapping[str, Floats], vertices: Floats
 ) -> tuple[SegmentPoint, ...]:
-    """The points of a segment: first that of its clinical motion, last the middle of its surface.
-
-    landmarks: mapping of str to (3,), mm. Skull landmarks.
-    vertices: (v, 3), mm, of the segment's surface, before.
-    """
+    """The points of a segment: first that of its clinical motion, last its vertices' middle."""
     known = {**_canines(landmarks), **landmarks}
     stated = clinical_motion(segment, np.eye(4), landmarks=landmarks, vertices=vertices)
     points = []

@@ -43,8 +43,7 @@ class PlanNumbers:
 
     segments: Those that count; the motion of others changes nothing.
     backwards: (s, 4, 4), mm. The inverse of each segment's motion under the reference plan.
-    middles: (s, 3), mm. The middle of each segment, before.
-    arms: (s,), mm, by which rotations, in radians, are multiplied.
+    middles, arms: (s, 3) and (s,), mm. Each middle before, and what multiplies rotations, radians.
     """
 
     segments: tuple[str, ...]
@@ -142,8 +141,7 @@ def fitted_correction(
     plans: (n, s, 6), mm. Their values at plans that were solved exactly; at least two.
     distances: (n,), mm, of these plans from the reference.
     errors: (n, k, 3), mm. Exact displacements minus the operator's.
-    Returns `pays`: Whether the largest error at plans that are left out falls to `PAYS`, RMS over
-        the plans.
+    It pays if the largest error at plans that are left out falls to `PAYS`, RMS over the plans.
     """
     count, nodes, _ = errors.shape
     rows = errors.reshape(count, -1)

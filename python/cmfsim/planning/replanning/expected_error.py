@@ -124,10 +124,7 @@ class ExpectedError:
 
 
 def plan_distance(planning: PlanningModel, plan: Motions) -> float:
-    """How far a plan is from the reference, mm.
-
-    The largest distance between the two positions of a corner of the box around a segment.
-    """
+    """How far a plan is from the reference: the most that a corner of a segment's box moves, mm."""
     whole = planning.whole(plan)
     return max(
         float(
@@ -237,10 +234,7 @@ def plans_near(
 
 @dataclass(frozen=True, eq=False)
 class SolvedPlan:
-    """A plan as `predict` solves it.
-
-    shift: (k, 3), mm. Displacements of the skin; none if `failed` says why there are none.
-    """
+    """A plan as `predict` solves it: the skin's displacements (k, 3), mm, or why it `failed`."""
 
     shift: Floats | None
     failed: str
