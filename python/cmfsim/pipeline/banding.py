@@ -33,10 +33,8 @@ from cmfsim.values.skin_band import WHOLE_FACE, BandOptions, SkinBand
 
 @dataclass(frozen=True)
 class FaceLandmarks:
-    """Landmarks that place the regions of a face.
+    """Landmarks that place the regions of a face: all of `SKIN_LANDMARKS`, (3,) mm, or none.
 
-    points: mapping of str to (3,), mm. All of `SKIN_LANDMARKS`; empty where they are neither given
-        nor found.
     findings: That they were proposed, or why there are none.
     """
 
@@ -90,10 +88,7 @@ def _none(reason: str) -> Finding:
 
 
 def face_motion(prediction: Prediction) -> dict[str, float]:
-    """How far the skin of the face moves on average, as "face_mean", mm.
-
-    Empty where the case has not all landmarks of the skin: nothing is looked for.
-    """
+    """How far the skin of the face moves on average, "face_mean", mm; empty without landmarks."""
     known = prediction.patient.landmarks.get("skin", {})
     if any(name not in known for name in SKIN_LANDMARKS):
         return {}

@@ -62,9 +62,8 @@ def check_face_after(
     """Findings on a face after that is another patient's, in another frame, or the one before.
 
     They are errors, unless the case states that the face is verified.
-
     unmoved: The faces before and after where nothing was operated on, where it is known.
-    moved: mapping of str to (v,), mm. How far each model moves each vertex of the skin.
+    moved: How far each model moves each vertex of the skin, (v,) mm.
     """
     given = case.postoperative
     severity = "warning" if given is not None and given.verified else "error"
@@ -105,10 +104,7 @@ def _is_unchanged(comparison: ModelComparison) -> bool:
 
 
 def refuse_other_face(findings: Iterator[Finding]) -> tuple[Finding, ...]:
-    """The findings, where none is an error.
-
-    Raises `CaseError`: One is.
-    """
+    """The findings; `CaseError` where one is an error."""
     found = tuple(findings)
     for finding in found:
         if finding.severity == "error":
@@ -373,9 +369,6 @@ def _not_shown(reason: str) -> Finding:
 
 
 def evaluation_key(case: Case, models: Sequence[str]) -> str:
-    """The SHA-256 of everything that an evaluation depends on: inputs, models and version.
-
-    Raises `OSError`: A file that the case names cannot be read.
-    """
+    """The SHA-256 of what an evaluation depends on: the case, as `case_key`, and the models."""
     content = {"case": case_key(case), "models": sorted(models)}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -55,11 +55,8 @@ def prepare(
     """Finds before any work what would end it late.
 
     is_written: Whether a file of a name is written to the output folder.
-    report: Whether a report is written.
     evaluation: Whether predictions are compared with the face after the operation.
-    Raises `CaseError`: Packages are missing, all named in one line; the output folder is a file,
-        leads out of the case's folder, or holds an input of a name that is written there.
-    Raises `OSError`: The output folder cannot be written to.
+    Raises `CaseError`: Packages are missing, all named in one line; and as `check_output`.
     """
     check_output(case, is_written)
     check_extras(_needs(case, report=report, evaluation=evaluation))
@@ -213,8 +210,7 @@ def predictions_of(
 ) -> Iterator[Prediction]:
     """The predictions of several models for one case, as `predict_models` makes them.
 
-    built: What `build_patient` gave of a case that may have had another plan, with that case. It is
-        used if nothing else has changed.
+    built: A case, perhaps of another plan, and its patient, used if nothing else has changed.
     """
     if band is not None:
         # Before a case is built for a minute.
@@ -256,10 +252,7 @@ def predictions_of(
 
 
 def named_models(models: str | Sequence[str]) -> tuple[str, ...]:
-    """Models by name, each once, in the order given.
-
-    Raises `CaseError`: None, or another name: with the one that was meant, it seems.
-    """
+    """Models by name, each once, in order; `CaseError` for none or another, with the one meant."""
     named = (models,) if isinstance(models, str) else tuple(dict.fromkeys(models))
     if not named:
         raise CaseInputError(f"no model is named: give one or more of {', '.join(MODELS)}")
@@ -299,10 +292,7 @@ def _replanned(
 def build_patient(
     case: CaseOrPath, models: Sequence[str], options: BuildOptions | None = None
 ) -> PatientModel:
-    """The patient as models need it: muscles are placed if one of them has muscles.
-
-    Raises `CaseError`: A file of the case changed while the work went on.
-    """
+    """The patient as models need it, with muscles if one has; `CaseError` if a file has changed."""
     case, options = as_case(case), options or BuildOptions()
     # Before the files are read: the key must be that of what is built.
     hashes = input_hashes(case)

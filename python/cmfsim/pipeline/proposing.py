@@ -172,11 +172,9 @@ def proposed_head(
     doubtful. If the second jaw is worse, the first one stays. Where the first jaw shows no teeth,
     as in a head that nods far forwards, an average head's separate it, and then the patient's own.
 
-    stage: Called with the name of each stage.
     templates: Folders of template heads besides those that the case names.
     is_read: Whether the anatomy is what `read_anatomy` makes of the case: any other keeps its jaws.
-    placed: mapping of str to (3,), mm. Sites of the skull that a person placed, which separate the
-        jaws wherever they contradict.
+    placed: Sites of the skull, mm, that a person placed: they separate the jaws where they differ.
     """
     placed = placed or {}
     heads = [read_template_head(folder) for folder in (*case.landmarks.templates, *templates)]
@@ -310,9 +308,7 @@ def read_template_head(folder: Path) -> TemplateHead:
 
     The folder holds `cranium.*`, `mandible.*` and, where known, `skin.*` (PLY, STL, OBJ, VTP; LPS
     mm), `skull_landmarks.mrk.json` and, where known, `skin_landmarks.mrk.json`.
-
     Raises `FileNotFoundError`: The folder has no cranium or no skull landmarks.
-    Raises `CmfsimError`: A file cannot be read.
     """
     surfaces = {
         name: read_surface(path)
@@ -345,15 +341,11 @@ def head_distribution(head: ProposedHead) -> SiteDistribution:
 
 
 def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks:
-    """The landmarks of a head of which a person has placed some.
+    """The landmarks of a head of which a person has placed some, with the origin of each site.
 
     Given sites stay; the others move by the conditional mean of their distribution, and onto their
     surface. A missing site is doubtful if its expected error is above `GOOD_ERROR`, and stays
-    missing above `MOST_ERROR`.
-
-    head: With what was proposed, which may be nothing.
-    given: mapping of (kind, label) to point (mm) and state.
-    Returns: With the origin of each site.
+    missing above `MOST_ERROR`. What was proposed may be nothing.
     Raises `LandmarkError`: A given site lies on none of the bones, or not on the skin.
     """
     before = head_distribution(head)

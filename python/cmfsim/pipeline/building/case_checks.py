@@ -38,12 +38,10 @@ TURNED = 15.0
 
 @dataclass(frozen=True, eq=False)
 class Head:
-    """A case with what was read of it.
+    """A case with what was read of it, and the landmarks, mm, of "skull" and "skin".
 
-    landmarks: mapping of str to mapping of str to (3,), mm. "skull" and "skin".
     proposed: The landmarks, where they were found automatically.
-    skin: The skin in full detail, where finding them has made it.
-    colours: Of its vertices, (v, 3), where the case has a 3D photo.
+    skin: In full detail, where finding them has made it, with `colours` of a 3D photo.
     """
 
     case: Case
@@ -63,8 +61,7 @@ class Head:
 class MeshedTissue:
     """The soft tissue of a head before its bones are known to be cut.
 
-    filled: The tets that fill it, their report and the findings on them; None where they have to
-        follow the seam between the lips.
+    filled: Tets, report and findings; None if they have to follow the seam between the lips.
     """
 
     region: TissueRegion
@@ -88,9 +85,8 @@ class Tissue:
 
 @dataclass(frozen=True, eq=False)
 class CaseLipContact:
-    """The lips of a case, and what they may not enter.
+    """The lips of a case, "upper" and "lower" where they are separated; what they may not enter.
 
-    regions: "upper" and "lower"; none where the lips are not separated.
     kinds: Of all nodes, those that may lift off the teeth free.
     """
 
@@ -144,10 +140,9 @@ def cut_segments(case: Case) -> list[str]:
 
 
 def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> list[Finding]:
-    """What is to be found about the sizes of the motions now that every segment has its surface.
+    """Findings on the sizes of the motions now that every segment, cut by now, has its surface.
 
-    The doctor has no surface of bone that is still to be segmented. Raises what it would have
-    raised: a bone that is torn away.
+    Raises what the doctor would have raised: a bone that is torn away.
     """
     seen = {(finding.code, finding.where) for finding in known}
     found: list[Finding] = []
@@ -271,8 +266,7 @@ def untouched(
 ) -> tuple[Finding, ...]:
     """A finding for each moved segment that lies beyond the mesh and holds none of its nodes.
 
-    Raises `CaseError`: A moved segment that holds no node and is named in the case, or lies at the
-        mesh: the face would not follow it.
+    Raises `CaseError`: For one that the case names, or at the mesh: the face would not follow it.
     """
     findings = []
     segments = {segment.name: segment for segment in bones.segments}

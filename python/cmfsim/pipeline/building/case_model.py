@@ -227,10 +227,7 @@ def model_of(case: Case, options: BuildOptions) -> PatientModel:
 def replanned(
     patient: PatientModel, before: Case, case: Case, options: BuildOptions
 ) -> PatientModel:
-    """The model of a case that differs in nothing but its plan from the one of a patient.
-
-    before: The case of which the patient was built.
-    """
+    """The model of a case that differs only in its plan from the one `before`, of the patient."""
     old = {finding.what for finding in _of_plan(patient, before, Stages(BuildOptions()))[1]}
     stages = Stages(options)
     bones, found = _of_plan(patient, case, stages)
@@ -425,11 +422,7 @@ def _checked(case: Case) -> tuple[Finding, ...]:
 
 
 def kind_options_of(case: Case) -> KindOptions:
-    """The options of [node_kinds].
-
-    Raises `CaseError`: An unknown option, or a value of another kind or out of range, with its
-        line.
-    """
+    """The options of [node_kinds]; `CaseError`, with the line, where one is not valid."""
     for key, value in case.node_kinds.items():
         try:
             kind_options({key: value})

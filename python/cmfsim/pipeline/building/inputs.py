@@ -82,8 +82,7 @@ def read_anatomy(
 ) -> tuple[Anatomy, tuple[Finding, ...]]:
     """The head of a case, from its CT or its surfaces.
 
-    kept: Takes the opened head, or gives it once where it was opened before: separating its jaws by
-        other landmarks needs no more of the image.
+    kept: Takes the opened head, or gives it once: other landmarks need no more of the image.
     """
     if case.image is not None:
         # A case of surfaces loads nothing of imaging.
@@ -136,10 +135,7 @@ def read_anatomy(
 def _with_given_bones(
     case: Case, image: CaseImage, anatomy: Anatomy, progress: Progress
 ) -> Anatomy:
-    """The anatomy of a CT with the bones of the case's files, which must lie where it shows bone.
-
-    Raises `CaseError`: They are those of another scan, or in another frame.
-    """
+    """The anatomy of a CT with bones of files; `CaseError` where these are not of this scan."""
     missing = [name for name in ("cranium", "mandible") if name not in image.bones]
     if missing:
         raise CaseInputError(
@@ -196,10 +192,7 @@ def segment_options(case: Case) -> SegmentOptions:
 def read_motion(
     case: Case, motion: CaseMotion
 ) -> Floats | MovedSurface | tuple[SurfaceData, SurfaceData]:
-    """How a segment moves, from its table and the files that this names.
-
-    Surfaces with different triangles come back as they are, before and after.
-    """
+    """How a segment moves, by table and files; surfaces of different triangles stay a pair."""
     if motion.matrix is not None:
         return motion.matrix
     if motion.transform is not None:
@@ -226,8 +219,7 @@ def motion_source(motion: CaseMotion) -> str:
 def input_hashes(case: Case) -> dict[str, str]:
     """The SHA-256 of every file that a case names, by its path from the case's folder.
 
-    A file elsewhere counts by its name, the second of one name as "name (2)". The hash of a folder
-    is of the files in it.
+    A file elsewhere counts by its name, the second as "name (2)"; a folder by the files in it.
     """
     return _hashes(_files(case), case.file.parent)
 
@@ -249,11 +241,8 @@ def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
     """The SHA-256 of everything that results of a case depend on: files, plan, options, version.
 
     Results of one key may be shown together. Folders may be moved: paths count from the case's own,
-    and where the results go does not count, nor does the band around them.
-
-    case: Changes that were made to it in memory count as those in its file.
-    hashes: Its `input_hashes`, where they are known already.
-    Raises `OSError`: A file that the case names cannot be read.
+    and where the results go does not count, nor does the band around them. Changes to the case in
+    memory count as those in its file. Raises `OSError`: A file that the case names cannot be read.
     """
     folder = case.file.parent
     content = {
@@ -272,9 +261,7 @@ def plan_key(case: Case) -> str:
     """The SHA-256 of what the numbers of a plan are about: image or surfaces, landmarks and cuts.
 
     A plan of one key means the same for every case of that key, whatever its mesh, tissue, muscles
-    or own plan.
-
-    Raises `OSError`: A file that the case names cannot be read.
+    or own plan. Raises as `case_key`.
     """
     others: dict[str, Any] = dict.fromkeys(("muscles", "postoperative", "photo", "bite"))
     about = replace(case, plan={}, achieved=False, mesh=CaseMesh(), **others)
@@ -307,10 +294,7 @@ def _path_from(path: Path, folder: Path) -> str:
 
 
 def plan_of_other_case(case: Case, key: str) -> list[Finding]:
-    """The finding about a plan whose file states another head that it was made for, if it does.
-
-    key: The `plan_key` of the case.
-    """
+    """The finding about a plan whose file states another `plan_key` than this one of the case."""
     if case.made_for in {"", key}:
         return []
     return [Finding("plan-other-case", where="the file of the plan")]

@@ -59,12 +59,10 @@ OPPOSITE = (
 def check_bones_of_sites(
     case: Case, skull: Mapping[str, Floats], anatomy: Anatomy, *, by_hand: bool
 ) -> None:
-    """Refuses sites of one jaw that lie on the bone of the other.
+    """Refuses, by `LandmarkError`, sites of one jaw that lie on the bone of the other.
 
-    skull: mapping of str to (3,), mm.
     anatomy: Bones without a jaw in their names, and heads of one bone, are not checked.
     by_hand: Whether a person placed the sites.
-    Raises `LandmarkError`: With the sites and their distances from both bones.
     """
     jaws: dict[str, list[ImageData]] = {"upper": [], "lower": []}
     for name, level in anatomy.bones.items():
@@ -101,10 +99,7 @@ def check_pieces(
     *,
     by_hand: bool,
 ) -> None:
-    """Refuses a cut whose piece lacks the sites that it is cut for, or holds the other jaw.
-
-    Raises `LandmarkError`: With the piece, and the sites and distances or the volume.
-    """
+    """Refuses (`LandmarkError`) a piece that lacks its sites, or holds part of the other jaw."""
     made = {cut.segment: (procedure, cut) for procedure in procedures for cut in procedure.cuts}
     bodies = {segment.name: segment for segment in segments}
     rests = {cut.rest: procedure for procedure, cut in made.values() if cut.rest is not None}
@@ -205,12 +200,9 @@ def found_landmarks(
 ) -> Head:
     """A head with the landmarks found on it, by which its jaws may be separated.
 
-    Placed sites stay where they are, and the others follow them. Without any landmarks, with a
-    warning, where the head shows no face: what cannot do without them is refused where it is
-    reached.
+    Placed sites stay, and the others follow them. Without any landmarks, with a warning, where the
+    head shows no face: what cannot do without them is refused where it is reached.
 
-    placed: mapping of str to mapping of str to (3,), mm. The landmarks that the case gives, if any:
-        "skull" and "skin".
     is_read: Whether the anatomy was made of the case's own files: the jaws of another one stay.
     Raises `LandmarkError`: What was taken for the mandible in the image cannot be one, and the plan
         needs it.

@@ -47,9 +47,7 @@ Held = tuple[TetMesh, NodeKinds, Integers, tuple[Finding, ...]]
 def held_part(mesh: TetMesh, kinds: NodeKinds) -> Held:
     """The mesh without bodies that neither bone nor plane holds, and a finding for them.
 
-    A body is connected by the faces of its tets: what an edge or a node joins to the rest can turn
-    about it.
-
+    A body is connected by faces of tets: what an edge or a node joins to it can turn about that.
     Raises `MeshError`: Nothing of it is held.
     """
     tets = mesh.tets
@@ -94,10 +92,7 @@ def _are_loose(body: Integers, tets: Indices, holds: NDArray[np.bool_]) -> NDArr
 def lifted_where_held(
     mesh: TetMesh, kinds: NodeKinds, body: Integers, lifted: LiftedTissue
 ) -> LiftedTissue:
-    """The lifted nodes without those of bodies that too little else holds: these would drift.
-
-    body: (m,). That of each tet, as `held_part` gives it.
-    """
+    """The lifted nodes without those of bodies that too little else holds: these would drift."""
     holds = np.isin(kinds.kind, (1, 2))
     holds[lifted.nodes] = False
     loose = _are_loose(body, mesh.tets, holds)
@@ -134,9 +129,7 @@ def separated_at_seam(mesh: TetMesh, kinds: NodeKinds, body: Integers, seam: Lip
     """The mesh separated at the seam; new nodes have the kinds of those that they lie between.
 
     Kinds are found before: the faces of the lips along the edges of teeth look at these without
-    being attached to them.
-
-    Raises `MeshError`: A surface given as a file runs through no tissue.
+    being attached to them. Raises `MeshError`: A surface of a file runs through no tissue.
     """
     if seam.surface is None:
         return mesh, kinds, body, ()
@@ -189,7 +182,6 @@ def lip_contact(
 
     height: mm. How far from the seam the lips reach.
     walls: The sheets of the arches.
-    segments: Those that the kinds were found with.
     """
     if seam.surface is None:
         return CaseLipContact({}, kinds)
@@ -299,8 +291,7 @@ TRIANGLES = 120_000
 def with_photo(head: Head) -> tuple[SurfaceData, NDArray[np.uint8], Finding]:
     """The skin of a head in full detail, the colours of its vertices, and how they came there.
 
-    Raises `CaseError`: A photo that cannot be read, has no colours, or does not lie on the skin;
-        landmarks that are missing or do not fit.
+    Raises `CaseError`: A photo or landmarks of it that do not do, or do not lie on the skin.
     """
     given, where = head.case.photo, head.case.where("photo")
     if given is None:  # called for cases with a photo
@@ -447,8 +438,6 @@ def on_skin(
 ) -> NDArray[np.bool_]:
     """Which boundary triangles are skin: their centroids lie nearer to it than to anything else.
 
-    nodes: (n, 3), mm.
-    triangles: (t, 3) uint32. The boundary of the mesh.
     level: Of the tissue that was meshed.
     """
     centroids = nodes[triangles].mean(axis=1)

@@ -29,10 +29,7 @@ BEARING = 20_000
 
 
 def with_scanned_teeth(head: Head, scans: CaseBite, stages: Stages) -> Head:
-    """The head with the crowns of its scans, each registered to the crowns of its row.
-
-    Raises `CaseError`: A scan does not fit its row, or the rows are doubtful or not found.
-    """
+    """The head with the crowns of its scans, registered to its rows, or a `CaseError`."""
     stages.begin("registering the scans of the teeth")
     anatomy = head.anatomy
     segments = [
@@ -67,10 +64,7 @@ def _noticed(jaw: str, error: float, *, as_well: bool) -> Iterator[Finding]:
 
 
 def _with_crowns(level: ImageData, row: ToothRow, skin: ImageData) -> ImageData:
-    """The level of a bone with the crowns of a scan that lies in place.
-
-    Where the nearest place of the scan is its gum, the image stays.
-    """
+    """The level of a bone with a scan's crowns; where its gum is nearest, the image stays."""
     spatial = third_party("scipy.spatial", "crowns are replaced", "imaging")
     vertices, step = row.surface.vertices, level.spacing
     low, high = (

@@ -16,11 +16,9 @@ PAGE_FILE = "landmarks.html"
 def head_content(
     name: str, head: ProposedHead, placed: GivenSites | None = None, *, built_for: str = ""
 ) -> PageContent:
-    """The content of the page of a head.
+    """The content of the page of a head of a case of this name.
 
-    name: Of the case.
-    placed: mapping of (kind, label) to point (mm) and state. Sites that a person has placed or
-        accepted already.
+    placed: Sites that a person has placed or accepted already.
     built_for: The state of the case.
     """
     distribution = head_distribution(head)
@@ -74,11 +72,7 @@ def _sites(
 
 
 def write_landmark_page(path: Path, content: PageContent) -> int:
-    """The size in bytes of a page of landmarks, written to a file in one step.
-
-    Raises `CaseError`: Numbers that are not finite.
-    Raises `OSError`: The folder cannot be written to.
-    """
+    """The size in bytes of a page of landmarks, written in one step; `CaseError` if not finite."""
     data = landmark_page_text(content).encode()
     with replacing(path) as file:
         file.write(data)

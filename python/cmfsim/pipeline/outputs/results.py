@@ -112,11 +112,9 @@ class WrittenPrediction:
 
 @dataclass
 class WrittenResults:
-    """What was written to an output folder.
+    """What was written to an output folder, in the order in which predictions were solved.
 
-    predictions: In the order in which they were solved.
     files: Of a comparison, its report included.
-    report: The name of the report; none where none was made.
     left_out: Files that were removed, since they belonged to something else.
     """
 
@@ -134,10 +132,7 @@ class WrittenResults:
 
 @dataclass
 class _Clock:
-    """The seconds of each stage of predictions, and of the work after them, by place.
-
-    place: Of the prediction that is worked on; None for all of them.
-    """
+    """Seconds of each stage of the prediction at a place, or where that is None of all of them."""
 
     seconds: dict[str, dict[str, float]] = field(default_factory=dict)
     place: str | None = None
@@ -240,15 +235,13 @@ def write_results(
     """What was written of predictions, their comparison and the report of both.
 
     output: The case's output folder: predictions of several models lie in a folder for each.
-    predictions: or callable. Written one by one, as each is solved. A callable gives them; it takes
-        the functions to be called with what is known before any is solved, which begin pictures.
+    predictions: Written one by one, as each is solved. A callable gives them; it takes the
+        functions to be called with what is known before any is solved, which begin pictures.
     models: That were asked for, whether or not all could be predicted.
-    stage: Called with the name of each stage as it begins.
     evaluation: Gives the comparison, once the predictions are there.
     pictures: Whether those of a model are drawn, by its name.
     slicer: Whether each prediction is written as a bundle for 3D Slicer as well, `prediction.mrb`.
-    Raises `CmfsimError`, `OSError`: What a prediction or a file ends in; the folder is then as it
-        was.
+    Raises what a prediction or a file ends in; the folder is then as it was.
     """
     check_own(output)
     written = WrittenResults()
@@ -493,10 +486,9 @@ def _report_of(
 
 
 def write_case_report(folder: Path) -> str | None:
-    """The name of the report made of the results in a folder; none without Jinja2.
+    """The name of the report made of a folder's results; none without Jinja2.
 
-    Raises `FileNotFoundError`, `CaseError`: As `predictions_of`: there is no prediction; some
-        belong to different plans.
+    Raises as `predictions_of`: there is no prediction; some belong to different plans.
     """
     found = predictions_of(folder)
     key = next(iter(found.values()))["case_key"]
@@ -523,10 +515,7 @@ def _document(
     figures: Mapping[str, bytes],
     left_out: str = "",
 ) -> Document:
-    """The report of predictions in their places, with the planning page of the folder.
-
-    That page is named if it was made for the head and cuts of the predictions.
-    """
+    """The report of predictions in their places, with the planning page if it was made for them."""
     place, pictures = _shown(found)
     shown_figures = []
     # The box plot first: it shows all models together.

@@ -46,10 +46,7 @@ def plan_key(case: Case, name: str) -> str:
 def motion_findings(
     found: AchievedMotion, name: str, where: str, skull: ShapeFit | None, *, is_still: bool
 ) -> Iterator[Finding]:
-    """Findings about the motion of a segment that was read off the bone after the operation.
-
-    `skull` is how the bone that was left alone lies on the one after, where it is known.
-    """
+    """Findings about a motion read off the bone after, where `skull` lies, left alone, if known."""
     severity = "note" if found.method == "icp" else "warning"
     yield from (_removed_finding(name, where, patch, severity) for patch in found.removed)
     fit = found.fit
@@ -220,9 +217,8 @@ def _stray_finding(name: str, where: str, patch: StrayPatch, *, is_still: bool) 
 
 @dataclass(frozen=True, eq=False)
 class PlannedBones:
-    """The bone segments of a case with their motions.
+    """The bone segments of a case, with the motions, (4, 4) mm or MovedSurface, of some of them.
 
-    motions: mapping of str to (4, 4), mm, or MovedSurface, of the segments that the plan moves.
     achieved: How they were found, where the plan is the achieved one.
     fits: How the motions that a plan gives by surfaces were found.
     sources: Where each motion comes from and how it was understood, in words.
@@ -239,12 +235,10 @@ class PlannedBones:
 def planned_bones(
     case: Case, segments: tuple[BoneSegment, ...], after: Postoperative | None = None
 ) -> PlannedBones:
-    """The segments of a case with the motions that its plan, or the operation, gives them.
+    """The segments of a case, cut already, with the motions of its plan or of the operation.
 
-    segments: Cut already.
     after: What `read_postoperative` gives, where it is known already.
-    Raises `CaseError`, `BoundaryError`, `RegistrationError`: A segment that there is not; a motion
-        that cannot be read or meant.
+    Raises `CaseError`, `BoundaryError`, `RegistrationError`: For what is no segment or motion.
     """
     known = [segment.name for segment in segments]
     for name in case.plan:
@@ -421,10 +415,7 @@ def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None
 
 
 def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
-    """Findings about a bone that is followed vertex by vertex.
-
-    Raises `CaseError`: Its surfaces are no bone that moved: mirrored, shuffled, in two units.
-    """
+    """Findings on a bone followed by vertices; `CaseError` if it is mirrored or shuffled."""
     found = list(check_pairs(name, case.where(plan_key(case, name)), moved))
     for finding in found:
         if finding.severity == "error":

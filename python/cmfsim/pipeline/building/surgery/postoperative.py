@@ -35,9 +35,8 @@ MOST_STEPS = 300
 
 @dataclass(frozen=True, eq=False)
 class Postoperative:
-    """Face and bones after the operation.
+    """Face and bones after the operation, in the frame of the data before.
 
-    skin: In the frame of the data before the operation, as all that follows.
     landmarks: dict of str to (3,), mm, of the skin; empty where none are given.
     bones: By bone or segment; of an image "bone" alone, which is all of it.
     alignment: (4, 4), mm. What took the frame after the operation to that before it.
@@ -51,9 +50,7 @@ class Postoperative:
 
 
 def read_postoperative(case: Case) -> Postoperative:
-    """Face and bones after the operation, as the case has them.
-
-    Data that are not aligned yet are registered to the data before by the skull above the jaws.
+    """Face and bones after the operation, registered if need be by the skull above the jaws.
 
     Raises `CaseError`: The case has no [postoperative], or nothing to align by.
     Raises `RegistrationError`: The scans do not fit each other.

@@ -39,9 +39,7 @@ def without_clefts(
 ) -> tuple[TetMesh, NodeKinds, tuple[Finding, ...]]:
     """The mesh without the tets in the clefts next to moving segments, and a finding about them.
 
-    segments: Those that the kinds were found with.
-    moved: Names of the segments that may move.
-    width: mm. As for `cleft_tets`.
+    moved, width: As for `cleft_tets`.
     """
     nodes, tets = mesh.nodes, mesh.tets
     inside = cleft_tets(nodes, tets, kinds, segments, moved=moved, width=width)
@@ -68,11 +66,7 @@ def without_crushed(
     """The mesh without the tets that the plan crushes between segments, and a finding about them.
 
     Linear tissue turns inside out there at no harm to the rest; in large deformation no position of
-    the nodes between two bones that meet leaves these tets a volume.
-
-    segments: Those that the kinds were found with.
-    motions: mapping of str to (4, 4), mm, or MovedSurface, of the segments that move.
-    width: mm. As for `crushed_tets`.
+    the nodes between two bones that meet leaves these tets a volume. Arguments: `crushed_tets`.
     """
     crushed = crushed_tets(mesh.nodes, mesh.tets, kinds, segments, motions=motions, width=width)
     if not crushed.any():
@@ -110,12 +104,7 @@ def crushed_tets(
     Nodes on a segment move with it. Those between segments follow all of them with weights 1/d² of
     the distance d (Shepard 1968). A tet is crushed if this leaves it less than a tenth of its
     volume. Only tets are judged of which every node has two segments within three times `width`,
-    taken together: other tissue moves out of the way.
-
-    nodes: (n, 3), mm.
-    tets: (m, 4) uint32.
-    motions: mapping of str to (4, 4), mm, or MovedSurface, of the segments that move.
-    width: mm. The width of a cleft; 0: no tet.
+    mm, of a cleft, taken together: other tissue moves out of the way.
     """
     crushed = np.zeros(len(tets), dtype=bool)
     if width <= 0.0 or not motions:
@@ -178,12 +167,8 @@ def cleft_tets(
 ) -> NDArray[np.bool_]:
     """Which tets lie between two segments of which one or both move, (m,).
 
-    Those are tets that hold nodes of both, and those whose centroid has both within `width`, taken
-    together: a cut in the bone and the slit between the tooth rows look the same.
-
-    nodes: (n, 3), mm.
-    tets: (m, 4) uint32.
-    width: mm. 0: no tet.
+    Those are tets that hold nodes of both, and those whose centroid has both within `width`, mm,
+    taken together: a cut in the bone and the slit between the tooth rows look the same.
     """
     inside = np.zeros(len(tets), dtype=bool)
     if width <= 0.0 or not moved:
@@ -258,8 +243,7 @@ class CaseContacts:
     ) -> dict[str, dict[str, Any]]:
         """What build.json states of the contact surfaces of a scene.
 
-        "surface" is "sheet" or "bone"; "departure_mean", "departure_p95" and "departure_max", mm,
-        say how far it lies from the bone under the nodes that slide.
+        Departures, mm, say how far each lies from the bone under the nodes that slide.
         """
         stated = {}
         for segment in segments:
@@ -290,9 +274,7 @@ def arch_sheets(
     """The contact sheets of the arches of a head, for the segments that bear them.
 
     A sheet is that of the whole bone before it is cut, so that it goes on smoothly past the cuts;
-    each piece carries it with its own motion.
-
-    edge_length: mm, of the tissue's tets.
+    each piece carries it with its own motion. `edge_length`: mm, of the tets.
     Raises `CaseError`: No bone at an arch.
     """
     if not options.sliding or options.contact_surface == "bone" or not arches.by_jaw:

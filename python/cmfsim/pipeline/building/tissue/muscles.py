@@ -23,11 +23,7 @@ from cmfsim.values.patient_model import PatientModel
 
 @dataclass(frozen=True, eq=False)
 class PlacedMuscles:
-    """A template's muscles in a head.
-
-    prepared: Its muscles muscles with what a mesh is sampled by.
-    seconds: Of each step.
-    """
+    """A template's muscles in a head, what a mesh is sampled by, and the seconds of each step."""
 
     muscles: MorphedMusculature
     prepared: PreparedMuscles
@@ -42,9 +38,7 @@ class NoMuscles:
 
 
 def placed_muscles(given: CaseMuscles, skull: Mapping[str, Floats]) -> PlacedMuscles | NoMuscles:
-    """The muscles of a case in a head, from its skull landmarks.
-
-    Those that the landmarks do not place are left out with a finding.
+    """The muscles that a case's skull landmarks place in a head, with findings on the others.
 
     Raises `LandmarkError`: The landmarks do not fit the template's.
     Raises `CaseError`: There is no such template.

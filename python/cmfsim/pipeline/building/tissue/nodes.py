@@ -135,8 +135,7 @@ def tissue_mesh(
 ) -> tuple[TetMesh, MeshReport, tuple[Finding, ...]]:
     """The mesh that the case names or that fills the tissue, its report, and what to say of it.
 
-    It is refined along a seam between the lips, and not separated there: that follows when the
-    kinds of its nodes are known.
+    It is refined along a seam, not separated: that needs the kinds of its nodes.
     """
     if case.mesh.file is not None:
         mesh = TetMesh(*read_tet_mesh(case.mesh.file))
@@ -167,9 +166,6 @@ def needed_halvings(level: ImageData, anatomy: Anatomy) -> Counts:
     A tet holds one mixture of fat and muscle: one half as large as a lip is thick smears the lip's
     muscle over it, where the motions of the jaws differ most. No landmark is asked for, nor that
     the image show the lips apart.
-
-    level: Of the tissue, on the anatomy's grid.
-    Returns: (nx, ny, nz) uint8.
     """
     needed = np.zeros(level.values.shape, dtype=np.uint8)
     mandible = anatomy.bones.get("mandible")
@@ -199,13 +195,7 @@ def needed_halvings(level: ImageData, anatomy: Anatomy) -> Counts:
 
 
 def lip_halvings(level: ImageData, seam: LipSeam, edge_length: float) -> Counts:
-    """How often the edge is halved at least along the seam between the lips, where these are thin.
-
-    level: Of the tissue.
-    seam: With a surface.
-    edge_length: mm.
-    Returns: (nx, ny, nz) uint8.
-    """
+    """How often the edge is halved at least along the seam between thin lips."""
     values = level.values
     needed = np.zeros(values.shape, dtype=np.uint8)
     if seam.surface is None:
@@ -388,10 +378,8 @@ def end_findings(
 ) -> list[Finding]:
     """Findings on bones that move close to where tissue is fixed, and on tissue that ends loose.
 
-    nodes: (n, 3), mm.
     triangles: (t, 3) uint32. Boundary of the tissue's mesh, outward.
     anatomy: Its grid ends where the image does.
-    moved: Names of the segments that move.
     """
     near = _near_ends(anatomy, region, [s for s in segments if s.name in moved])
     return [*near, *_loose_ends(nodes, triangles, kinds, anatomy)]
