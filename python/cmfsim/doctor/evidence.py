@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -20,7 +20,7 @@ from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.repair import INNER_WALL, RepairOptions, repair_surface
 from cmfsim.values.case_parts import CaseMotion, CaseSurfaces
 from cmfsim.values.checks import Floats
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.landmark_sites import is_for_measures
 from cmfsim.values.moduli import FatModuli, moduli_unusual
@@ -91,7 +91,7 @@ class Body:
     def walls(self) -> tuple[Finding, ...]:
         """A finding where an inner wall is dropped."""
         found = (f for f in self._repair[1] if f.code == INNER_WALL)
-        return tuple(replace(finding, where=self.where) for finding in found)
+        return tuple(findings_at(self.where, found))
 
     @cached_property
     def index(self) -> Surface:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.doctor.evidence import Body, Evidence, distances_from, place_text
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
 from cmfsim.values.landmark_sites import label_key
 
 # Spacing above which thin structures of a face are lost, mm: half the thickness of lips and lids.
@@ -48,7 +48,7 @@ def check_surfaces(evidence: Evidence) -> Iterator[Finding]:
     for body in [*([evidence.skin] if evidence.skin else []), *evidence.bones.values()]:
         yield from body.walls
         for check in checks:
-            yield from check(body)
+            yield from findings_at(body.where, check(body))
 
 
 def _check_borders(body: Body) -> Iterator[Finding]:
@@ -65,7 +65,6 @@ def _check_borders(body: Body) -> Iterator[Finding]:
         f"{len(report.borders)} open borders of {lengths}{more} mm, the longest around "
         f"{place_text(longest.centre)}",
         severity="warning" if wide or body.name != "skin" else "note",
-        where=body.where,
         why="only a closed surface has an inside and an outside: gaps are capped"
         + (", and the shape of a cap this wide is invented" if wide else ""),
     )
@@ -79,7 +78,6 @@ def _check_orientation(body: Body) -> Iterator[Finding]:
             f"{report.inconsistent} edges have triangles that face opposite ways"
             + ("" if report.orientable else "; a part has only one side (Möbius)"),
             severity="warning",
-            where=body.where,
             why="inside and outside differ from place to place; the smaller part is flipped",
         )
     elif report.volume < 0.0:
@@ -87,7 +85,6 @@ def _check_orientation(body: Body) -> Iterator[Finding]:
             "surface-normals",
             f"normals point inwards (volume {report.volume:.0f} mm³)",
             severity="warning",
-            where=body.where,
             why="inside and outside are swapped; build flips it",
         )
 
@@ -101,7 +98,6 @@ def _check_edges(body: Body) -> Iterator[Finding]:
             "surface-non-manifold",
             f"{len(report.non_manifold)} edges have more than two triangles, first at "
             f"{place_text(vertex)}",
-            where=body.where,
         )
 
 
@@ -112,7 +108,6 @@ def _check_crossings(body: Body) -> Iterator[Finding]:
             "surface-crossing",
             "triangles are too crowded to check for intersections",
             severity="warning",
-            where=body.where,
             fix="remesh it with triangles of about equal size",
         )
     elif len(report.crossings) and report.crossing_points is not None:
@@ -122,7 +117,6 @@ def _check_crossings(body: Body) -> Iterator[Finding]:
             f"{len(report.crossings)} pairs of triangles intersect, first at "
             f"{place_text(report.crossing_points[0])}",
             severity="warning" if share > CROSSING_SHARE or body.name == "skin" else "note",
-            where=body.where,
         )
 
 
@@ -140,7 +134,6 @@ def _check_pieces(body: Body) -> Iterator[Finding]:
         f"{len(solid)} pieces besides the largest, with {share:.1%} of its area; the next has "
         f"{solid[0].n_triangles} triangles at {place_text(solid[0].centre)}",
         severity="warning" if body.name == "skin" else "note",
-        where=body.where,
     )
 
 
@@ -151,7 +144,6 @@ def _check_triangles(body: Body) -> Iterator[Finding]:
             "surface-degenerate",
             f"{len(report.degenerate)} triangles without area and {len(report.duplicate)} repeated",
             severity="note",
-            where=body.where,
             why="they have no normal, or their volume counts twice; they are removed",
             fix="nothing to do",
         )
@@ -162,7 +154,6 @@ def _check_triangles(body: Body) -> Iterator[Finding]:
             f"{len(report.slivers)} of {report.n_triangles} triangles are slivers, over a "
             "hundred times longer than high",
             severity="warning" if share > SLIVER_SHARE else "note",
-            where=body.where,
             fix="remesh it if tissue slides on it" if share <= SLIVER_SHARE else "remesh it",
         )
 

@@ -3,8 +3,8 @@
 import logging
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import KW_ONLY, InitVar, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -95,6 +95,11 @@ class Finding:
         known = ("severity", "code", "what", "where", "why", "fix")
         given = {name: values[name] for name in known if name in values}
         return cls(**{**given, "code": FORMER_CODES.get(given["code"], given["code"])})
+
+
+def findings_at(where: str, findings: Iterable[Finding]) -> Iterator[Finding]:
+    """Findings about one place: each with it."""
+    return (replace(finding, where=where) for finding in findings)
 
 
 @dataclass(frozen=True)

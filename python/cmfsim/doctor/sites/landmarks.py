@@ -14,7 +14,7 @@ from cmfsim.doctor.evidence import Evidence, direction_text, place_text, shift_t
 from cmfsim.errors import LandmarkError, RegistrationError
 from cmfsim.registration import common_shift, leave_one_out, mirror_agreement, swapped_names
 from cmfsim.values.checks import Floats
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.landmark_sites import REFERENCE_PLACES
 
@@ -129,20 +129,20 @@ def check_landmarks(
     findings: list[Finding] = []
     named: set[str] = set()
     if nearest is not None:
-        findings += _off_surface(key, landmarks, where, nearest, named)
+        findings += _off_surface(key, landmarks, nearest, named)
     swapped = swapped_names(landmarks, REFERENCE_PLACES[key])
     if swapped is not None and not named & set(swapped):
-        findings.append(_swapped(landmarks, swapped, where))
+        findings.append(_swapped(landmarks, swapped))
         named |= set(swapped)
     sound = {name: place for name, place in landmarks.items() if name not in named}
-    findings += _asymmetric(key, sound, where, named)
+    findings += _asymmetric(key, sound, named)
     sound = {name: place for name, place in landmarks.items() if name not in named}
-    findings += _disagreeing(key, sound, where)
-    return findings
+    findings += _disagreeing(key, sound)
+    return [*findings_at(where, findings)]
 
 
 def _off_surface(
-    key: str, landmarks: Mapping[str, Floats], where: str, nearest: Nearest, named: set[str]
+    key: str, landmarks: Mapping[str, Floats], nearest: Nearest, named: set[str]
 ) -> Iterator[Finding]:
     points = np.stack(list(landmarks.values()))
     offsets = points - nearest(points)
@@ -168,7 +168,6 @@ def _off_surface(
             "they lie "
             f"{shift.after:.1f} mm from the {surface} on average, now {shift.before:.1f} mm",
             severity="error" if shift.size > SHIFT_ERROR else "warning",
-            where=where,
         )
     elif far.mean() >= MANY and far.sum() > 1:
         yield Finding(
@@ -176,7 +175,6 @@ def _off_surface(
             f"{int(far.sum())} of {n} landmarks of the {key} lie more than {FAR:g} mm from "
             f"the {surface}, and half of them by more than {median:.1f} mm",
             severity="error" if median > ANOTHER else "warning",
-            where=where,
             why="errors of placement do not explain so many: the landmarks belong to another "
             f"patient, scan or frame, or the {surface} is not this patient's",
         )
@@ -192,26 +190,22 @@ def _off_surface(
             "landmark-far",
             f"{name} {lies}, at {place_text(point)}",
             severity="error" if distance > TOO_FAR else "warning",
-            where=where,
             fix=AGAIN,
             facts={"placed": PLACED_FROM[key], "most": FAR},
         )
 
 
-def _swapped(landmarks: Mapping[str, Floats], pair: tuple[str, str], where: str) -> Finding:
+def _swapped(landmarks: Mapping[str, Floats], pair: tuple[str, str]) -> Finding:
     one, other = pair
     apart = float(np.linalg.norm(landmarks[one] - landmarks[other]))
     return Finding(
         "landmarks-swapped",
         f"{one} at {place_text(landmarks[one])} and {other} at {place_text(landmarks[other])} "
         f"seem to be swapped: when exchanged, they fit all the others ({apart:.0f} mm apart)",
-        where=where,
     )
 
 
-def _asymmetric(
-    key: str, landmarks: Mapping[str, Floats], where: str, named: set[str]
-) -> Iterator[Finding]:
+def _asymmetric(key: str, landmarks: Mapping[str, Floats], named: set[str]) -> Iterator[Finding]:
     """Landmarks that are not the mirror image of their partner, or not in the midline."""
     agreement = mirror_agreement(landmarks)
     if agreement is None:
@@ -237,10 +231,10 @@ def _asymmetric(
             else f"{base}_L and {base}_R deviate from mirror symmetry by {distance:.1f} mm, "
             "judged by the other landmarks"
         )
-        yield Finding("landmark-asymmetric", what, where=where, facts={"placed": PLACED_FROM[key]})
+        yield Finding("landmark-asymmetric", what, facts={"placed": PLACED_FROM[key]})
 
 
-def _disagreeing(key: str, landmarks: Mapping[str, Floats], where: str) -> Iterator[Finding]:
+def _disagreeing(key: str, landmarks: Mapping[str, Floats]) -> Iterator[Finding]:
     """Landmarks that the others, carried from an average head, put elsewhere."""
     reference = REFERENCE_PLACES[key]
     names = [name for name in reference if name in landmarks]
@@ -259,7 +253,6 @@ def _disagreeing(key: str, landmarks: Mapping[str, Floats], where: str) -> Itera
             "landmark-disagrees",
             f"{name} lies {distances[name]:.1f} mm {direction_text(offset)} where the other "
             "landmarks put it in an average head",
-            where=where,
             why=f"{PLACED_FROM[key]}; heads differ by up to 10 mm there",
             fix=AGAIN,
         )

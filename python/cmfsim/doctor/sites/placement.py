@@ -13,13 +13,15 @@ from cmfsim.doctor.sites.landmarks import (
     nearest_of_surfaces,
 )
 from cmfsim.errors import ImageError
+from cmfsim.io import Case
 from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
 from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.repair import INNER_WALL
 from cmfsim.values.case_parts import SKIN_EXTENT, UNITS
 from cmfsim.values.checks import Floats
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
+from cmfsim.values.image_data import ImageData
 
 # Longest extents that other units give a head, and their name; normalised to 1 or to −1…1.
 OTHER_UNITS: Sequence[tuple[str, float, float, float]] = (
@@ -63,10 +65,12 @@ HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
 def check_placement(evidence: Evidence) -> list[Finding]:
     """Findings about positions; a fault that causes others is reported alone."""
-    sizes = [*_check_skin_size(evidence), *_check_bone_sizes(evidence)]
-    if sizes:
-        return sizes
     findings: list[Finding] = []
+    if (skin := evidence.skin) is not None:
+        findings += findings_at(skin.where, _check_skin_size(evidence.case, skin))
+        findings += _check_bone_sizes(evidence, skin)
+    if findings:
+        return findings
     for name, body in evidence.bones.items():
         findings += _check_bone_inside(evidence, name, body)
         if any(finding.code == INNER_WALL for finding in findings):
@@ -78,15 +82,17 @@ def check_placement(evidence: Evidence) -> list[Finding]:
     for key, landmarks in (("skull", evidence.skull_landmarks), ("skin", evidence.skin_landmarks)):
         if not landmarks:
             continue
-        for check in (_check_landmark_fit, _check_within_image, _check_directions, _check_sides):
-            wrong = list(check(evidence, key, landmarks))
-            if wrong:
-                break
-        else:
+        where = evidence.case.where(f"landmarks.{key}")
+        checks = (
+            _check_landmark_fit(evidence, key, landmarks),
+            _check_within_image(evidence.image, landmarks),
+            _check_directions(landmarks),
+            _check_sides(landmarks),
+        )
+        wrong = next(filter(None, (list(findings_at(where, found)) for found in checks)), [])
+        if not wrong:
             nearest = _nearest_point(evidence, key, landmarks)
-            wrong = check_landmarks(
-                key, landmarks, evidence.case.where(f"landmarks.{key}"), nearest
-            )
+            wrong = check_landmarks(key, landmarks, where, nearest)
         turned |= any(f.code == "frame-turned" and f.severity == "error" for f in wrong)
         findings += wrong
     if not turned:
@@ -99,14 +105,12 @@ def _extent(points: Floats) -> float:
     return float(np.ptp(points, axis=0).max())
 
 
-def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
-    if evidence.skin is None:
-        return
-    extent = _extent(evidence.skin.repaired.vertices)
+def _check_skin_size(case: Case, skin: Body) -> Iterator[Finding]:
+    extent = _extent(skin.repaired.vertices)
     low, high = SKIN_EXTENT
     if low <= extent <= high:
         return
-    stated = evidence.case.surfaces.units if evidence.case.surfaces else "mm"
+    stated = case.surfaces.units if case.surfaces else "mm"
     # In the numbers of the file: if another unit is stated, they may simply be mm.
     numbers = extent / UNITS[stated]
     if low <= numbers <= high:
@@ -115,7 +119,6 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
             f"the skin is {numbers:.4g} long in the numbers of the file: they look like mm but "
             f"are read as {stated} ({extent:.4g} mm)",
             severity="error",
-            where=evidence.skin.where,
         )
         return
     for name, least, most, factor in OTHER_UNITS:
@@ -129,7 +132,6 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
                 "surface-units",
                 f"the skin is {extent:.4g} mm long: this looks like {name}, read as {stated}",
                 severity="error",
-                where=evidence.skin.where,
                 fix=fix,
             )
             return
@@ -137,26 +139,23 @@ def _check_skin_size(evidence: Evidence) -> Iterator[Finding]:
         "surface-units",
         f"the skin is {extent:.4g} mm long",
         severity="error" if not 0.5 * low <= extent <= 2.0 * high else "warning",
-        where=evidence.skin.where,
         why=f"a head or face is {low:g} to {high:g} mm long",
         fix="check the units, and that the file holds the skin alone",
     )
 
 
-def _check_bone_sizes(evidence: Evidence) -> Iterator[Finding]:
-    if evidence.skin is None:
-        return
-    skin = _extent(evidence.skin.repaired.vertices)
+def _check_bone_sizes(evidence: Evidence, skin: Body) -> Iterator[Finding]:
+    size = _extent(skin.repaired.vertices)
     low, high = SKIN_EXTENT
-    if not low <= skin <= high:
+    if not low <= size <= high:
         return
     for name, body in evidence.bones.items():
         extent = _extent(body.repaired.vertices)
-        if BONE_SHARE[0] * skin <= extent <= BONE_SHARE[1] * skin:
+        if BONE_SHARE[0] * size <= extent <= BONE_SHARE[1] * size:
             continue
         yield Finding(
             "surface-units",
-            f"bone {name} is {extent:.4g} mm long, the skin {skin:.4g} mm",
+            f"bone {name} is {extent:.4g} mm long, the skin {size:.4g} mm",
             severity="error",
             where=body.where,
             why="all surfaces of a case must have the same units and the same frame",
@@ -186,7 +185,6 @@ def _check_landmark_fit(
     if key == "skull" and _is_part(bodies, points):
         # The others belong to the bone that is not given.
         return
-    where = evidence.case.where(f"landmarks.{key}")
     surface = "bones" if key == "skull" else "skin"
     what = f"half of the landmarks are more than {median:.0f} mm from the {surface}"
     tries = {
@@ -203,21 +201,19 @@ def _check_landmark_fit(
             yield Finding(
                 "landmark-frame",
                 f"{what}; {done}, {fitted:.1f} mm",
-                where=where,
                 fix="correct coordinateSystem in the file (LPS or RAS), or frame under "
                 "[surfaces] if it is the surfaces that have the wrong frame"
                 if is_frame
                 else "correct coordinateUnits in the file, or save it again in mm",
             )
             return
-    yield Finding("landmark-frame", what, where=where)
+    yield Finding("landmark-frame", what)
 
 
 def _check_within_image(
-    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
+    image: ImageData | None, landmarks: Mapping[str, Floats]
 ) -> Iterator[Finding]:
     """Landmarks outside the CT, or inside it only in another frame."""
-    image = evidence.image
     if image is None:
         return
     points = np.stack(list(landmarks.values()))
@@ -242,7 +238,6 @@ def _check_within_image(
         + (f", converted from RAS to LPS {int(turned.sum())}" if is_frame else "")
         + f": {', '.join(names[:4])}{more}",
         severity="error" if is_frame or wrong.mean() > ELSEWHERE_SHARE else "warning",
-        where=evidence.case.where(f"landmarks.{key}"),
         fix="correct coordinateSystem in the file (LPS or RAS)"
         if is_frame
         else "check that landmarks and image are from one patient and in mm, and that the scan is "
@@ -277,9 +272,7 @@ def _unit(vector: Floats) -> Floats | None:
     return vector / length if length > SHORTEST else None
 
 
-def _check_directions(
-    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
-) -> Iterator[Finding]:
+def _check_directions(landmarks: Mapping[str, Floats]) -> Iterator[Finding]:
     """A head that does not look along −P with its left along +L and its crown along +S."""
     pairs = side_vectors(landmarks)
     left = _unit(np.mean(list(pairs.values()), axis=0)) if pairs else None
@@ -290,14 +283,12 @@ def _check_directions(
         0 if v is None or abs(v[axis]) < MAIN_AXIS else int(np.sign(v[axis]))
         for axis, v in enumerate((left, back, up))
     ]
-    where = evidence.case.where(f"landmarks.{key}")
     if signs[0] < 0 and signs[1] < 0:
         yield Finding(
             "frame-turned",
             "the face looks towards +P and its left side lies towards R: these are RAS coordinates "
             "read as LPS",
             severity="error",
-            where=where,
             fix='state the frame: "coordinateSystem": "RAS" in the file, and frame = "RAS" under '
             "[surfaces] if the surfaces are in it as well",
         )
@@ -305,7 +296,6 @@ def _check_directions(
         yield Finding(
             "left-right-swapped",
             f"of {len(pairs)} pairs of landmarks, the left ones are on the right (R) side",
-            where=where,
             why="either the labels are swapped or the data are mirrored; a plan would move the "
             "wrong side",
             fix="swap the labels _L and _R; if the labels are right, the images or surfaces are "
@@ -313,31 +303,22 @@ def _check_directions(
         )
     elif signs[1] < 0 or signs[2] < 0:
         what = "the face looks backwards" if signs[1] < 0 else "the head is upside down"
-        yield Finding(
-            "frame-turned", f"according to its landmarks, {what}", severity="error", where=where
-        )
+        yield Finding("frame-turned", f"according to its landmarks, {what}", severity="error")
     elif any(v is not None and s == 0 for v, s in zip((left, back, up), signs, strict=True)):
         yield Finding(
             "frame-turned",
             "according to its landmarks, the head is rotated by more than 60° from the axes",
             severity="warning",
-            where=where,
             why="default planes are placed along the axes",
             fix="rotate the data upright, or give posterior_plane and the planes of the cuts",
         )
 
 
-def _check_sides(
-    evidence: Evidence, key: str, landmarks: Mapping[str, Floats]
-) -> Iterator[Finding]:
+def _check_sides(landmarks: Mapping[str, Floats]) -> Iterator[Finding]:
     wrong = wrong_sides(landmarks)
     if wrong:
         names = ", ".join(wrong)
-        yield Finding(
-            "left-right-swapped",
-            f"left and right are swapped in: {names}",
-            where=evidence.case.where(f"landmarks.{key}"),
-        )
+        yield Finding("left-right-swapped", f"left and right are swapped in: {names}")
 
 
 def _nearest_point(evidence: Evidence, key: str, landmarks: Mapping[str, Floats]) -> Nearest | None:

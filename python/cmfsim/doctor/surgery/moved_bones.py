@@ -12,7 +12,7 @@ from cmfsim.errors import CmfsimError, RegistrationError
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import clinical_motion
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
 from cmfsim.values.surface_data import MovedSurface
 
 # A bone whose vertices all move less than this was not moved, mm: rounding in a surface file.
@@ -55,35 +55,8 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
     """Findings about motions given by surfaces, vertex by vertex."""
     case = evidence.case
     least: dict[str, float] = {}
-    for name, moved in evidence.moved.items():
-        where = case.where(f"plan.{name}")
-        if isinstance(moved, CmfsimError):
-            yield Finding(
-                "moved-not-paired",
-                str(moved),
-                where=where,
-                why=f"the motion of each vertex of {name} is unknown",
-            )
-            continue
-        if not isinstance(moved, MovedSurface):
-            before, after = moved
-            # The build finds its motion by its shape.
-            yield Finding(
-                "moved-remeshed",
-                f"{name} has {len(after.triangles)} triangles after and {len(before.triangles)} "
-                "before, or numbers them differently, so its rigid motion is found by its shape",
-                where=where,
-            )
-            continue
-        here, there = moved.surface.vertices, moved.moved_vertices
-        wrong = list(check_pairs(name, where, moved))
-        # A bone of another size goes on, and must not go far.
-        if all(finding.code == "moved-scaled" and finding.severity != "error" for finding in wrong):
-            wrong += _check_distance(name, where, moved)
-        yield from wrong
-        if not any(finding.severity == "error" for finding in wrong):
-            least[name] = float(np.quantile(np.linalg.norm(there - here, axis=1), FEW))
-            yield from check_against_skin(evidence, name, here, there)
+    for name in evidence.moved:
+        yield from findings_at(case.where(f"plan.{name}"), _check_bone(evidence, name, least))
     others = set(evidence.bones) - set(case.plan) if case.surfaces is not None else {""}
     if least and not others and not case.osteotomies and min(least.values()) > STAYS:
         yield Finding(
@@ -93,7 +66,34 @@ def check_moved(evidence: Evidence) -> Iterator[Finding]:
         )
 
 
-def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]:
+def _check_bone(evidence: Evidence, name: str, least: dict[str, float]) -> Iterator[Finding]:
+    """Findings about one bone; how far nearly all of it moves, mm, is entered in `least`."""
+    moved = evidence.moved[name]
+    if isinstance(moved, CmfsimError):
+        why = f"the motion of each vertex of {name} is unknown"
+        yield Finding("moved-not-paired", str(moved), why=why)
+        return
+    if not isinstance(moved, MovedSurface):
+        before, after = moved
+        # The build finds its motion by its shape.
+        yield Finding(
+            "moved-remeshed",
+            f"{name} has {len(after.triangles)} triangles after and {len(before.triangles)} "
+            "before, or numbers them differently, so its rigid motion is found by its shape",
+        )
+        return
+    here, there = moved.surface.vertices, moved.moved_vertices
+    wrong = list(check_pairs(name, moved))
+    # A bone of another size goes on, and must not go far.
+    if all(finding.code == "moved-scaled" and finding.severity != "error" for finding in wrong):
+        wrong += _check_distance(name, moved)
+    yield from wrong
+    if not any(finding.severity == "error" for finding in wrong):
+        least[name] = float(np.quantile(np.linalg.norm(there - here, axis=1), FEW))
+        yield from check_against_skin(evidence, name, here, there)
+
+
+def check_pairs(name: str, moved: MovedSurface) -> Iterator[Finding]:
     """Whether both are one bone: of one size, with vertices that belong together, not mirrored.
 
     An achieved plan is asked the same where it follows a bone vertex by vertex.
@@ -103,7 +103,6 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
         yield Finding(
             "moved-not-paired",
             f"{name} is mirrored after the operation relative to before",
-            where=where,
             why="no motion mirrors a bone: in one of the files, left and right or another axis "
             "are swapped",
             fix="export both in one frame (LPS or RAS)",
@@ -115,15 +114,14 @@ def check_pairs(name: str, where: str, moved: MovedSurface) -> Iterator[Finding]
             "moved-not-paired",
             f"the edges of {name} have other directions after the operation (cosine {along:.2f} "
             "on average, not 1)",
-            where=where,
             why="both files have the same number of vertices, but in a different order",
             fix=f"export the moved mesh without remeshing or sorting its vertices; {BY_SHAPE}",
         )
     elif abs(scale - 1.0) > SCALED:
-        yield _scaled(name, where, scale)
+        yield _scaled(name, scale)
 
 
-def _scaled(name: str, where: str, scale: float) -> Finding:
+def _scaled(name: str, scale: float) -> Finding:
     """An error where the size can only be another unit's, else a warning with the evidence."""
     unit = next(
         (
@@ -142,7 +140,6 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
             "moved-scaled",
             f"{what}{between}",
             severity="error",
-            where=where,
             why="bone does not grow during an operation: the files have different units, or one "
             "was scaled",
             fix="export both in the unit that the case states",
@@ -151,7 +148,6 @@ def _scaled(name: str, where: str, scale: float) -> Finding:
         "moved-scaled",
         f"{what}: not close to the ratio of any two units (2.54, 10, 25.4, 100, 1000)",
         severity="warning",
-        where=where,
         why="bone does not grow during an operation, so the calibration or segmentation of the "
         f"scans differs by {abs(scale - 1.0):.1%}; where the shape differs as well, each vertex is "
         "followed, and the difference counts as motion",
@@ -190,7 +186,7 @@ def _is_mirrored(here: Floats, there: Floats) -> bool:
     return kept > STAYS and mirrored < MIRRORED * kept
 
 
-def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Finding]:
+def _check_distance(name: str, motion: MovedSurface) -> Iterator[Finding]:
     """Whether the bone moves as far, and turns as far, as bone is moved."""
     surface, there = motion.surface, motion.moved_vertices
     here = surface.vertices
@@ -200,7 +196,6 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
         yield Finding(
             "plan-still",
             f"{name} moves by {moved[worst]:.2g} mm at most",
-            where=where,
             why="the plan does not move this segment",
             fix="check that the file is the bone after the operation; otherwise remove it",
         )
@@ -211,7 +206,6 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
             "plan-far",
             f"{name} moves by up to {moved[worst]:.1f} mm, at {place_text(here[worst])}",
             severity="error" if moved[worst] > TOO_FAR else "warning",
-            where=where,
             fix="one file is in LPS and the other in RAS: export both in one frame"
             if turned
             else "register the post-operative scan to the pre-operative one on the skull, and "
@@ -222,7 +216,7 @@ def _check_distance(name: str, where: str, motion: MovedSurface) -> Iterator[Fin
         return
     fit = clinical_motion(name, MovedSurface(surface, there))
     angle = float(np.linalg.norm([fit.pitch, fit.yaw, fit.roll]))
-    yield from check_turn(name, where, angle)
+    yield from check_turn(name, angle)
     # A measured turn may be as small as it likes.
     computed = fit.residual is not None and fit.residual < COMPUTED
-    yield from check_tiny(name, where, float(moved[worst]), angle if computed else 0.0)
+    yield from check_tiny(name, float(moved[worst]), angle if computed else 0.0)

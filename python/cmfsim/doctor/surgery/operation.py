@@ -24,7 +24,7 @@ from cmfsim.values.anatomy import JAWS
 from cmfsim.values.case_parts import CUT_UP, CaseOsteotomy
 from cmfsim.values.checks import Floats
 from cmfsim.values.clinical_motion import ClinicalMotion
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
 from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import MovedSurface, SurfaceData
 
@@ -281,31 +281,22 @@ def check_plan(
         yield nothing_moves(case.where("plan"))
     apart = False
     for name, matrix in evidence.motions.items():
-        piece, given = pieces[name], case.plan[name]
-        yield from _check_frame(evidence, name, matrix)
-        wrong = list(
-            check_motion_size(
-                SizedMotion(
-                    name,
-                    matrix,
-                    case.where(f"plan.{name}"),
-                    None if piece is None else piece[:, :3],
-                    plan[name].point,
-                    typed=given.typed,
-                    centre=given.centre,
-                )
-            )
+        piece, given, where = pieces[name], case.plan[name], case.where(f"plan.{name}")
+        points = None if piece is None else piece[:, :3]
+        yield from findings_at(where, _check_frame(evidence, name, matrix))
+        sized = SizedMotion(
+            name, matrix, points, plan[name].point, typed=given.typed, centre=given.centre
         )
+        wrong = list(findings_at(where, check_motion_size(sized)))
         yield from wrong
         if given.typed:
-            yield from check_typed(plan[name], case.where(f"plan.{name}"))
+            yield from findings_at(where, check_typed(plan[name]))
         # A bone that flies off passes the skin as well: one reason is enough.
         flies = any(f.severity == "error" for f in wrong)
         apart = apart or flies
-        if piece is not None and not flies:
-            yield from check_against_skin(
-                evidence, name, piece[:, :3], carried(matrix, piece[:, :3])
-            )
+        if points is not None and not flies:
+            moved = carried(matrix, points)
+            yield from findings_at(where, check_against_skin(evidence, name, points, moved))
     if not apart:
         yield from check_jaws(_parts(evidence), evidence.skull_landmarks)
 
@@ -324,7 +315,6 @@ def _check_frame(evidence: Evidence, name: str, matrix: Floats) -> Iterator[Find
     yield Finding(
         "plan-frame",
         f"the motion of {name} has no frame and is read as LPS, but the surfaces are in {frame}",
-        where=case.where(f"plan.{name}"),
         facts={"frame": frame},
     )
 
@@ -367,7 +357,6 @@ def _check_through_skin(
         "plan-through-skin",
         f"{name} is moved through the undeformed skin, by {depth[worst]:.1f} mm at "
         f"{place_text(moved[through[worst]])}",
-        where=evidence.case.where(f"plan.{name}"),
     )
 
 
@@ -386,8 +375,5 @@ def _check_tissue(evidence: Evidence, name: str, piece: Floats) -> Iterator[Find
     if tissue.any():
         return
     yield Finding(
-        "segment-no-tissue",
-        f"{name} touches no soft tissue in the meshed region",
-        severity="error",
-        where=evidence.case.where(f"plan.{name}"),
+        "segment-no-tissue", f"{name} touches no soft tissue in the meshed region", severity="error"
     )

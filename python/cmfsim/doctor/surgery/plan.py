@@ -49,7 +49,6 @@ class SizedMotion:
 
     name: str
     matrix: Floats
-    where: str
     points: Floats | None = None
     point: Floats | None = None
     typed: bool = False
@@ -77,20 +76,16 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
             "plan-far",
             f"{motion.name} moves by up to {far:.1f} mm",
             severity="error" if far > TOO_FAR else "warning",
-            where=motion.where,
             fix=remedy,
             facts={"most": FAR},
         )
     elif far > SMALL and motion.name in HELD:
-        yield Finding(
-            "plan-cranium", f"{motion.name} moves by up to {far:.1f} mm", where=motion.where
-        )
+        yield Finding("plan-cranium", f"{motion.name} moves by up to {far:.1f} mm")
     elif angle > TINY_TURN[0] and motion.typed and motion.centre is None:
         yield Finding(
             "plan-no-centre",
             f"{motion.name} turns by {angle:.1f}° about the origin of the coordinates, for no "
             f"centre is given: the turn moves it by up to {far:.1f} mm",
-            where=motion.where,
         )
     # The origin is where other programs turn about, with a translation that makes up for it.
     turns = motion.points is not None and angle > TINY_TURN[0]
@@ -101,14 +96,13 @@ def check_motion_size(motion: SizedMotion) -> Iterator[Finding]:
                 "plan-centre-far",
                 f"{motion.name} turns about a point {away:.0f} mm away from it, and moves by up to "
                 f"{far:.1f} mm",
-                where=motion.where,
             )
-    yield from check_turn(motion.name, motion.where, angle)
+    yield from check_turn(motion.name, angle)
     reach = 0.0 if motion.points is not None else REACH * math.radians(angle)
-    yield from check_tiny(motion.name, motion.where, far + reach, angle)
+    yield from check_tiny(motion.name, far + reach, angle)
 
 
-def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
+def check_typed(motion: ClinicalMotion) -> Iterator[Finding]:
     """Findings about the numbers of a typed motion: in centimetres, or in another order."""
     size = math.hypot(motion.forwards, motion.up, motion.left)
     turn = math.hypot(motion.pitch, motion.yaw, motion.roll)
@@ -116,7 +110,6 @@ def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
         yield Finding(
             "plan-tiny",
             f"{motion.segment} moves by {size:.2g} mm",
-            where=where,
             facts={"size": size, "unit": "cm", "larger": 10.0 * size},
         )
     if abs(motion.left) > SIDEWAYS and size < math.sqrt(2.0) * abs(motion.left):
@@ -125,7 +118,6 @@ def check_typed(motion: ClinicalMotion, where: str) -> Iterator[Finding]:
             "plan-sideways",
             f"{motion.segment} moves {abs(motion.left):.1f} mm to the {side}, which is most of its "
             "motion",
-            where=where,
         )
 
 
@@ -138,25 +130,23 @@ def nothing_moves(where: str, measured: float | None = None) -> Finding:
     return Finding("plan-still", what, where=where, fix=fix)
 
 
-def check_turn(name: str, where: str, angle: float) -> Iterator[Finding]:
+def check_turn(name: str, angle: float) -> Iterator[Finding]:
     """A finding about a turn, in degrees, of more than bone is turned."""
     if angle > TURNED:
         yield Finding(
             "plan-turned",
             f"{name} turns by {angle:.1f}°",
             severity="error" if angle > TOO_TURNED else "warning",
-            where=where,
             facts={"most": TURNED},
         )
 
 
-def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Finding]:
+def check_tiny(name: str, far: float, angle: float) -> Iterator[Finding]:
     """Findings about a motion of `far` mm at most and a turn, in degrees, that nobody plans."""
     if NOTHING < far < TINY:
         yield Finding(
             "plan-tiny",
             f"{name} moves by {far:.2g} mm at most",
-            where=where,
             why="this is too small to be visible: the prediction equals the face before the "
             "operation",
             facts={"size": far, "unit": "m", "larger": 1000.0 * far},
@@ -166,7 +156,6 @@ def check_tiny(name: str, where: str, far: float, angle: float) -> Iterator[Find
         yield Finding(
             "plan-tiny-angle",
             f"{name} turns by {angle:.2g}°",
-            where=where,
             facts={"angle": angle, "degrees": math.degrees(angle)},
         )
 

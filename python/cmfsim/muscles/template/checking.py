@@ -1,7 +1,9 @@
 """Problems of a muscle template: files, surfaces, sides, landmarks, each with its fix."""
 
+import itertools
 import os
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -14,7 +16,7 @@ from cmfsim.registration import side_vectors, wrong_sides
 from cmfsim.surfaces.checks import check_surface
 from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.repair import clean_surface
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS
 from cmfsim.values.musculature import MuscleSurface, TemplateData
 
@@ -103,15 +105,24 @@ def check_template(template: TemplateData | str | os.PathLike[str]) -> tuple[Fin
 def check_contents(template: TemplateData) -> tuple[Finding, ...]:
     """Problems of the contents of a template, after the findings of its reading."""
     skull = _searchable(template.skull)
-    return (
-        *template.findings,
+    kinds = {muscle.name: muscle.kind for muscle in template.muscles}
+    middles = {m.name: m.surface.vertices.mean(axis=0)[0] for m in template.muscles}
+    of_template = (
         *_check_terms(template),
         *_check_sites(template),
         *_check_landmark_places(template, skull),
         *_check_skull(template),
-        *_check_partners(template),
-        *(finding for muscle in template.muscles for finding in _check_muscle(muscle, skull)),
-        *_check_sides(template),
+    )
+    checks = (
+        partial(_check_partner, kinds=kinds),
+        partial(_check_muscle, skull=skull),
+        partial(_check_side, middles=middles),
+    )
+    of_muscles = (findings_at(m.name, check(m)) for check in checks for m in template.muscles)
+    return (
+        *template.findings,
+        *findings_at(template.name, of_template),
+        *itertools.chain(*of_muscles),
     )
 
 
@@ -129,9 +140,9 @@ def _listed(names: list[str]) -> str:
 
 def _check_terms(template: TemplateData) -> Iterator[Finding]:
     if not template.attribution:
-        yield Finding("template-source", "attribution is not stated", where=template.name)
+        yield Finding("template-source", "attribution is not stated")
     if not template.source:
-        yield Finding("template-source", "source is not stated", where=template.name)
+        yield Finding("template-source", "source is not stated")
 
 
 def _check_sites(template: TemplateData) -> Iterator[Finding]:
@@ -144,7 +155,6 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             "template-landmarks-missing",
             f"{len(missing)} of the {len(SKULL_LANDMARKS)} usual landmarks are missing: "
             f"{_listed(missing)}",
-            where=template.name,
             fix="place them on the skull reference",
         )
     undefined = [name for name in extra if name not in template.definitions]
@@ -154,7 +164,6 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
             f"{len(extra)} landmarks have names defined by this template: {_listed(extra)}"
             + (f"; without a definition: {_listed(undefined)}" if undefined else ""),
             severity="warning" if undefined else "note",
-            where=template.name,
             why="they can be used only for patients with landmarks of the same names",
             fix="describe their positions under [landmarks.definitions], or use the usual names",
         )
@@ -165,7 +174,6 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
         yield Finding(
             "template-landmarks",
             f"{names[one]} and {names[other]} lie in the same place",
-            where=template.name,
             why="no map can send one point to two places",
             fix="place one of them again",
         )
@@ -175,7 +183,6 @@ def _check_sites(template: TemplateData) -> Iterator[Finding]:
         yield Finding(
             "template-landmarks",
             f"four landmarks that do not lie in a plane are needed: {found}",
-            where=template.name,
             why="the map to a patient is undefined in the third direction",
         )
 
@@ -191,7 +198,6 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
             "left and right are swapped in "
             + ("every pair" if everything else f"{len(swapped)} pairs")
             + f": {_listed(swapped)}",
-            where=template.name,
             why="muscles would be inverted when they are fitted to a patient",
             fix="the set is mirrored, or in another frame than LPS"
             if everything
@@ -206,7 +212,6 @@ def _check_landmark_places(template: TemplateData, skull: Surface | None) -> Ite
                 "template-off",
                 f"{name} lies {distance:.1f} mm from the skull reference (at most "
                 f"{LANDMARK_DISTANCE:g})",
-                where=template.name,
                 why="muscles would be pulled to a place without bone",
                 fix="place it on the bone, in the frame and units of the skull reference",
             )
@@ -221,44 +226,34 @@ def _check_skull(template: TemplateData) -> Iterator[Finding]:
             "surface-units",
             f"the skull reference is {extent:.3g} mm long (a head has {low:g} to {high:g})",
             severity="error",
-            where=template.name,
             why="its unit is not mm, or it is not a skull",
             fix='state the unit of the files: units = "cm"',
         )
 
 
-def _check_partners(template: TemplateData) -> Iterator[Finding]:
-    """Names that say another side than the muscle has, and muscles on one side alone."""
-    kinds = {muscle.name: muscle.kind for muscle in template.muscles}
-    for muscle in template.muscles:
-        ending = muscle.name[-2:] if muscle.name[-2:] in {"_L", "_R"} else ""
-        if ending != ("" if muscle.side == "both" else f"_{muscle.side}"):
+def _check_partner(muscle: MuscleSurface, kinds: Mapping[str, str]) -> Iterator[Finding]:
+    """A name that says another side than the muscle has, and a muscle on one side alone."""
+    ending = muscle.name[-2:] if muscle.name[-2:] in {"_L", "_R"} else ""
+    if ending != ("" if muscle.side == "both" else f"_{muscle.side}"):
+        yield Finding(
+            "template-sides",
+            f"the side is {muscle.side!r}, the name ends in {ending or 'no side'!r}",
+            severity="error",
+            why="muscles are addressed by names that state their side",
+            fix="end the name in _L or _R, or in neither for side both",
+        )
+    elif ending:
+        partner = muscle.name[:-1] + ("R" if muscle.side == "L" else "L")
+        if partner not in kinds:
+            yield Finding("template-sides", f"there is no {partner}", severity="warning")
+        elif muscle.side == "L" and kinds[partner] != muscle.kind:
             yield Finding(
                 "template-sides",
-                f"the side is {muscle.side!r}, the name ends in {ending or 'no side'!r}",
-                severity="error",
-                where=muscle.name,
-                why="muscles are addressed by names that state their side",
-                fix="end the name in _L or _R, or in neither for side both",
+                f"it is a {muscle.kind}, {partner} a {kinds[partner]}",
+                severity="warning",
+                why="fibres would differ between the sides",
+                fix="give both the same kind",
             )
-        elif ending:
-            partner = muscle.name[:-1] + ("R" if muscle.side == "L" else "L")
-            if partner not in kinds:
-                yield Finding(
-                    "template-sides",
-                    f"there is no {partner}",
-                    severity="warning",
-                    where=muscle.name,
-                )
-            elif muscle.side == "L" and kinds[partner] != muscle.kind:
-                yield Finding(
-                    "template-sides",
-                    f"it is a {muscle.kind}, {partner} a {kinds[partner]}",
-                    severity="warning",
-                    where=muscle.name,
-                    why="fibres would differ between the sides",
-                    fix="give both the same kind",
-                )
 
 
 def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Finding]:
@@ -271,7 +266,6 @@ def _check_muscle(muscle: MuscleSurface, skull: Surface | None) -> Iterator[Find
             "template-off",
             f"its distance from the skull is never below {nearest:.0f} mm (at most "
             f"{MUSCLE_DISTANCE:g})",
-            where=muscle.name,
         )
     yield from _check_course(muscle)
 
@@ -283,7 +277,6 @@ def _check_muscle_surface(muscle: MuscleSurface) -> Iterator[Finding]:
             "surface-normals",
             f"it encloses {report.volume:.0f} mm³: normals point inwards",
             severity="error",
-            where=muscle.name,
         )
     if not report.is_closed:
         length = sum(loop.length for loop in report.borders)
@@ -291,7 +284,6 @@ def _check_muscle_surface(muscle: MuscleSurface) -> Iterator[Finding]:
             "surface-open",
             f"{len(report.borders)} borders, {length:.1f} mm long",
             severity="warning",
-            where=muscle.name,
             why="near a gap, the winding number changes gradually from 1 to 0 instead of abruptly",
             fix="close it (cmfsim.repair_surface)",
         )
@@ -300,14 +292,12 @@ def _check_muscle_surface(muscle: MuscleSurface) -> Iterator[Finding]:
             "surface-non-manifold",
             f"{len(report.non_manifold)} edges of more than two triangles, {report.inconsistent} "
             "between triangles that face opposite ways",
-            where=muscle.name,
         )
     if report.crossings is not None and len(report.crossings):
         yield Finding(
             "surface-crossing",
             f"{len(report.crossings)} pairs of triangles intersect",
             severity="note",
-            where=muscle.name,
             why="winding numbers above ½ count as inside, so only folds of the surface are "
             "affected",
             fix="nothing to do if the muscle looks right",
@@ -326,24 +316,20 @@ def _check_course(muscle: MuscleSurface) -> Iterator[Finding]:
             yield Finding(
                 "template-off",
                 f"fibre line {number} leaves it by {away:.1f} mm (at most {COURSE_DISTANCE:g})",
-                where=muscle.name,
                 why="the line may belong to another muscle",
                 fix="correct the line",
             )
 
 
-def _check_sides(template: TemplateData) -> Iterator[Finding]:
-    """Left muscles on the left of right ones: x grows to the patient's left."""
-    middles = {m.name: m.surface.vertices.mean(axis=0)[0] for m in template.muscles}
-    for muscle in template.muscles:
-        partner = f"{muscle.name[:-1]}R"
-        if muscle.side != "L" or partner not in middles:
-            continue
-        across = middles[muscle.name] - middles[partner]
-        if across < 0.0:
-            yield Finding(
-                "left-right-swapped",
-                f"it lies {-across:.0f} mm to the right of {partner}",
-                where=muscle.name,
-                fix="swap the names, or correct the frame: x grows to the patient's left",
-            )
+def _check_side(muscle: MuscleSurface, middles: Mapping[str, float]) -> Iterator[Finding]:
+    """A left muscle on the left of its right one: x grows to the patient's left."""
+    partner = f"{muscle.name[:-1]}R"
+    if muscle.side != "L" or partner not in middles:
+        return
+    across = middles[muscle.name] - middles[partner]
+    if across < 0.0:
+        yield Finding(
+            "left-right-swapped",
+            f"it lies {-across:.0f} mm to the right of {partner}",
+            fix="swap the names, or correct the frame: x grows to the patient's left",
+        )

@@ -21,7 +21,7 @@ from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.planning.face_measures.occlusion import bite_frame
 from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.landmark_sites import is_for_measures
 from cmfsim.values.mesh_report import MeshReport
@@ -157,10 +157,10 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
             continue
         given = case.plan.get(name)
         is_measured = case.achieved or name in bones.fits
+        where = case.where("plan" if case.achieved else f"plan.{name}")
         sized = SizedMotion(
             name,
             motion,
-            case.where("plan" if case.achieved else f"plan.{name}"),
             points=surfaces[name].vertices,
             typed=given is not None and given.typed,
             centre=None if given is None else given.centre,
@@ -168,7 +168,7 @@ def plan_sizes(case: Case, bones: PlannedBones, known: Iterable[Finding]) -> lis
         # A measured motion may be as small as it likes.
         found += [
             finding
-            for finding in check_motion_size(sized)
+            for finding in findings_at(where, check_motion_size(sized))
             if (finding.code, finding.where) not in seen
             and not (is_measured and finding.code.startswith("plan-tiny"))
         ]
@@ -255,8 +255,8 @@ def given_plan(patient: PatientModel) -> PatientModel:
         if (jaw := jaw_of(segment.name)) is not None:
             parts.append(BonePart(segment.name, jaw, where, segment.surface, motion))
         if not isinstance(motion, MovedSurface):
-            vertices = segment.surface.vertices
-            found += check_motion_size(SizedMotion(segment.name, motion, where, vertices))
+            sized = SizedMotion(segment.name, motion, segment.surface.vertices)
+            found += findings_at(where, check_motion_size(sized))
     found += check_jaws(parts, patient.landmarks.get("skull", {}))
     return patient.with_findings(found)
 

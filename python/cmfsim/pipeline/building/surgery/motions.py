@@ -24,7 +24,7 @@ from cmfsim.pipeline.building.surgery.postoperative import (
 from cmfsim.surfaces.repair import clean_surface
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats, frozen_mapping
-from cmfsim.values.finding import Finding
+from cmfsim.values.finding import Finding, findings_at
 from cmfsim.values.surface_data import MovedSurface, SurfaceData, joined_surface
 
 if TYPE_CHECKING:
@@ -44,62 +44,55 @@ def plan_key(case: Case, name: str) -> str:
 
 
 def motion_findings(
-    found: AchievedMotion, name: str, where: str, skull: ShapeFit | None, *, is_still: bool
+    found: AchievedMotion, name: str, skull: ShapeFit | None, *, is_still: bool
 ) -> Iterator[Finding]:
     """Findings about a motion read off the bone after, where `skull` lies, left alone, if known."""
     severity = "note" if found.method == "icp" else "warning"
-    yield from (_removed_finding(name, where, patch, severity) for patch in found.removed)
+    yield from (_removed_finding(name, patch, severity) for patch in found.removed)
     fit = found.fit
     if found.method == "vertices" or fit is None:
-        yield from _vertex_findings(found, name, where, is_still=is_still)
+        yield from _vertex_findings(found, name, is_still=is_still)
         return
-    yield from (_stray_finding(name, where, patch, is_still=is_still) for patch in found.stray)
-    yield from _size_findings(name, where, fit, None if is_still else skull)
-    yield from (_open_finding(name, where, way, found.method) for way in fit.open)
+    yield from (_stray_finding(name, patch, is_still=is_still) for patch in found.stray)
+    yield from _size_findings(name, fit, None if is_still else skull)
+    yield from (_open_finding(name, way, found.method) for way in fit.open)
     if found.slip > SLID:
-        yield _slip_finding(name, where, found.slip, "median", "its shape did not change")
+        yield _slip_finding(name, found.slip, "median", "its shape did not change")
 
 
-def _vertex_findings(
-    found: AchievedMotion, name: str, where: str, *, is_still: bool
-) -> Iterator[Finding]:
+def _vertex_findings(found: AchievedMotion, name: str, *, is_still: bool) -> Iterator[Finding]:
     """Findings about a bone that is followed vertex by vertex."""
     if len(found.pieces) > 1:
         areas = ", ".join(f"{piece.area / 100.0:.0f}" for piece in found.pieces)
         yield Finding(
             "motion-pieces",
             f"{name} moved as {len(found.pieces)} rigid pieces within its surface, of {areas} cm²",
-            where=where,
             why="each piece is followed along its normals; between pieces the vertices are "
             "followed as they are",
         )
     if not (is_still or found.is_rigid):
-        yield _bent_finding(name, where, found.fit)
+        yield _bent_finding(name, found.fit)
     if found.slip > SLID:
         why = "bending explains less motion along the surface than the vertices show"
-        yield _slip_finding(name, where, found.slip, "rms", why)
+        yield _slip_finding(name, found.slip, "rms", why)
     if found.noise > 0.0:
         yield Finding(
             "motion-slip",
             f"the vertices of {name} moved with {found.noise:.2f} mm of noise, which is averaged "
             "out",
-            where=where,
         )
 
 
-def _slip_finding(name: str, where: str, slip: float, measure: str, why: str) -> Finding:
+def _slip_finding(name: str, slip: float, measure: str, why: str) -> Finding:
     """Vertices of a fitted mesh that slid along the bone."""
     return Finding(
         "motion-slip",
         f"the vertices of {name} slid along its surface by {slip:.1f} mm ({measure})",
-        where=where,
         why=f"{why}, so the slip is that of the fitted mesh, not of the bone, and is subtracted",
     )
 
 
-def _size_findings(
-    name: str, where: str, fit: ShapeFit, skull: ShapeFit | None
-) -> Iterator[Finding]:
+def _size_findings(name: str, fit: ShapeFit, skull: ShapeFit | None) -> Iterator[Finding]:
     """A change of size with its interval, and what it does to the motion."""
     low, high = fit.scale_interval
     change = abs(fit.scale - 1.0)
@@ -119,7 +112,6 @@ def _size_findings(
         f"{name} is {fit.scale:.3g} times as large after the operation as before (95 % "
         f"interval {low:.3f} to {high:.3f}, by its shape)",
         severity="warning" if is_sure and change > SCALED else "note",
-        where=where,
         why="bone does not grow during an operation, so the scans are calibrated or segmented "
         f"differently by {change:.1%}; the motion is that of the middle of the bone, without "
         f"the change of size{common}",
@@ -131,7 +123,7 @@ def _is_scaled(fit: ShapeFit) -> bool:
     return abs(fit.scale - 1.0) >= NOTED and not low <= 1.0 <= high
 
 
-def _open_finding(name: str, where: str, way: OpenDirection, method: str) -> Finding:
+def _open_finding(name: str, way: OpenDirection, method: str) -> Finding:
     """A motion of the bone that its shape hardly shows."""
     axis = ", ".join(f"{x:+.2f}" for x in way.axis)
     words = (
@@ -146,12 +138,11 @@ def _open_finding(name: str, where: str, way: OpenDirection, method: str) -> Fin
         "motion-open",
         f"the shape of {name} hardly determines {words}: eigenvalue ratio {way.ratio:.3f}, "
         f"{OPEN:g} is needed",
-        where=where,
         facts={"left": left},
     )
 
 
-def _bent_finding(name: str, where: str, fit: ShapeFit | None) -> Finding:
+def _bent_finding(name: str, fit: ShapeFit | None) -> Finding:
     """A bone that is followed vertex by vertex, as no rigid motion lays it on the bone after."""
     left = (
         "no rigid motion fits it to the post-operative bone"
@@ -159,12 +150,10 @@ def _bent_finding(name: str, where: str, fit: ShapeFit | None) -> Finding:
         else f"its best rigid motion, at the best size, leaves {np.quantile(fit.off, 0.95):.1f} "
         "mm (95th percentile)"
     )
-    return Finding(
-        "motion-bent", f"{name} has a different shape after the operation: {left}", where=where
-    )
+    return Finding("motion-bent", f"{name} has a different shape after the operation: {left}")
 
 
-def _removed_finding(name: str, where: str, patch: RemovedBone, severity: str) -> Finding:
+def _removed_finding(name: str, patch: RemovedBone, severity: str) -> Finding:
     """A patch of bone that is not there after the operation."""
     at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
     used = (
@@ -175,12 +164,11 @@ def _removed_finding(name: str, where: str, patch: RemovedBone, severity: str) -
         f"{patch.area:.0f} mm² of {name} about ({at}) mm are missing after the operation, "
         f"by up to {patch.depth:.1f} mm: this counts as removed bone, not as motion",
         severity=severity,
-        where=where,
         facts={"used": used},
     )
 
 
-def _stray_finding(name: str, where: str, patch: StrayPatch, *, is_still: bool) -> Finding:
+def _stray_finding(name: str, patch: StrayPatch, *, is_still: bool) -> Finding:
     """The warning about a piece of a segment that is off the post-operative bone."""
     at = ", ".join(f"{x:.0f}" for x in patch.place.tolist())
     piece = f"{patch.area / 100.0:.1f} cm² of {name} about ({at}) mm"
@@ -210,7 +198,6 @@ def _stray_finding(name: str, where: str, patch: StrayPatch, *, is_still: bool) 
         "achieved-piece-off",
         what,
         severity="note" if is_still and not patch.has_bone else "warning",
-        where=where,
         fix=fix,
     )
 
@@ -291,7 +278,8 @@ def _fit_findings(
         # A torn bone's pieces are numbered after it.
         bone = name if name in names else name.rsplit("_", 1)[0]
         where = case.where(plan_key(case, bone))
-        yield from motion_findings(found, name, where, skull, is_still=name in REFERENCES)
+        own = motion_findings(found, name, skull, is_still=name in REFERENCES)
+        yield from findings_at(where, own)
 
 
 def _with_motions(
@@ -416,7 +404,7 @@ def _same_bone(case: Case, name: str, there: SurfaceData) -> MovedSurface | None
 
 def _paired(case: Case, name: str, moved: MovedSurface) -> list[Finding]:
     """Findings on a bone followed by vertices; `CaseError` if it is mirrored or shuffled."""
-    found = list(check_pairs(name, case.where(plan_key(case, name)), moved))
+    found = [*findings_at(case.where(plan_key(case, name)), check_pairs(name, moved))]
     for finding in found:
         if finding.severity == "error":
             raise CaseInputError(f"{finding.where}: {finding.what}; {finding.fix}")
