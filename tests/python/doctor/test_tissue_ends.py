@@ -6,7 +6,7 @@ from diagnosed_heads import diagnosis, image_case
 import cmfsim
 from cmfsim import Anatomy, BoneSegment, ImageData, NodeKinds, SurfaceData
 from cmfsim.meshing import TissueRegion
-from cmfsim.pipeline.building.tissue.nodes import end_findings
+from cmfsim.pipeline.building.tissue.nodes import loose_ends, near_ends
 from head_case import HeadCase
 
 
@@ -14,7 +14,7 @@ def block(lower=None, upper=None, *, loose=(), gap=5.0):
     """Tissue that fills an image, a bone in it, and what is fixed there."""
     labels = np.ones((10, 10, 10), dtype=np.uint8)
     mesh = cmfsim.mesh_from_labels(labels, (4.0, 4.0, 4.0), edge_length=8.0)
-    nodes, triangles = np.asarray(mesh.nodes), np.asarray(mesh.boundary_triangles())
+    nodes = np.asarray(mesh.nodes)
     skin = ImageData(np.ones((10, 10, 10), dtype=np.float32), (4.0, 4.0, 4.0))
     kind = np.zeros(len(nodes), dtype=np.uint8)
     ends = {"x": (0, nodes[:, 0].max()), "z": (2, nodes[:, 2].min())}
@@ -30,15 +30,10 @@ def block(lower=None, upper=None, *, loose=(), gap=5.0):
     corners = np.array([[15.0, 15, low], [25, 15, low], [15, 25, low], [15, 15, low + 3.0]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.uint32)
     chin = BoneSegment("chin", skin, SurfaceData(corners, faces))
-    return end_findings(
-        nodes,
-        triangles,
-        NodeKinds(kind, np.full(len(nodes), -1, dtype=np.int16), ("chin",)),
-        Anatomy(skin, {"skull": skin}),
-        TissueRegion((0.0, 100.0, 0.0), (0.0, 1.0, 0.0), lower=lower, upper=upper),
-        segments=[chin],
-        moved=["chin"],
-    )
+    kinds = NodeKinds(kind, np.full(len(nodes), -1, dtype=np.int16), ("chin",))
+    anatomy = Anatomy(skin, {"skull": skin})
+    region = TissueRegion((0.0, 100.0, 0.0), (0.0, 1.0, 0.0), lower=lower, upper=upper)
+    return [*near_ends(anatomy, region, [chin]), *loose_ends(mesh, kinds, anatomy)]
 
 
 def test_a_bone_that_moves_close_to_a_plane_that_fixes_is_reported():

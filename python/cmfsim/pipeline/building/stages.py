@@ -156,7 +156,3 @@ class Stages:
             for finding in self.findings
             if finding.code not in codes or where not in {None, finding.where}
         ]
-
-    def drop_repeated(self) -> None:
-        """Keeps each finding once."""
-        self.findings = [*dict.fromkeys(self.findings)]

@@ -1,6 +1,6 @@
 """The soft tissue of a case as tets, the kind of each node, and ends near moving bone."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -274,7 +274,7 @@ def nodes_of(
         if mesh.n_tets < whole or lips.regions:
             counted = beside.submit(report_of_part, mesh, report)
         stages.add(_noticed(head, bones, tissue, mesh, kinds))
-        stages.drop_repeated()
+        stages.findings = [*dict.fromkeys(stages.findings)]
         lifted = lifted_tissue(mesh.nodes, kinds, bones.segments, moved, options)
         if options.septum:
             held = septum(
@@ -337,16 +337,13 @@ def _noticed(
     head: Head, bones: PlannedBones, tissue: Tissue, mesh: TetMesh, kinds: NodeKinds
 ) -> list[Finding]:
     """Where the tissue ends next to bone that moves, and segments that hold none of it."""
-    ends = end_findings(
-        mesh.nodes,
-        mesh.boundary_triangles(),
-        kinds,
-        head.anatomy,
-        tissue.region,
-        segments=bones.segments,
-        moved=_moved(head.case, bones),
-    )
-    return [*ends, *untouched(head.case, mesh, kinds, bones)]
+    moved = _moved(head.case, bones)
+    moving = [segment for segment in bones.segments if segment.name in moved]
+    return [
+        *near_ends(head.anatomy, tissue.region, moving),
+        *loose_ends(mesh, kinds, head.anatomy),
+        *untouched(head.case, mesh, kinds, bones),
+    ]
 
 
 def made_contacts(
@@ -366,28 +363,10 @@ def made_contacts(
     return arch_sheets(head.anatomy, bones.segments, arches, options, edge_length)
 
 
-def end_findings(
-    nodes: Floats,
-    triangles: NDArray[np.uint32],
-    kinds: NodeKinds,
-    anatomy: Anatomy,
-    region: TissueRegion,
-    *,
-    segments: Sequence[BoneSegment],
-    moved: Collection[str],
-) -> list[Finding]:
-    """Findings on bones that move close to where tissue is fixed, and on tissue that ends loose.
-
-    triangles: (t, 3) uint32. Boundary of the tissue's mesh, outward.
-    anatomy: Its grid ends where the image does.
-    """
-    near = _near_ends(anatomy, region, [s for s in segments if s.name in moved])
-    return [*near, *_loose_ends(nodes, triangles, kinds, anatomy)]
-
-
-def _near_ends(
+def near_ends(
     anatomy: Anatomy, region: TissueRegion, moving: Sequence[BoneSegment]
 ) -> Iterator[Finding]:
+    """Findings on bones that move close to where tissue is fixed."""
     image_low, image_high = (float(h[2]) for h in (anatomy.skin.lowest, anatomy.skin.highest))
     for segment in moving:
         heights = segment.surface.vertices[:, 2]
@@ -420,10 +399,10 @@ def _near_ends(
             )
 
 
-def _loose_ends(
-    nodes: Floats, triangles: NDArray[np.uint32], kinds: NodeKinds, anatomy: Anatomy
-) -> Iterator[Finding]:
-    corners = nodes[triangles]
+def loose_ends(mesh: TetMesh, kinds: NodeKinds, anatomy: Anatomy) -> Iterator[Finding]:
+    """Findings on tissue that ends loose at a border of the image, where the anatomy does."""
+    triangles = mesh.boundary_triangles()
+    corners = mesh.nodes[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     twice = np.linalg.norm(normal, axis=1)
     free = (kinds.kind[triangles] == 0).all(axis=1)
