@@ -14,6 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeVar
@@ -60,12 +61,6 @@ class RefusedError(Exception):
 
 
 NOT_FOUND = RefusedError(404, "not found")
-
-
-def check_token(given: str, token: str) -> None:
-    """Refuses, by `RefusedError`, any token but that of this launch, in constant time."""
-    if not hmac.compare_digest(given.encode(), token.encode()):
-        raise NOT_FOUND
 
 
 def check_headers(headers: Mapping[str, str], address: str, *, sends: bool) -> None:
@@ -210,8 +205,9 @@ class LocalServer:
         """The answer to a request, once it is known to come from the page."""
         check_headers(request.headers, self._address, sends=False)
         token, slash, name = request.path_params["place"].partition("/")
-        check_token(token, self._token)
-        if name not in self._pages and name not in self._calls:
+        # Of this launch, compared in constant time.
+        is_ours = hmac.compare_digest(token.encode(), self._token.encode())
+        if not is_ours or (name not in self._pages and name not in self._calls):
             raise NOT_FOUND
         if slash and request.method == "GET" and name in self._pages:
             return await _in_thread(self._pages[name])
@@ -281,29 +277,18 @@ class _Line:
 
 async def _in_thread(work: Callable[[], T]) -> T:
     """What a function returns, called in a thread that does not keep the process from ending."""
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[T] = loop.create_future()
-
-    def settle(result: Any, error: BaseException | None) -> None:
-        if answer.done():
-            return
-        if error is None:
-            answer.set_result(result)
-        else:
-            answer.set_exception(error)
+    answer: Future[T] = Future()
+    # From now on it cannot be cancelled: nobody may wait for it any more when it is there.
+    answer.set_running_or_notify_cancel()
 
     def run() -> None:
-        result, failed = None, None
         try:
-            result = work()
+            answer.set_result(work())
         except Exception as error:  # noqa: BLE001 (raised again where it is waited for)
-            failed = error
-        # The loop has ended where the process is about to.
-        with contextlib.suppress(RuntimeError):
-            loop.call_soon_threadsafe(settle, result, failed)
+            answer.set_exception(error)
 
     threading.Thread(target=run, daemon=True).start()
-    return await answer
+    return await asyncio.wrap_future(answer)
 
 
 async def _limited_body(request: Any) -> bytes:
