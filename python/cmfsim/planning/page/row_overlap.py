@@ -14,6 +14,7 @@ from cmfsim._core import signed_distance_image
 from cmfsim.planning.occlusion import patient_rows
 from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.motion import carried
 from cmfsim.values.patient_model import PatientModel
 
 # Points kept of the lower crowns, how far around them the grid reaches, and its spacing, mm.
@@ -38,7 +39,7 @@ class RowOverlap:
         up = np.asarray(plan.get(self.upper, np.eye(4)), dtype=np.float64)
         low = np.asarray(plan.get(self.lower, np.eye(4)), dtype=np.float64)
         both = np.linalg.inv(up) @ low
-        places = self.points @ both[:3, :3].T + both[:3, 3]
+        places = carried(both, self.points)
         inside = ((places >= self.depth.lowest) & (places < self.depth.highest)).all(axis=1)
         if not inside.any():
             return 0.0

@@ -12,7 +12,7 @@ import numpy as np
 from cmfsim.errors import ContactError, SolverError
 from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.values.checks import Floats, Plain, as_positive, as_whole, in_files, plain
-from cmfsim.values.motion import rigid_motion
+from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.progress import PLANNING, ProgressOrBar, shown_progress
 
 # Plans that are solved to measure the error.
@@ -126,14 +126,9 @@ class ExpectedError:
 def plan_distance(planning: PlanningModel, plan: Motions) -> float:
     """How far a plan is from the reference: the most that a corner of a segment's box moves, mm."""
     whole = planning.whole(plan)
+    apart = {name: motion - planning.reference[name] for name, motion in whole.items()}
     return max(
-        float(
-            np.linalg.norm(
-                corners @ (whole[name] - planning.reference[name])[:3, :3].T
-                + (whole[name] - planning.reference[name])[:3, 3],
-                axis=1,
-            ).max()
-        )
+        float(np.linalg.norm(carried(apart[name], corners), axis=1).max())
         for name, corners in segment_boxes(planning).items()
     )
 
@@ -249,18 +244,15 @@ def solved_plans(planning: PlanningModel, plans: Sequence[Motions]) -> Iterator[
 
     def solved(plan: Motions) -> SolvedPlan:
         begun = time.perf_counter()
-        shift, failed = None, ""
         try:
-            found, converged = planning.solve_skin(plan)
+            shift, converged = planning.solve_skin(plan)
         except (ContactError, SolverError) as error:
-            failed = str(error)
-        else:
-            # What stopped above its tolerance is no answer to measure by, or to interpolate.
-            if converged:
-                shift = found
-            else:
-                failed = "contact stopped above its tolerance"
-        return SolvedPlan(shift, failed, time.perf_counter() - begun)
+            return SolvedPlan(None, str(error), time.perf_counter() - begun)
+        seconds = time.perf_counter() - begun
+        if converged:
+            return SolvedPlan(shift, "", seconds)
+        # What stopped above its tolerance is no answer to measure by, or to interpolate.
+        return SolvedPlan(None, "contact stopped above its tolerance", seconds)
 
     pool = ThreadPoolExecutor(min(MOST_AT_ONCE, os.cpu_count() or 1))
     try:
@@ -272,15 +264,8 @@ def solved_plans(planning: PlanningModel, plans: Sequence[Motions]) -> Iterator[
 
 def _trial(planning: PlanningModel, plan: dict[str, Floats], solved: SolvedPlan) -> PlanTrial:
     distance = plan_distance(planning, plan)
-    if solved.shift is None:
-        return PlanTrial(plan, distance, None, None, None, solved.failed, solved.seconds)
-    away = np.linalg.norm(planning.displacements(plan) - solved.shift, axis=1)
-    return PlanTrial(
-        plan,
-        distance,
-        float(away.mean()),
-        float(np.percentile(away, 95)),
-        float(away.max()),
-        "",
-        solved.seconds,
-    )
+    figures: tuple[float | None, float | None, float | None] = (None, None, None)
+    if solved.shift is not None:
+        away = np.linalg.norm(planning.displacements(plan) - solved.shift, axis=1)
+        figures = (float(away.mean()), float(np.percentile(away, 95)), float(away.max()))
+    return PlanTrial(plan, distance, *figures, solved.failed, solved.seconds)
