@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from cmfsim._core import rigid_fit
 from cmfsim.errors import CaseInputError, LandmarkInputError, RegistrationError
-from cmfsim.planning.face_measures.definitions import Measure, measures_of
+from cmfsim.planning.face_measures.definitions import measures_of, value_of
 from cmfsim.values.checks import Floats, as_point
 from cmfsim.values.landmark_sites import REFERENCE_PLACES, is_lower_site, profile_sites
 
@@ -100,7 +100,7 @@ def cephalometry(
     3.88
     """
     places = projected(known_sites(landmarks), None if before is None else known_sites(before))
-    return {measure.key: value_of(measure, places) for measure in CEPHALOMETRIC_MEASURES}
+    return {m.key: value_of(m, FORMULAS[m.formula][0], places) for m in CEPHALOMETRIC_MEASURES}
 
 
 def known_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
@@ -109,13 +109,6 @@ def known_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, Floats]:
         return {name: as_point(f"landmark {name}", place) for name, place in landmarks.items()}
     except CaseInputError as error:
         raise LandmarkInputError(str(error)) from error
-
-
-def value_of(measure: Measure, places: Mapping[str, Floats]) -> float | None:
-    """A measure by one of `FORMULAS` of `projected` places, mm or degrees; None without one."""
-    sites = [places[name] for name in measure.sites if name in places]
-    whole = len(sites) == len(measure.sites)
-    return FORMULAS[measure.formula][0](*sites) if whole else None
 
 
 def missing_sites(landmarks: Mapping[str, ArrayLike]) -> dict[str, str]:

@@ -94,6 +94,15 @@ def measures_of(group: str) -> tuple[Measure, ...]:
     )
 
 
+def value_of(
+    measure: Measure, formula: Callable[..., float], places: Mapping[str, Floats]
+) -> float | None:
+    """A measure by its formula of places, mm or degrees; None if one of its sites is missing."""
+    if not all(name in places for name in measure.sites):
+        return None
+    return formula(*(np.asarray(places[name], dtype=np.float64) for name in measure.sites))
+
+
 MEASURES = measures_of("face")
 
 
@@ -116,11 +125,4 @@ def measure_sites(places: Mapping[str, Floats]) -> dict[str, float | None]:
     >>> cmfsim.measure_sites(mouth)["mouth_width"]
     50.0
     """
-    found: dict[str, float | None] = {}
-    for measure in MEASURES:
-        if all(name in places for name in measure.sites):
-            sites = [np.asarray(places[name], dtype=np.float64) for name in measure.sites]
-            found[measure.key] = FORMULAS[measure.formula](*sites)
-        else:
-            found[measure.key] = None
-    return found
+    return {m.key: value_of(m, FORMULAS[m.formula], places) for m in MEASURES}
