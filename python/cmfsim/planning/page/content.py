@@ -28,7 +28,6 @@ from cmfsim.planning.replanning import (
     ExpectedError,
     Motions,
     PlanBand,
-    PlanCorrection,
     PlanningModel,
     segment_boxes,
 )
@@ -176,8 +175,9 @@ def _operator(planning: PlanningModel, reference: Prediction) -> Arrays:
         moves |= np.abs(correction.shapes).max(axis=(1, 2)) > STILL
     active = np.flatnonzero(moves)
     rows = columns.matrix[active]
-    weights = np.zeros((0, 0))
+    plans = weights = np.zeros((0, 0))
     if correction is not None:
+        plans = correction.plans.reshape(len(correction.plans), -1)
         spare = -correction.shapes.shape[2] % PRODUCT_STEP
         rows = np.concatenate(
             [rows, np.pad(correction.shapes[active], ((0, 0), (0, 0), (0, spare)))], axis=2
@@ -186,19 +186,12 @@ def _operator(planning: PlanningModel, reference: Prediction) -> Arrays:
     with np.errstate(over="ignore"):
         half = rows.astype(np.float16)
     return {
-        "correction_plans": singles(_solved_plans(correction)),
+        "correction_plans": singles(plans),
         "correction_weights": singles(weights),
         "active": indices(active),
         "columns": half,
         "reference_shift": singles(reference.skin_displacements[active]),
     }
-
-
-def _solved_plans(correction: PlanCorrection | None) -> Floats:
-    """The numbers of the plans that a correction interpolates, (n, 6 s) mm."""
-    if correction is None:
-        return np.zeros((0, 0))
-    return correction.plans.reshape(len(correction.plans), -1)
 
 
 def _correction(planning: PlanningModel) -> dict[str, Any] | None:
@@ -257,15 +250,19 @@ def _bones(
     for number, segment in enumerate(segments):
         most = max(LEAST_BONE, BONE_TRIANGLES * counts[number] // sum(counts))
         _fewer(arrays, f"bone_{number}", segment.name, segment.surface, most, findings=findings)
-        moves = segment.name in planning.segments
         found.append(
             {
                 "name": segment.name,
-                "segment": planning.segments.index(segment.name) if moves else None,
+                "segment": _number(planning, segment.name),
                 "colour": colours[segment.name],
             }
         )
     return found
+
+
+def _number(planning: PlanningModel, segment: str) -> int | None:
+    """The number of a segment, which pages know it by; None if the plan does not move it."""
+    return planning.segments.index(segment) if segment in planning.segments else None
 
 
 def _measured(planning: PlanningModel, sites: FaceSites) -> dict[str, Any]:
@@ -283,21 +280,12 @@ def _measured(planning: PlanningModel, sites: FaceSites) -> dict[str, Any]:
     return {
         "skin_sites": [{"name": name} for name in sites.skin],
         "bone_sites": [
-            {
-                "name": name,
-                "place": site.place.tolist(),
-                "segment": planning.segments.index(site.segment)
-                if site.segment in planning.segments
-                else None,
-            }
+            {"name": name, "place": site.place.tolist(), "segment": _number(planning, site.segment)}
             for name, site in sites.bone.items()
         ],
         "measures": [
             {
-                "key": measure.key,
-                "label": measure.label,
-                "unit": measure.unit,
-                "formula": measure.formula,
+                **{name: getattr(measure, name) for name in ("key", "label", "unit", "formula")},
                 "sites": list(measure.sites),
                 "about": measure.about,
                 "absent": sites.why_absent(measure.sites),
@@ -369,10 +357,9 @@ def _target_bite(planning: PlanningModel) -> dict[str, Any] | None:
     target = planning.patient.summary.get("target_bite")
     if target is None:
         return None
-    number = {name: index for index, name in enumerate(planning.segments)}
     return {
-        "upper": number.get(target["upper"]),
-        "lower": number.get(target["lower"]),
+        "upper": _number(planning, target["upper"]),
+        "lower": _number(planning, target["lower"]),
         "motion": np.ravel(target["motion"]).tolist(),
         "places": target["places"],
     }
@@ -385,11 +372,10 @@ def _teeth(planning: PlanningModel, arrays: Arrays) -> dict[str, Any]:
         return {"occlusion": None, "occlusion_absent": str(error)}
     arrays["occlusion_points"] = singles(rows.points)
     arrays["occlusion_depth"] = singles(rows.depth.values)
-    number = {name: index for index, name in enumerate(planning.segments)}
     return {
         "occlusion": {
-            "upper": number.get(rows.upper),
-            "lower": number.get(rows.lower),
+            "upper": _number(planning, rows.upper),
+            "lower": _number(planning, rows.lower),
             "origin": rows.depth.lowest.tolist(),
             "spacing": float(rows.depth.spacing[0]),
             "shape": list(rows.depth.values.shape),

@@ -1,6 +1,5 @@
 """Points at which the motion of a segment is measured: incisors, canines, molars, chin."""
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -8,10 +7,8 @@ from types import MappingProxyType
 import numpy as np
 
 from cmfsim.values.checks import Floats
-from cmfsim.values.clinical_motion import clinical_motion
+from cmfsim.values.clinical_motion import NUMBERED, clinical_motion
 
-# A piece of a bone that was separated has the bone's name with a number.
-NUMBERED = re.compile(r"_\d+$")
 # A landmark that several segments could have belongs to one within this of its surface, mm.
 ON_SEGMENT = 6.0
 # Canines stand at this share of half the width of the arch of second molars: intercanine to
