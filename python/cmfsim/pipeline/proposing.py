@@ -187,11 +187,11 @@ def proposed_head(
     second = _separated_by(first, case, stage, heads, placed)
     if second is None:
         return replace(first, findings=(_not_separated_again(),))
-    if found.is_rough:
-        # Teeth are known now, and separate the jaws less roughly.
+    if not {"supradentale", "infradentale"} <= found.skull.keys():
+        # An average head's teeth separated the jaws: these teeth are known now, and do it better.
         third = _separated_by(second, case, stage, heads, placed)
         first, second = (first, second) if third is None else (second, third)
-    apart = _apart(first.landmarks.skull, second.landmarks.skull)
+    apart = second.landmarks.apart(first.landmarks.points.get("skull", {}))
     moved = replace(second.landmarks, skull=_with_moves(second.landmarks.skull, apart))
     return replace(second, landmarks=moved, findings=(_separated_again(apart),))
 
@@ -254,16 +254,6 @@ def _is_worse(second: ProposedLandmarks, first: ProposedLandmarks) -> bool:
     if bool(second.impossible_jaw) != bool(first.impossible_jaw):
         return bool(second.impossible_jaw)
     return bool(second.doubtful_jaw) and not first.doubtful_jaw
-
-
-def _apart(
-    first: Mapping[str, ProposedSite], second: Mapping[str, ProposedSite]
-) -> dict[str, float]:
-    return {
-        name: float(np.linalg.norm(site.point - first[name].point))
-        for name, site in second.items()
-        if name in first
-    }
 
 
 def _with_moves(
@@ -374,8 +364,9 @@ def filled_landmarks(head: ProposedHead, given: GivenSites) -> ProposedLandmarks
             site = _given_site(key, *given[key], surfaces)
             site = _compared(site, key, before, points, stds)
         else:
-            site = _following(head.landmarks, key, mean, float(error), float(share))
-            site = site if shift > STILL or site is None else _as_found(head.landmarks, key, site)
+            found = (head.landmarks.skull if kind == "skull" else head.landmarks.skin).get(name)
+            site = _following(found, mean, float(error), float(share))
+            site = site if shift > STILL else found or site
             site = site and _on_surface(site, surfaces.get(site_part(*key)))
         if site is not None:
             sites[kind][name] = site
@@ -445,11 +436,9 @@ def _compared(
 
 
 def _following(
-    found: ProposedLandmarks, key: SiteKey, mean: Floats, error: float, share: float
+    site: ProposedSite | None, mean: Floats, error: float, share: float
 ) -> ProposedSite | None:
     """A site that nobody placed, moved with the others; None if it is missing and stays so."""
-    kind, name = key
-    site = (found.skull if kind == "skull" else found.skin).get(name)
     if site is None:
         few = "the sites that were placed are too few or too far away"
         doubt = "" if error <= GOOD_ERROR else few
@@ -459,12 +448,6 @@ def _following(
     if share <= CLEARED_SHARE and error <= GOOD_ERROR:
         return ProposedSite(mean, error, "", "moved")
     return ProposedSite(mean, max(error, share * site.error), site.doubt, "moved")
-
-
-def _as_found(found: ProposedLandmarks, key: SiteKey, site: ProposedSite) -> ProposedSite:
-    """The site as it was proposed, if it was."""
-    kind, name = key
-    return (found.skull if kind == "skull" else found.skin).get(name, site)
 
 
 def _on_surface(site: ProposedSite, surfaces: list[Surface] | None) -> ProposedSite | None:

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
+import numpy as np
+
 from cmfsim.values.checks import Floats, keep
 from cmfsim.values.finding import Finding
 
@@ -108,11 +110,6 @@ class ProposedLandmarks:
     doubtful_jaw: str = ""
     separation: Mapping[str, Floats] = field(default_factory=dict)
 
-    @property
-    def is_rough(self) -> bool:
-        """Whether jaws can be separated again only by where an average head has its teeth."""
-        return not {"supradentale", "infradentale"} <= self.skull.keys()
-
     def __post_init__(self) -> None:
         for name in ("skull", "skin", "missing_skull", "missing_skin", "separation"):
             keep(self, **{name: getattr(self, name)})
@@ -125,6 +122,14 @@ class ProposedLandmarks:
             kind: MappingProxyType({name: site.point for name, site in sites.items()})
             for kind, sites in kinds
             if sites
+        }
+
+    def apart(self, others: Mapping[str, Floats]) -> dict[str, float]:
+        """How far sites of the skull lie from other places of theirs, mm."""
+        return {
+            name: float(np.linalg.norm(site.point - others[name]))
+            for name, site in self.skull.items()
+            if name in others
         }
 
     @property

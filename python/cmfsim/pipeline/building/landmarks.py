@@ -264,21 +264,12 @@ def needs_lower_jaw(case: Case) -> bool:
 
 def _contradiction(case: Case, found: ProposedLandmarks, skull: Mapping[str, Floats]) -> str:
     """Why found sites are of no use beside placed ones; empty if they are."""
-    apart = _apart(found, skull)
+    apart = found.apart(skull)
     _check_jaw_of_placed(case, found, skull, apart)
     if all(size <= DISAGREE for size in apart.values()):
         return ""
     listed = ", ".join(f"{name} by {size:.0f} mm" for name, size in apart.items())
     return f"those found differ from those placed by hand: {listed}"
-
-
-def _apart(found: ProposedLandmarks, skull: Mapping[str, Floats]) -> dict[str, float]:
-    """How far found sites lie from placed ones, mm."""
-    return {
-        name: float(np.linalg.norm(site.point - skull[name]))
-        for name, site in found.skull.items()
-        if name in skull
-    }
 
 
 def _check_jaw_of_placed(
@@ -303,18 +294,11 @@ def _check_jaw_of_placed(
 
 
 def _not_found(reason: str, count: int) -> Finding:
+    code, what = "landmarks-not-found", "the case names no landmarks, and none"
     if count:
-        return Finding(
-            "landmarks-not-completed",
-            f"the case names {count} landmarks of the skull, and no others were found "
-            f"automatically: {reason}",
-            where="landmarks",
-        )
-    return Finding(
-        "landmarks-not-found",
-        f"the case names no landmarks, and none were found automatically: {reason}",
-        where="landmarks",
-    )
+        code = "landmarks-not-completed"
+        what = f"the case names {count} landmarks of the skull, and no others"
+    return Finding(code, f"{what} were found automatically: {reason}", where="landmarks")
 
 
 def landmark_summary(found: ProposedLandmarks) -> dict[str, Any]:
