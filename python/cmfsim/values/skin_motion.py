@@ -62,7 +62,7 @@ def skin_end(skin: SurfaceData, held: ArrayLike) -> SkinEnd:
         return SkinEnd(np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64))
     nodes, corners = used_nodes(rim)
     closest, _, _ = Surface(skin.vertices[nodes], corners).closest(skin.vertices)
-    reach = max(NEAR_END, NEAR_END_EDGES * _mean_edge(skin.vertices[triangles]))
+    reach = max(NEAR_END, NEAR_END_EDGES * mean_edge(skin.vertices[triangles]))
     near = np.linalg.norm(closest - skin.vertices, axis=1) < reach
     pairs = np.concatenate([triangles[:, [k, (k + d) % 3]] for k in range(3) for d in (1, 2)])
     pairs = np.unique(pairs[near[pairs[:, 0]]], axis=0)
@@ -92,7 +92,7 @@ def attachment(skin: Surface, points: ArrayLike) -> Attachment:
     """Where points (k, 3), mm, are attached to a mesh's skin."""
     places = as_rows("points", points, 3)
     closest, _, triangles = skin.closest(places)
-    edge = _mean_edge(skin.vertices[skin.triangles])
+    edge = mean_edge(skin.vertices[skin.triangles])
     offset = places - closest
     away = np.linalg.norm(offset, axis=1)
     inwards = np.minimum(1.0, edge / np.maximum(away, edge))
@@ -115,6 +115,6 @@ def carried_points(before: SurfaceData, displacements: Floats, points: ArrayLike
     return carried
 
 
-def _mean_edge(corners: Floats) -> float:
+def mean_edge(corners: Floats) -> float:
     """The mean edge of triangles given by their corners, (t, 3, 3), mm."""
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())

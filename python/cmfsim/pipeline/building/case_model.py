@@ -48,7 +48,6 @@ from cmfsim.pipeline.building.skin import check_skin, find_seam, lip_summary, on
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, Stages, build_options
 from cmfsim.pipeline.building.surgery.motions import PlannedBones, planned_bones
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative
-from cmfsim.pipeline.building.tissue.contacts import mean_edge
 from cmfsim.pipeline.building.tissue.nodes import made_contacts, nodes_of, region_of, tissue_mesh
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.values.checks import Floats
@@ -389,8 +388,7 @@ def _tissue(
     contacts = None
     if case.mesh.file is None:
         # While the tissue is meshed.
-        edge = case.mesh.edge_length
-        contacts = made_contacts(head, stages, bones, arches, options, edge_length=edge)
+        contacts = made_contacts(head, stages, bones, arches, options)
     stages.begin("filling the tissue with tets")
     found = meshed.result()
     stages.add(found.findings)
@@ -406,8 +404,7 @@ def _tissue(
     stages.add(noticed)
     _log.info("mesh: %d nodes, %d tets", mesh.n_nodes, mesh.n_tets)
     if contacts is None:
-        edge = mean_edge(mesh)
-        contacts = made_contacts(head, stages, bones, arches, options, edge_length=edge)
+        contacts = made_contacts(head, stages, bones, arches, options, mesh=mesh)
     return Tissue(found.region, found.level, mesh, report, arches, seam, contacts)
 
 

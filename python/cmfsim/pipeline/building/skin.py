@@ -20,7 +20,7 @@ from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.case_checks import CaseLipContact, Head
 from cmfsim.pipeline.building.inputs import stated_frame
-from cmfsim.pipeline.building.tissue.contacts import CaseContacts
+from cmfsim.pipeline.building.tissue.contacts import CaseContacts, without_tets
 from cmfsim.surfaces.depth import barycentric, distances
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.surfaces.topology import Integers, connected_labels, edges_of, tet_bodies
@@ -29,6 +29,7 @@ from cmfsim.values.case_parts import UNITS
 from cmfsim.values.checks import Floats, Indices
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.motion import carried
 from cmfsim.values.patient_model import LiftedTissue
 from cmfsim.values.scene import NODE_KINDS, NodeKinds
 from cmfsim.values.surface_data import SurfaceData, area_vectors, triangle_areas, used_nodes
@@ -61,8 +62,6 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> Held:
             "bone; check that bones and skin are in one frame, and check the posterior plane"
         )
     dropped = loose[body]
-    used, left = used_nodes(tets[~dropped])
-    kept = TetMesh(mesh.nodes[used], left)
     volume = float(mesh.volumes[dropped].sum())
     place = mesh.nodes[tets[dropped]].reshape(-1, 3).mean(axis=0)
     speck = volume < SPECKS
@@ -76,7 +75,7 @@ def held_part(mesh: TetMesh, kinds: NodeKinds) -> Held:
         if speck
         else "check skin and bone nearby; a larger bone threshold or closing may have cut them off",
     )
-    return kept, kinds.of_nodes(used), body[~dropped], (finding,)
+    return *without_tets(mesh, kinds, dropped), body[~dropped], (finding,)
 
 
 def _are_loose(body: Integers, tets: Indices, holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -307,7 +306,7 @@ def with_photo(head: Head) -> tuple[SurfaceData, NDArray[np.uint8], Finding]:
         points = {name: scale * np.asarray(point) for name, point in found.items()}
         ours = head.landmarks.get("skin", {})
         matrix = _registered(scale * photo.vertices, points, ours, skin, where)
-    vertices = scale * photo.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = carried(matrix, scale * photo.vertices)
     away = float(np.median(distances(vertices, skin.searched)))
     if away > MOST_AWAY:
         raise CaseInputError(
@@ -350,7 +349,7 @@ def _registered(
     there = np.array([points[name] for name in names])
     here = np.array([ours[name] for name in names])
     start = rigid_fit(there, here).matrix
-    off = np.linalg.norm(there @ start[:3, :3].T + start[:3, 3] - here, axis=1)
+    off = np.linalg.norm(carried(start, there) - here, axis=1)
     if off.max() > MOST_OFF:
         raise CaseInputError(
             f"{where}: landmark {names[int(off.argmax())]} of the photo stays {off.max():.0f} mm "

@@ -20,6 +20,7 @@ from cmfsim.values.case_parts import CasePostoperative
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.motion import carried
 from cmfsim.values.surface_data import SurfaceData
 
 _log = logging.getLogger(__name__)
@@ -129,7 +130,7 @@ def _trimmed_fit(moving: Floats, fixed: Floats) -> Floats:
     for _ in range(MOST_STEPS):
         fit = rigid_fit(moving[kept], fixed[kept])
         matrix = fit.matrix
-        left = np.linalg.norm(moving @ matrix[:3, :3].T + matrix[:3, 3] - fixed, axis=1)
+        left = np.linalg.norm(carried(matrix, moving) - fixed, axis=1)
         nearest = left <= np.quantile(left, 1.0 - TRIM)
         if np.array_equal(nearest, kept):
             break
@@ -190,5 +191,4 @@ def _registered(case: Case, after: ImageData, skull: Mapping[str, Floats]) -> Fl
 
 
 def _carried(surface: SurfaceData, matrix: Floats) -> SurfaceData:
-    vertices = surface.vertices @ matrix[:3, :3].T + matrix[:3, 3]
-    return replace(surface, vertices=vertices)
+    return replace(surface, vertices=carried(matrix, surface.vertices))

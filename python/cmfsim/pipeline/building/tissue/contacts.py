@@ -16,6 +16,7 @@ from cmfsim.values.anatomy import Anatomy, BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
+from cmfsim.values.motion import carried
 from cmfsim.values.scene import NodeKinds
 from cmfsim.values.surface_data import MovedSurface, SurfaceData, used_nodes
 
@@ -53,7 +54,7 @@ def without_clefts(
         f"{width:g} mm",
         where=f"segments {', '.join(sorted(moved))}",
     )
-    return *_without(mesh, kinds, inside), (finding,)
+    return *without_tets(mesh, kinds, inside), (finding,)
 
 
 def without_crushed(
@@ -80,12 +81,13 @@ def without_crushed(
         "other, and were removed",
         where=f"between ({low}) and ({high}) mm",
     )
-    return *_without(mesh, kinds, crushed), (finding,)
+    return *without_tets(mesh, kinds, crushed), (finding,)
 
 
-def _without(
+def without_tets(
     mesh: TetMesh, kinds: NodeKinds, removed: NDArray[np.bool_]
 ) -> tuple[TetMesh, NodeKinds]:
+    """A mesh without some tets (m,), and the kinds of the nodes that are left."""
     used, tets = used_nodes(mesh.tets[~removed])
     return TetMesh(mesh.nodes[used], tets), kinds.of_nodes(used)
 
@@ -151,7 +153,7 @@ def _blended(
             field = SurfaceMotion(motion.surface.searched, motion.moved_vertices)
             total += own[:, None] * field.displacement(nodes)
         else:
-            total += own[:, None] * (nodes @ motion[:3, :3].T + motion[:3, 3] - nodes)
+            total += own[:, None] * (carried(motion, nodes) - nodes)
     blended: Floats = total / weights.sum(axis=0)[:, None]
     return blended
 
@@ -360,9 +362,3 @@ def _sharp(jaw: str, name: str, sheet: ContactSheet, edge_length: float) -> Find
         why="sliding may need many iterations there, or not converge",
         fix="check the bone at this arch, or use a smaller edge_length in [mesh]",
     )
-
-
-def mean_edge(mesh: TetMesh) -> float:
-    """The mean length of the edges on the boundary of a mesh, mm."""
-    corners = mesh.nodes[mesh.boundary_triangles()]
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())

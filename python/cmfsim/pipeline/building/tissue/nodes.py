@@ -45,7 +45,6 @@ from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import (
     CaseContacts,
     arch_sheets,
-    mean_edge,
     without_clefts,
     without_crushed,
 )
@@ -58,6 +57,7 @@ from cmfsim.values.finding import Finding
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.mesh_report import MeshReport
 from cmfsim.values.scene import NodeKinds
+from cmfsim.values.skin_motion import mean_edge
 from cmfsim.values.surface_data import MovedSurface
 
 Counts = NDArray[np.uint8]
@@ -321,9 +321,8 @@ def _walls(
     if options.contact_surface == "sheet" and options.sliding:
         return tissue.contacts
     sheets = replace(options, contact_surface="sheet", sliding=True)
-    case = head.case
-    edge = case.mesh.edge_length if case.mesh.file is None else mean_edge(tissue.mesh)
-    walls = made_contacts(head, stages, bones, tissue.arches, sheets, edge_length=edge)
+    mesh = None if head.case.mesh.file is None else tissue.mesh
+    walls = made_contacts(head, stages, bones, tissue.arches, sheets, mesh=mesh)
     stages.add(walls.findings)
     return walls
 
@@ -353,14 +352,20 @@ def made_contacts(
     arches: DentalArches | None,
     options: KindOptions,
     *,
-    edge_length: float,
+    mesh: TetMesh | None = None,
 ) -> CaseContacts:
-    """The surfaces along the dental arches that tissue slides on: none without arches."""
+    """The surfaces along the dental arches that tissue slides on: none without arches.
+
+    mesh: That of the case's file, which has edges of its own.
+    """
     if arches is None:
         return CaseContacts()
     if options.contact_surface == "sheet":
         stages.begin("making the contact sheets")
-    return arch_sheets(head.anatomy, bones.segments, arches, options, edge_length)
+    edge = head.case.mesh.edge_length
+    if mesh is not None:
+        edge = mean_edge(mesh.nodes[mesh.boundary_triangles()])
+    return arch_sheets(head.anatomy, bones.segments, arches, options, edge)
 
 
 def near_ends(
