@@ -1,7 +1,5 @@
 """One case by several models, compared with the face after the operation, which is checked."""
 
-import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -29,6 +27,7 @@ from cmfsim.pipeline.building.stages import BuildKeywords, build_options
 from cmfsim.pipeline.building.surgery.postoperative import Postoperative, read_postoperative
 from cmfsim.pipeline.predicting import named_models, predictions_of
 from cmfsim.surfaces.depth import tissue_depth
+from cmfsim.values.calibration import settings_digest
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding, grouped
 from cmfsim.values.prediction import MODELS, Prediction
@@ -158,7 +157,7 @@ class CaseEvaluation:
             for i, one in enumerate(names)
             for other in names[i + 1 :]
         }
-        first = self.predictions[0]
+        first, found = self.predictions[0], self.findings
         timings = {
             name: sum(p.summary["timings"].values())
             for name, p in zip(names, self.predictions, strict=True)
@@ -175,8 +174,13 @@ class CaseEvaluation:
             "wilcoxon": tests,
             "notes": [WILCOXON_NOTE] if tests else [],
             "seconds": timings,
-            "findings": [asdict(finding) for finding in self.findings],
-            "warnings": self._warnings(),
+            "findings": [asdict(finding) for finding in found],
+            # Of everything that led to the figures, one line for each kind.
+            "warnings": [
+                f"{g.severity}: {g.line}"
+                for g in grouped([*(f for p in self.predictions for f in p.findings), *found])
+                if g.severity != "note"
+            ],
         }
 
     @property
@@ -202,12 +206,6 @@ class CaseEvaluation:
             }
             found["thickness"] = {**self.thickness.as_dict(), "mean_mm": means}
         return found
-
-    def _warnings(self) -> list[str]:
-        """Errors and warnings of everything that led to the figures, one line for each kind."""
-        found = [finding for prediction in self.predictions for finding in prediction.findings]
-        groups = grouped([*found, *self.findings])
-        return [f"{g.severity}: {g.line}" for g in groups if g.severity != "note"]
 
     def _of(self, name: str) -> dict[str, Any]:
         comparison = self.comparison
@@ -370,5 +368,4 @@ def _not_shown(reason: str) -> Finding:
 
 def evaluation_key(case: Case, models: Sequence[str]) -> str:
     """The SHA-256 of what an evaluation depends on: the case, as `case_key`, and the models."""
-    content = {"case": case_key(case), "models": sorted(models)}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return settings_digest({"case": case_key(case), "models": sorted(models)})

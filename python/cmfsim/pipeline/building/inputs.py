@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -19,6 +18,7 @@ from cmfsim.io import Case, read_bone_pair, read_landmark_file, read_surface_fil
 from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.images.dicom_series import dicom_files
 from cmfsim.io.images.image_files import read_image_file
+from cmfsim.io.landmarks import LandmarkFile
 from cmfsim.io.meshes.photos import photo_files
 from cmfsim.io.results.predictions import PREDICTION_FILE, check_own
 from cmfsim.io.results.result_files import is_model_file
@@ -27,6 +27,7 @@ from cmfsim.meshing import anatomy_from_surfaces, signed_level
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.anatomy import Anatomy
+from cmfsim.values.calibration import settings_digest
 from cmfsim.values.case_parts import CaseImage, CaseMesh, CaseMotion
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
@@ -54,27 +55,27 @@ CHUNK = 1 << 20
 
 def read_case_landmarks(case: Case) -> tuple[dict[str, Mapping[str, Floats]], tuple[Finding, ...]]:
     """The landmarks of a case, "skull" and "skin", with what was noticed on reading them."""
-    landmarks: dict[str, Mapping[str, Floats]] = {}
-    findings: list[Finding] = []
-    for name in ("skull", "skin"):
-        path = getattr(case.landmarks, name)
-        if path is not None:
-            found = read_landmark_file(path, frame=case.landmarks.frame, kind=name)
-            landmarks[name] = found.points
-            findings.extend(found.findings)
-    return landmarks, tuple(findings)
+    files = _landmark_files(case)
+    findings = tuple(finding for file in files.values() for finding in file.findings)
+    return {kind: file.points for kind, file in files.items()}, findings
+
+
+def _landmark_files(case: Case) -> dict[str, LandmarkFile]:
+    given = case.landmarks
+    return {
+        kind: read_landmark_file(path, frame=given.frame, kind=kind)
+        for kind, path in (("skull", given.skull), ("skin", given.skin))
+        if path is not None
+    }
 
 
 def read_placed_sites(case: Case) -> dict[tuple[str, str], tuple[Floats, SiteState]]:
     """The landmarks of a case by kind and label, and who placed each, as the files describe it."""
-    found = {}
-    for kind in ("skull", "skin"):
-        path = getattr(case.landmarks, kind)
-        if path is not None:
-            read = read_landmark_file(path, frame=case.landmarks.frame, kind=kind)
-            for name, point in read.points.items():
-                found[kind, name] = (point, site_state(read.descriptions.get(name, "")))
-    return found
+    return {
+        (kind, name): (point, site_state(read.descriptions.get(name, "")))
+        for kind, read in _landmark_files(case).items()
+        for name, point in read.points.items()
+    }
 
 
 def read_anatomy(
@@ -254,7 +255,7 @@ def case_key(case: Case, hashes: Mapping[str, str] | None = None) -> str:
         },
         "version": __version__,
     }
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return settings_digest(content)
 
 
 def plan_key(case: Case) -> str:
@@ -269,7 +270,7 @@ def plan_key(case: Case) -> str:
     parts = ("image", "surfaces", "landmarks", "osteotomies")
     content = {name: _plain(getattr(about, name), folder) for name in parts}
     content["inputs"] = _hashes((p for p in _files(about) if p != case.file), folder)
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return settings_digest(content)
 
 
 def _plain(value: Any, folder: Path) -> Any:
