@@ -273,9 +273,6 @@ def page_state(path: str | os.PathLike[str]) -> str | None:
     return None if found is None else found[1].decode()
 
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
 # The jaw that an intermediate splint holds where it is planned, while the other is not moved yet.
 FIRST: Mapping[str, str] = {"maxilla": "upper", "mandible": "lower"}
 

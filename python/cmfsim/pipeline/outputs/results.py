@@ -215,12 +215,6 @@ class _Drawing:
         return self._begun[model, name]
 
 
-def _seal(fresh: Path, compared: Mapping[str, Any]) -> None:
-    """Writes the summary of a comparison, with the hashes of its files."""
-    sealed = [n for n in compared["files"] if n not in {EVALUATION_FILE, REPORT_FILE}]
-    write_summary(fresh / EVALUATION_FILE, compared, hashes_of(fresh, sealed))
-
-
 def write_results(
     output: Path,
     predictions: Predictions,
@@ -273,8 +267,9 @@ def write_results(
         clock.write(fresh)
         own = [written.report] if written.report is not None else []
         if evaluation is not None and compared is not None:
+            sealed = hashes_of(fresh, compared["files"])
             written.files += own
-            _seal(fresh, {**compared, "files": written.files})
+            write_summary(fresh / EVALUATION_FILE, {**compared, "files": written.files}, sealed)
         of_models = [f"{w.place}/{n}".lstrip("/") for w in written.predictions for n in w.files]
         return list(dict.fromkeys([*of_models, *written.files, *own]))
 
