@@ -5,6 +5,7 @@ import json
 import re
 import unicodedata
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from importlib.resources import files
 
@@ -64,7 +65,7 @@ def name_role(name: str) -> NameRole:
 def _part(words: set[str]) -> tuple[str, str]:
     """The part that words name, and the word that does; the more special comes first."""
 
-    def said(known: frozenset[str]) -> str:
+    def said(known: AbstractSet[str]) -> str:
         return min(words & known, default="")
 
     if word := said(KNOWN["no_bone"]):
@@ -81,30 +82,24 @@ def _part(words: set[str]) -> tuple[str, str]:
         if left != right:
             return ("ramus_left" if left else "ramus_right"), word
         return "", word
-    if words & KNOWN["mandible"] and (word := said(KNOWN["distal"] | KNOWN["body"])):
-        return "mandible_body", word
-    if word := said(KNOWN["cranium"]):
-        return "cranium", word
-    if word := said(KNOWN["midface"]):
-        return "midface", word
-    if words & KNOWN["lower"] and (word := said(KNOWN["either_jaw"])):
-        return "mandible", word
-    for part, side in (("maxilla", "upper"), ("mandible", "lower")):
-        if word := said(KNOWN[part] - {"jaw"}):
-            return part, word
-        if words & KNOWN[side] and (word := said(KNOWN["jaw"])):
-            return part, word
-    if "jaw" in words:
-        return "mandible", "jaw"
-    if word := said(KNOWN["distal"]):
-        return "mandible_body", word
-    if word := said(KNOWN["skin"]):
-        return "skin", word
-    if "head" in words:
-        return "skin", "head"
-    if word := said(KNOWN["bone"]):
-        return "bone", word
-    return "", ""
+    # A part, the words that say it, and those of which one has to stand beside them.
+    rules = (
+        ("mandible_body", KNOWN["distal"] | KNOWN["body"], KNOWN["mandible"]),
+        ("cranium", KNOWN["cranium"], words),
+        ("midface", KNOWN["midface"], words),
+        ("mandible", KNOWN["either_jaw"], KNOWN["lower"]),
+        ("maxilla", KNOWN["maxilla"] - {"jaw"}, words),
+        ("maxilla", KNOWN["jaw"], KNOWN["upper"]),
+        ("mandible", KNOWN["mandible"] - {"jaw"}, words),
+        ("mandible", KNOWN["jaw"], KNOWN["lower"]),
+        ("mandible", {"jaw"}, words),
+        ("mandible_body", KNOWN["distal"], words),
+        ("skin", KNOWN["skin"], words),
+        ("skin", {"head"}, words),
+        ("bone", KNOWN["bone"], words),
+    )
+    found = ((part, said(own)) for part, own, beside in rules if words & beside)
+    return next((entry for entry in found if entry[1]), ("", ""))
 
 
 def _row(words: set[str]) -> str:
