@@ -27,6 +27,7 @@ from cmfsim.drafting.written import (
 )
 from cmfsim.io.cases.case_tables import matrix_rows
 from cmfsim.values.case_parts import PROCEDURES
+from cmfsim.values.motion import carried
 from cmfsim.values.proposed_landmarks import ProposedSite
 
 # Middles of the skins before and after that are farther apart are those of two scans, mm.
@@ -434,10 +435,10 @@ def _distance_after(draft: Draft, frame: str) -> float:
     if anatomy.skin is None or anatomy.after_skin is None or anatomy.asks("units") is not None:
         return float("inf")
     here, there = place_before(draft).matrix(anatomy.skin), place_after(draft, frame).matrix
-    before = anatomy.placed(anatomy.skin) @ here[:3, :3].T + here[:3, 3]
+    before = carried(here, anatomy.placed(anatomy.skin))
     matrix = there(anatomy.after_skin)
     placed = replace(anatomy, frame=frame).placed(anatomy.after_skin)
-    after = placed @ matrix[:3, :3].T + matrix[:3, 3]
+    after = carried(matrix, placed)
     middles = [0.5 * (points.min(axis=0) + points.max(axis=0)) for points in (before, after)]
     return float(np.linalg.norm(middles[1] - middles[0]))
 

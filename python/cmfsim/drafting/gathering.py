@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from cmfsim.drafting import finds
 from cmfsim.drafting.roles import name_role
-from cmfsim.drafting.scene_finds import scene_finds, segment_finds
+from cmfsim.drafting.scene_finds import add_segments, scene_finds
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.io.images.segmentations import NAMES_FILE
 from cmfsim.io.slicer.slicer_scenes import read_slicer_scene, unpack_bundle
@@ -94,9 +94,7 @@ def _gather_images(
                 labels.append((path, label))
             else:
                 found.images.append(image)
-    surfaces, unused = segment_finds(labels)
-    found.surfaces += surfaces
-    found.others += unused
+    add_segments(found, labels)
     folders = {path.parent for path, _ in labels}
     found.names = [
         path for path in found.seen if path.name == NAMES_FILE and path.parent in folders
@@ -143,9 +141,7 @@ def _gather_files(
     for path in paths.labels:
         label = found.shown(path)
         progress(f"reading {label}")
-        surfaces, unused = segment_finds([(path, label)])
-        found.surfaces += surfaces
-        found.others += unused
+        add_segments(found, [(path, label)])
     for path in paths.transforms:
         label = found.shown(path)
         role = name_role(path.name[: -len(path.suffix)])

@@ -93,6 +93,10 @@ def scene_motions(
     in_image: Whether the case is in the coordinates of its image, not in those of the world.
     """
     back = np.linalg.inv(reference)
+
+    def relative(find: SurfaceFind) -> Floats:
+        return back @ find.to_world if in_image else find.to_world @ back
+
     # Surfaces about which there are questions, by the bone's name.
     asked: dict[str, list[SurfaceFind]] = {}
     for question in plan.anatomy.questions:
@@ -106,7 +110,7 @@ def scene_motions(
     # A piece that has a segment's name moves by it, wherever its surface comes from.
     known = {n: finds[0] for n, finds in asked.items() if n in MOVING and len(finds) == 1}
     for name, find in {**moved, **known}.items():
-        matrix = back @ find.to_world if in_image else find.to_world @ back
+        matrix = relative(find)
         if np.abs(matrix - np.eye(4)).max() <= NOTHING:
             continue
         words = plan.words(name, matrix)
@@ -123,21 +127,14 @@ def scene_motions(
         plan.taken.append(Taken(label, f"motion of {name}", why, "mm", "LPS"))
     for name, finds in asked.items():
         if name not in known:
-            motions = [back @ f.to_world if in_image else f.to_world @ back for f in finds]
-            _ask_whose(plan, name, finds, motions)
+            _ask_whose(plan, name, [(find, relative(find)) for find in finds])
     for motion in loose:
         _add_loose(plan, motion)
 
 
-def _ask_whose(
-    plan: Plan, name: str, finds: Sequence[SurfaceFind], motions: Sequence[Floats]
-) -> None:
+def _ask_whose(plan: Plan, name: str, finds: Sequence[tuple[SurfaceFind, Floats]]) -> None:
     """Asks about the motion of a bone of which it is not clear which surface, or bone, it is."""
-    moved = [
-        (find, matrix)
-        for find, matrix in zip(finds, motions, strict=True)
-        if np.abs(matrix - np.eye(4)).max() > NOTHING
-    ]
+    moved = [found for found in finds if np.abs(found[1] - np.eye(4)).max() > NOTHING]
     if not moved:
         return
     choices = [f"{find.label} {plan.words(name, matrix)}" for find, matrix in moved]
@@ -272,15 +269,12 @@ def _of_text(plan: Plan, name: str, find: TransformFind) -> DraftMotion:
     read = read_transform_file(find.path)
     here = plan.words(name, read.matrix)
     file = f"file = {quoted(find.label)}"
-    if "frame" not in read.assumed:
-        source = (f"{find.label}: {read.text}",)
-        toml = f'{{{file}, frame = "{read.frame}"}}'
-        return DraftMotion(here, source, None, toml, shown=read.matrix)
     other = plan.words(name, motion_in_lps(read.matrix, "RAS"))
-    if here == other:
-        source = (f"{find.label}: LPS or RAS, which give the same motion",)
-        toml = f'{{{file}, frame = "LPS"}}'
-        return DraftMotion(here, source, None, toml, shown=read.matrix)
+    is_stated = "frame" not in read.assumed
+    if is_stated or here == other:
+        how = read.text if is_stated else "LPS or RAS, which give the same motion"
+        toml = f'{{{file}, frame = "{read.frame if is_stated else "LPS"}"}}'
+        return DraftMotion(here, (f"{find.label}: {how}",), None, toml, shown=read.matrix)
     text = f"{find.label} does not state its frame: which of these is the plan?"
     choices = (
         f'"RAS" (the matrix that 3D Slicer shows): {other}',

@@ -14,7 +14,6 @@ from cmfsim.errors import CmfsimError, third_party
 from cmfsim.io.images.segmentations import Segment, Segmentation, read_labels, read_segmentation
 from cmfsim.io.slicer.slicer_scenes import SceneNode, SlicerScene
 from cmfsim.surfaces.levels import block_of, surface_of_level
-from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.surface_data import SurfaceData
 
@@ -204,31 +203,25 @@ def _add(found: finds.Gathered, scene: SlicerScene, node: SceneNode, shown: str)
     chain = tuple(above.name for above in scene.chain(node))
     matrix = scene.to_world(node)
     place: dict[str, Any] = {"to_world": matrix, "chain": chain, "in_scene": True}
+    image = finds.image_find(node.file, shown) if node.kind == "volume" else None
+    if node.kind == "segmentation" or (image is not None and image.is_labels):
+        add_segments(found, [(node.file, shown)], **place)
+        return
     place["role"] = name_role(node.name)
     if node.kind == "model":
         read = finds.surface_find(node.file, shown)
         found.surfaces.append(replace(read, stated=read.stated or node.frame, **place))
-    elif node.kind == "segmentation":
-        _add_segments(found, node.file, shown, matrix, chain)
-    elif node.kind == "volume":
-        image = finds.image_find(node.file, shown)
-        if image.is_labels:
-            _add_segments(found, node.file, shown, matrix, chain)
-            return
+    elif image is not None:
         found.images.append(replace(image, **place))
     else:
         found.landmarks.append(replace(finds.landmark_find(node.file, shown), **place))
 
 
-def _add_segments(
-    found: finds.Gathered, file: Path, shown: str, matrix: Floats, chain: tuple[str, ...]
-) -> None:
-    """Adds the segments of a file, where the scene shows them."""
-    surfaces, others = segment_finds([(file, shown)])
+def add_segments(found: finds.Gathered, files: Sequence[tuple[Path, str]], **place: Any) -> None:
+    """Adds the segments of files, with their place in a scene."""
+    surfaces, others = segment_finds(files)
     found.others += others
-    found.surfaces += [
-        replace(segment, to_world=matrix, chain=chain, in_scene=True) for segment in surfaces
-    ]
+    found.surfaces += [replace(segment, **place) for segment in surfaces]
 
 
 def _add_loose(found: finds.Gathered, scene: SlicerScene, label: str) -> None:

@@ -26,7 +26,7 @@ from cmfsim.io.landmarks import read_landmarks, write_landmarks
 from cmfsim.io.meshes.surfaces import write_surface
 from cmfsim.io.slicer.transforms import read_transform
 from cmfsim.values.checks import Floats
-from cmfsim.values.motion import rigid_motion
+from cmfsim.values.motion import carried, rigid_motion
 from cmfsim.values.surface_data import SurfaceData
 
 # What single precision leaves of coordinates of a head, mm, and what a rotation may differ by.
@@ -216,7 +216,7 @@ def surface_path(draft: Draft, find: SurfaceFind, name: str, place: Place) -> st
     true = find.stated or place.shown or "LPS"
     matrix, flip = place.matrix(find), [-1.0, -1.0, 1.0] if true == "RAS" else [1.0, 1.0, 1.0]
     known = draft.anatomy.asks("units") is None
-    vertices = find.surface.vertices * flip @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = carried(matrix, find.surface.vertices * flip)
     reads_as = place.frame or ("LPS" if find.is_silent else find.stated)
     if not _is_packed(draft, find, place) and (true == reads_as or not known):
         path = draft.found.shown(find.path)
