@@ -5,6 +5,7 @@ two of them cross; they end a little way past the bone or teeth that they meet.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from cmfsim.meshing.lips.crease import MIDDLE, MouthFrame, MouthLine, SkinProfiles, smoothed, solid
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import Floats
-from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.surface_data import SurfaceData, area_vectors
 
 # Distance of the centre of the rows behind the foremost point of the mouth's line, mm: about the
 # radius of an arch in front.
@@ -93,7 +94,7 @@ def lip_sheet(
     places = np.concatenate([plane, heights[..., None]], axis=-1)
     vertices = frame.out_of(places.reshape(-1, 3))
     triangles = _grid_triangles(*heights.shape)
-    surface = SurfaceData(vertices, _upwards(vertices, triangles, frame.axes[2]))
+    surface = SurfaceData(vertices, facing(vertices, triangles, frame.axes[2]))
     return LipSheet(surface, float(np.median(thickness)), opening)
 
 
@@ -214,8 +215,7 @@ def _grid_triangles(n_columns: int, n_rows: int) -> NDArray[np.intp]:
     return np.concatenate([one.reshape(-1, 3), two.reshape(-1, 3)])
 
 
-def _upwards(vertices: Floats, triangles: NDArray[np.intp], up: Floats) -> NDArray[np.intp]:
-    """The triangles, turned so that their normals look up."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    down = float((np.cross(b - a, c - a) @ up).sum()) < 0.0
+def facing(vertices: Floats, triangles: NDArray[Any], up: Floats) -> NDArray[Any]:
+    """The triangles (t, 3), turned if their normals look down on the whole; `up`: (3,)."""
+    down = float((area_vectors(vertices, triangles) @ up).sum()) < 0.0
     return triangles[:, ::-1] if down else triangles

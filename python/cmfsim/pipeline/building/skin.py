@@ -17,6 +17,7 @@ from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.meshes.photos import read_photo
 from cmfsim.meshing import separated_mesh
 from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
+from cmfsim.meshing.lips.sheet import facing
 from cmfsim.meshing.node_kinds import DentalArches
 from cmfsim.pipeline.building.case_checks import CaseLipContact, Head
 from cmfsim.pipeline.building.inputs import stated_frame
@@ -32,7 +33,7 @@ from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import carried
 from cmfsim.values.patient_model import LiftedTissue
 from cmfsim.values.scene import NODE_KINDS, NodeKinds
-from cmfsim.values.surface_data import SurfaceData, area_vectors, triangle_areas, used_nodes
+from cmfsim.values.surface_data import SurfaceData, triangle_areas, used_nodes
 from cmfsim.values.touching import LipRegion, ObstacleData, TouchingData
 
 # Held nodes that a body needs: three hold it unless they are in line.
@@ -112,16 +113,11 @@ def find_seam(
     seam = case.lips.seam
     if isinstance(seam, Path):
         surface = read_surface(seam, **stated_frame(case))
-        return LipSeam(_upwards(surface), "file", {"source": "file", "file": seam.name})
+        upwards = facing(surface.vertices, surface.triangles, np.array([0.0, 0.0, 1.0]))
+        surface = replace(surface, triangles=upwards)
+        return LipSeam(surface, "file", {"source": "file", "file": seam.name})
     by_jaw = {} if arches is None else arches.by_jaw
     return lip_seam(anatomy, by_jaw, skin, way=seam, depth=case.lips.depth)
-
-
-def _upwards(surface: SurfaceData) -> SurfaceData:
-    """The surface, turned if its normals look down."""
-    if float(area_vectors(surface.vertices, surface.triangles)[:, 2].sum()) >= 0.0:
-        return surface
-    return replace(surface, triangles=surface.triangles[:, ::-1])
 
 
 def separated_at_seam(mesh: TetMesh, kinds: NodeKinds, body: Integers, seam: LipSeam) -> Held:
