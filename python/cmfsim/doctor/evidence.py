@@ -170,11 +170,6 @@ class Evidence:
             inside &= points[:, 2] < region.upper
         return inside
 
-    @property
-    def has_all_bones(self) -> bool:
-        """Whether every bone that the case names could be read."""
-        return self.case.surfaces is not None and set(self.bones) == set(self.case.surfaces.bones)
-
 
 def gather(case: Case) -> Evidence:
     """What can be read of a case, with a finding for each file that cannot."""

@@ -207,7 +207,8 @@ def _closed(points: Floats, corners: Indices) -> tuple[Floats, NDArray[np.int64]
     triangles = corners.astype(np.int64)
     n = len(points)
     while True:
-        edges = _half_edges(triangles)
+        # The directed edges: first those of all first corners.
+        edges = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
         keys = np.minimum(*edges.T) * n + np.maximum(*edges.T)
         in_order = np.sort(keys)
         thrice = in_order[2:][in_order[2:] == in_order[:-2]]
@@ -226,11 +227,6 @@ def _closed(points: Floats, corners: Indices) -> tuple[Floats, NDArray[np.int64]
     if not centres:
         return points, triangles
     return np.vstack([points, centres]), np.vstack([triangles, np.array(fans, dtype=np.int64)])
-
-
-def _half_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The directed edges (3 t, 2): first those of all first corners."""
-    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
 def _outward(points: Floats, triangles: NDArray[np.int64]) -> Indices:

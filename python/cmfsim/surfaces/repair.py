@@ -344,7 +344,8 @@ def cap_loop(vertices: Floats, loop: Integers) -> tuple[Integers, float]:
     points = vertices[loop[::-1]]
     centred = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
-    normal = _loop_normal(centred)
+    # Twice the vector area of the loop (Newell).
+    normal = np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0)
     if float(np.linalg.norm(normal)) == 0.0:
         normal = axes[2]
     normal = normal / np.linalg.norm(normal)
@@ -355,12 +356,6 @@ def cap_loop(vertices: Floats, loop: Integers) -> tuple[Integers, float]:
     flat = np.stack([centred @ across, centred @ np.cross(normal, across)], axis=1)
     bulge = float(np.abs(centred @ normal).max())
     return loop[::-1][_clip_ears(flat)], bulge
-
-
-def _loop_normal(points: Floats) -> Floats:
-    """Twice the vector area of a loop (Newell)."""
-    doubled: Floats = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
-    return doubled
 
 
 def _clip_ears(flat: Floats) -> Integers:

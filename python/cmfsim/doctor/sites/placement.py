@@ -165,8 +165,10 @@ def _check_bone_sizes(evidence: Evidence, skin: Body) -> Iterator[Finding]:
 
 def _bodies(evidence: Evidence, key: str) -> list[Body]:
     if key == "skull":
+        given = evidence.case.surfaces
         # With a bone missing, its landmarks would seem to lie far from the others.
-        return list(evidence.bones.values()) if evidence.has_all_bones else []
+        is_whole = given is not None and set(evidence.bones) == set(given.bones)
+        return list(evidence.bones.values()) if is_whole else []
     return [evidence.skin] if evidence.skin else []
 
 

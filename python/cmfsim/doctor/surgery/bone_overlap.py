@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -47,10 +47,6 @@ def jaw_of(name: str) -> str | None:
     return None
 
 
-def _everywhere(points: Floats) -> NDArray[np.bool_]:
-    return np.ones(len(points), dtype=bool)
-
-
 @dataclass(frozen=True, eq=False)
 class BonePart:
     """A bone or segment of the "lower" or "upper" jaw with its motion, (4, 4) mm or MovedSurface.
@@ -64,7 +60,7 @@ class BonePart:
     where: str
     surface: SurfaceData
     motion: Floats | MovedSurface
-    owns: Callable[[Floats], NDArray[np.bool_]] = field(default=_everywhere)
+    owns: Callable[[Floats], NDArray[np.bool_]] = lambda points: np.ones(len(points), dtype=bool)
 
     @property
     def is_still(self) -> bool:
