@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from cmfsim.io.cases.template_archives import mirrored_muscle
-from cmfsim.muscles.template import MuscleTemplate, template_path
+from cmfsim.muscles.template.checking import template_path
+from cmfsim.muscles.template.muscle_template import MuscleTemplate
 from cmfsim.phantom import Muscle, PhantomHead, make_head
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.checks import Floats

@@ -18,7 +18,7 @@ from pathlib import Path
 import cmfsim
 from benches.scenes.marked import publish
 from cmfsim.errors import CmfsimError
-from cmfsim.evaluation import NO_CHANGE
+from cmfsim.evaluation.models import NO_CHANGE
 from cmfsim.lab.virtual import PATIENTS
 
 REGIONS = ("upper lip", "lower lip", "face")

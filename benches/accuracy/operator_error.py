@@ -21,7 +21,7 @@ import cmfsim
 from benches.scenes.marked import publish
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
-from cmfsim.planning.replanning import CORRECTIONS
+from cmfsim.planning.replanning.corrected import CORRECTIONS
 
 HEAD = (
     "| head | model | tets | skin nodes | operator, s | corrected by, s | plans | exact, s each "

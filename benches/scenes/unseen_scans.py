@@ -18,7 +18,7 @@ from benches.scenes import warped_heads
 from benches.scenes.warped_heads import KnownHead, Move, Points
 from cmfsim import ImageData, SurfaceData
 from cmfsim.io.images.image_files import read_image_file
-from cmfsim.meshing import anatomy_from_surfaces
+from cmfsim.meshing.levels import anatomy_from_surfaces
 from cmfsim.pipeline.proposing import read_template_head
 from cmfsim.values.landmark_sites import JAW_SITES
 

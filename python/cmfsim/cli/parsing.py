@@ -14,8 +14,9 @@ from cmfsim.io.results.populations import PARTS, TEST
 from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST
 from cmfsim.lab.frontier import EDGES, FACTORS
 from cmfsim.lab.virtual.population import TRUTHS
-from cmfsim.muscles.template import WHERE
-from cmfsim.planning.replanning import CORRECTIONS, TRIALS
+from cmfsim.muscles.template.bodyparts3d import WHERE
+from cmfsim.planning.replanning.corrected import CORRECTIONS
+from cmfsim.planning.replanning.expected_error import TRIALS
 from cmfsim.values.case_parts import PROCEDURES
 from cmfsim.values.language import translated
 from cmfsim.values.prediction import MODELS

@@ -17,8 +17,9 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, read_surface, write_plan, write_surface
 from cmfsim.pipeline.building.inputs import check_output, plan_key
 from cmfsim.pipeline.planning import PLAN_FILE, TARGET_STD, make_planning_page
-from cmfsim.planning.face_planning import FacePlan
-from cmfsim.planning.replanning import USUAL, ExpectedError, PlanCorrection
+from cmfsim.planning.face_planning.planning import FacePlan
+from cmfsim.planning.replanning.correction import PlanCorrection
+from cmfsim.planning.replanning.expected_error import USUAL, ExpectedError
 from cmfsim.planning.server import open_port, serve_planning
 from cmfsim.values.progress import BUILDING, PLANNING
 

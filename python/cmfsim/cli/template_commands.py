@@ -12,13 +12,9 @@ import numpy as np
 from cmfsim.cli import BAD_INPUT, DONE
 from cmfsim.cli.terminal import StageProgress, escaped, print_findings, print_json, print_text
 from cmfsim.errors import CaseInputError
-from cmfsim.muscles.template import (
-    MorphedMusculature,
-    MuscleTemplate,
-    check_template,
-    import_bodyparts3d,
-    template_names,
-)
+from cmfsim.muscles.template.bodyparts3d import import_bodyparts3d
+from cmfsim.muscles.template.checking import check_template, template_names
+from cmfsim.muscles.template.muscle_template import MorphedMusculature, MuscleTemplate
 from cmfsim.pictures import picture_muscles
 from cmfsim.pictures.anatomy import without_side
 from cmfsim.values.finding import SEVERITIES

@@ -24,7 +24,7 @@ from cmfsim.pipeline.planning import make_planning_page
 from cmfsim.pipeline.predicting import predictions_of, prepare
 from cmfsim.pipeline.proposing import filled_landmarks, proposed_head, unproposed_head
 from cmfsim.planning.page import page_text
-from cmfsim.planning.replanning import PlanningModel
+from cmfsim.planning.replanning.model import PlanningModel
 from cmfsim.planning.server import RefusedError, plan_of_body, solved_plan
 from cmfsim.processes.worker import Answer
 from cmfsim.values.finding import Finding

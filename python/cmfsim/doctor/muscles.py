@@ -8,8 +8,7 @@ from cmfsim._core import PRESETS
 from cmfsim.doctor.evidence import Evidence
 from cmfsim.errors import CmfsimError
 from cmfsim.muscles.equivalent import moduli_findings
-from cmfsim.muscles.template import MuscleTemplate
-from cmfsim.muscles.template.muscle_template import missing_landmarks, too_few
+from cmfsim.muscles.template.muscle_template import MuscleTemplate, missing_landmarks, too_few
 from cmfsim.registration import match_landmarks
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.finding import Finding

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from cmfsim._core import StaticSolver, Surface
 from cmfsim.errors import CalibrationError, CmfsimError, LandmarkInputError
-from cmfsim.evaluation import SKIN_LANDMARKS, calibrate, skin_regions
+from cmfsim.evaluation.conformal import calibrate
+from cmfsim.evaluation.regions import skin_regions
 from cmfsim.pipeline.proposing import head_surfaces, propose_landmarks
 from cmfsim.solving.models import solved_patient
 from cmfsim.solving.rates import SkinRates, skin_rates
@@ -26,6 +27,7 @@ from cmfsim.values.calibration import (
 )
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.prediction import Prediction
 from cmfsim.values.skin_band import WHOLE_FACE, BandOptions, SkinBand

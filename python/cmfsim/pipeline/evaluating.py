@@ -8,18 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError, RegistrationError
-from cmfsim.evaluation import (
-    NO_CHANGE,
-    WHOLE,
-    ModelComparison,
-    SkinComparison,
-    ThicknessChange,
-    compare_models,
-    compare_unmoved,
-    fitted_thickness,
-    skin_regions,
-    unmoved_regions,
-)
+from cmfsim.evaluation.comparison import SkinComparison
+from cmfsim.evaluation.models import NO_CHANGE, WHOLE, ModelComparison, compare_models
+from cmfsim.evaluation.regions import skin_regions, unmoved_regions
+from cmfsim.evaluation.unmoved import ThicknessChange, compare_unmoved, fitted_thickness
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.pipeline.banding import face_landmarks
 from cmfsim.pipeline.building.inputs import case_key

@@ -15,34 +15,16 @@ from cmfsim.io import CaseOrPath, as_case, read_landmarks, read_surface, replaci
 from cmfsim.pipeline.building.case_model import planned_head
 from cmfsim.pipeline.building.stages import BuildKeywords, build_options
 from cmfsim.pipeline.predicting import build_patient, named_models, prepare
-from cmfsim.planning.face_planning import (
-    FacePlan,
-    FaceSearch,
-    PointTarget,
-    SurfaceTarget,
-    Target,
-    plan_for_face,
-)
-from cmfsim.planning.occlusion import (
-    THICKNESS,
-    FinalBite,
-    Splint,
-    final_bite,
-    rigid_of,
-    splint_between,
-    tooth_rows,
-)
+from cmfsim.planning.face_planning.planning import FacePlan, FaceSearch, plan_for_face
+from cmfsim.planning.face_planning.targets import PointTarget, SurfaceTarget, Target
+from cmfsim.planning.occlusion.final_bite import FinalBite, final_bite
+from cmfsim.planning.occlusion.rows import rigid_of, tooth_rows
+from cmfsim.planning.occlusion.splint import THICKNESS, Splint, splint_between
 from cmfsim.planning.page import PageContent, page_content, page_text
-from cmfsim.planning.replanning import (
-    CORRECTIONS,
-    TRIALS,
-    ExpectedError,
-    PlanningModel,
-    corrected_planning,
-    expected_error,
-    plan_band,
-    planning_model,
-)
+from cmfsim.planning.replanning.corrected import CORRECTIONS, corrected_planning
+from cmfsim.planning.replanning.expected_error import TRIALS, ExpectedError, expected_error
+from cmfsim.planning.replanning.model import PlanningModel, planning_model
+from cmfsim.planning.replanning.plan_band import plan_band
 from cmfsim.values.anatomy import JAWS, BoneSegment
 from cmfsim.values.checks import Floats, as_whole, check_one_of
 from cmfsim.values.landmark_sites import label_key

@@ -20,7 +20,8 @@ from cmfsim.pipeline.building.inputs import (
     plan_of_other_case,
 )
 from cmfsim.pipeline.building.stages import BuildKeywords, BuildOptions, build_options
-from cmfsim.planning.occlusion import final_bite, patient_rows
+from cmfsim.planning.occlusion.final_bite import final_bite
+from cmfsim.planning.occlusion.rows import patient_rows
 from cmfsim.processes.memory import release_freed_memory
 from cmfsim.solving.models import solved_patient
 from cmfsim.values.case_parts import CaseBite, CaseMuscles

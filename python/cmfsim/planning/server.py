@@ -23,7 +23,7 @@ import numpy as np
 
 from cmfsim.errors import BoundaryError, CaseInputError, CmfsimError, third_party
 from cmfsim.planning.page import PageContent, page_text
-from cmfsim.planning.replanning import PlanningModel
+from cmfsim.planning.replanning.model import PlanningModel
 from cmfsim.values.checks import Floats
 
 # A plan of fifty segments takes about 16 kB.

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cmfsim.evaluation import NO_CHANGE, ErrorTable
+from cmfsim.evaluation.models import NO_CHANGE, ErrorTable
 from cmfsim.report.document import Alert, Document, Figure, Note, Section
 from cmfsim.report.page import MEASURES
 from cmfsim.values.table import NOTHING, Table, number, plain_line

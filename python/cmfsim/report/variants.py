@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cmfsim.evaluation import LEAST_PAIRS, NO_CHANGE, REGIONS, WHOLE
+from cmfsim.evaluation.models import NO_CHANGE, WHOLE
+from cmfsim.evaluation.regions import REGIONS
+from cmfsim.evaluation.statistics import LEAST_PAIRS
 from cmfsim.report.document import Alert, Document, Note, Section
 from cmfsim.values.table import NOTHING, Table, plain_line
 

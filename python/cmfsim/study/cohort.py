@@ -13,7 +13,8 @@ from typing import Any
 
 from cmfsim.doctor import examine, findings_text
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError, error_text
-from cmfsim.evaluation import NO_CHANGE, DistanceStatistics, ErrorTable
+from cmfsim.evaluation.models import NO_CHANGE, ErrorTable
+from cmfsim.evaluation.statistics import DistanceStatistics
 from cmfsim.io import Case, CaseChanges, Cohort, finish_writing, replacing_files
 from cmfsim.io.files.folders import check_below, check_writable
 from cmfsim.io.files.summaries import checked_file

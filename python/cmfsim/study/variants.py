@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.evaluation import NO_CHANGE, ErrorTable, PairedChange, paired_change
+from cmfsim.evaluation.models import NO_CHANGE, ErrorTable
+from cmfsim.evaluation.statistics import PairedChange, paired_change
 from cmfsim.io import AS_GIVEN, Case, CaseChanges, Cohort, Variants
 from cmfsim.pipeline.building.case_model import kind_options_of
 from cmfsim.pipeline.building.inputs import case_key, input_hashes

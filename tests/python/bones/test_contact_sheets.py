@@ -8,7 +8,8 @@ import pytest
 import arch_head
 import cmfsim
 from benches.scenes import meshes
-from cmfsim.bones import contact_sheets, sheet_departure
+from cmfsim.bones import contact_sheets
+from cmfsim.bones.contact_sheets import sheet_departure
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts, arch_sheets
 from cmfsim.surfaces.levels import surface_of_level
 from head_case import HeadCase

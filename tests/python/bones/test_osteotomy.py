@@ -9,8 +9,8 @@ import pytest
 import cmfsim
 import real_heads
 from benches.scenes.angles import angle_between
-from cmfsim.bones import PROCEDURES
 from cmfsim.bones.cuts import procedures
+from cmfsim.bones.cuts.procedures import PROCEDURES
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 
 pytest.importorskip("skimage")

@@ -10,7 +10,7 @@ import pytest
 
 import cmfsim
 import phantom_case
-from cmfsim.bones import check_segments
+from cmfsim.bones.segment_checks import check_segments
 from cmfsim.io import Case
 from cmfsim.pipeline.building import case_checks
 from cmfsim.pipeline.building.case_model import build_model

@@ -16,7 +16,7 @@ from cmfsim.cli import main
 from cmfsim.desk.server import desk_text
 from cmfsim.desk.session import Session
 from cmfsim.lab.virtual.demo import write_demo_case
-from cmfsim.planning.face_measures import MEASURES
+from cmfsim.planning.face_measures.definitions import MEASURES
 from cmfsim.planning.page.content import PageContent
 from cmfsim.planning.page.document import page_text
 from cmfsim.report import findings_of

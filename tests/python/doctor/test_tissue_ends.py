@@ -5,7 +5,7 @@ from diagnosed_heads import diagnosis, image_case
 
 import cmfsim
 from cmfsim import Anatomy, BoneSegment, ImageData, NodeKinds, SurfaceData
-from cmfsim.meshing import TissueRegion
+from cmfsim.meshing.levels import TissueRegion
 from cmfsim.pipeline.building.tissue.nodes import loose_ends, near_ends
 from head_case import HeadCase
 

@@ -7,8 +7,9 @@ from real_faces import face, moved
 import cmfsim
 import real_heads
 from benches.accuracy.paired_motion import lighter
-from cmfsim.evaluation import SKIN_LANDMARKS, compare_unmoved
+from cmfsim.evaluation.unmoved import compare_unmoved
 from cmfsim.surfaces.depth import moved_outward, tissue_depth
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 
 
 @pytest.mark.parametrize("head", real_heads.HEADS)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import cmfsim
 import head_case
 from cmfsim import _core
-from cmfsim.meshing import TissueRegion, near_skin, tissue_level
+from cmfsim.meshing.levels import TissueRegion, near_skin, tissue_level
 
 LEAST = 10.0
 

@@ -9,7 +9,8 @@ import pytest
 import cmfsim
 import real_heads
 from benches.scenes import ct_variants as variants
-from cmfsim.bones import cut_bones, place_procedure
+from cmfsim.bones.cuts.cutting import cut_bones
+from cmfsim.bones.cuts.procedures import place_procedure
 from cmfsim.cli import main
 from cmfsim.pipeline import proposing
 from cmfsim.pipeline.building.landmarks import (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.meshing import TissueRegion, tissue_level
+from cmfsim.meshing.levels import TissueRegion, tissue_level
 from cmfsim.pipeline.building.tissue.nodes import (
     GAP_REFINEMENTS,
     MOUTH_DEPTH,

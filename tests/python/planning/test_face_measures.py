@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import cmfsim
-from cmfsim.planning.face_measures import midline_profile
+from cmfsim.planning.face_measures.profile import midline_profile
 
 PLACES = st.lists(
     st.tuples(*[st.floats(-80.0, 80.0)] * 3), min_size=3, max_size=3, unique=True

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import cmfsim
-from cmfsim.planning.face_measures import BoneSite
+from cmfsim.planning.face_measures.sites import BoneSite
 from cmfsim.planning.page.content import occlusal_measures
 from cmfsim.planning.page.document import joined_scripts
 from cmfsim.values.motion import plan_digits

@@ -167,7 +167,7 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
     with pytest.raises(AttributeError, match="'cmfsim' has no attribute 'solve'"):
         cmfsim.solve  # noqa: B018
     assert set(cmfsim.__all__) <= set(dir(cmfsim))
-    assert cmfsim.meshing.mesh_report is cmfsim.mesh_report
+    assert cmfsim.io.read_surface is cmfsim.read_surface
 
 
 def test_a_missing_dependency_is_named_with_the_line_that_installs_it():

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface
-from cmfsim.bones import place_procedure, placed_cut
 from cmfsim.bones.cuts.planes import Cut
+from cmfsim.bones.cuts.procedures import place_procedure, placed_cut
 from cmfsim.doctor.evidence import Evidence, place_text
 from cmfsim.doctor.sites.placement import LANDMARK_WARNING
 from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of

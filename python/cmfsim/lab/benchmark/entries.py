@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.errors import CaseInputError, CmfsimError, third_party
-from cmfsim.evaluation import SKIN_LANDMARKS
 from cmfsim.io.files.summaries import kept_record, write_record
 from cmfsim.lab.benchmark.patients import (
     BenchmarkPatient,
@@ -34,6 +33,7 @@ from cmfsim.pipeline.predicting import build_patient
 from cmfsim.solving.models import predict_patient
 from cmfsim.surfaces.depth import at_closest
 from cmfsim.values.checks import Floats
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.prediction import MODELS, Prediction
 
 # Fewer patients than this teach nothing: one is left out at a time to choose the components.

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, __version__
 from cmfsim.errors import CaseInputError
-from cmfsim.evaluation import skin_regions
+from cmfsim.evaluation.regions import skin_regions
 from cmfsim.io import Case, read_landmarks, read_surface
 from cmfsim.io.files.reading_writing import check_readable, named, replacing
 from cmfsim.io.results.populations import MADE, Population

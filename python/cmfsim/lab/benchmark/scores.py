@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.evaluation import calibrate, cases_needed, covered_interval, region_scores
+from cmfsim.evaluation.conformal import calibrate, cases_needed, covered_interval, region_scores
 from cmfsim.io.results.populations import write_calibration
 from cmfsim.lab.benchmark.entries import NO_CHANGE, EntryFolder, check_own
 from cmfsim.lab.benchmark.patients import (

@@ -10,11 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface
 from cmfsim.errors import CaseInputError
-from cmfsim.evaluation import SKIN_LANDMARKS, DistanceStatistics, distance_statistics, skin_regions
+from cmfsim.evaluation.regions import skin_regions
+from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
 from cmfsim.surfaces.depth import distances
 from cmfsim.values.checks import Floats, Plain, as_floats, as_rows, in_files
+from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.table import csv_of
 

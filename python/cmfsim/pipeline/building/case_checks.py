@@ -13,9 +13,9 @@ from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of
 from cmfsim.doctor.surgery.plan import SMALL, nothing_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
-from cmfsim.meshing import TissueRegion
+from cmfsim.meshing.levels import TissueRegion
 from cmfsim.meshing.lips import LipSeam
-from cmfsim.meshing.node_kinds import DentalArches
+from cmfsim.meshing.node_kinds.arches import DentalArches
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts
 from cmfsim.planning.face_measures.occlusion import bite_frame

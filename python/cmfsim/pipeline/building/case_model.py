@@ -11,14 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cmfsim._core import TetMesh, __version__
-from cmfsim.bones import Procedure, check_segments, cut_bones, placed_cut
+from cmfsim.bones.cuts.cutting import cut_bones
+from cmfsim.bones.cuts.planes import Procedure
+from cmfsim.bones.cuts.procedures import placed_cut
+from cmfsim.bones.segment_checks import check_segments
 from cmfsim.doctor import diagnose
 from cmfsim.doctor.sites.landmarks import LANDMARK_CODES
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, CaseOrPath, as_case
-from cmfsim.meshing import tissue_level
+from cmfsim.meshing.levels import tissue_level
 from cmfsim.meshing.lips import seam_faces
-from cmfsim.meshing.node_kinds import KindOptions, dental_arches, kind_options, segment_data
+from cmfsim.meshing.node_kinds.arches import dental_arches
+from cmfsim.meshing.node_kinds.classification import segment_data
+from cmfsim.meshing.node_kinds.options import KindOptions, kind_options
 from cmfsim.pipeline.building.case_checks import (
     Head,
     MeshedTissue,

@@ -23,7 +23,7 @@ from cmfsim.io.meshes.photos import photo_files
 from cmfsim.io.results.predictions import PREDICTION_FILE, check_own
 from cmfsim.io.results.result_files import is_model_file
 from cmfsim.io.slicer.transforms import read_transform_file
-from cmfsim.meshing import anatomy_from_surfaces, signed_level
+from cmfsim.meshing.levels import anatomy_from_surfaces, signed_level
 from cmfsim.surfaces.levels import detailed_surface
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.anatomy import Anatomy

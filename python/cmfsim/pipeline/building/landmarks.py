@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cmfsim.bones import CuttingPlane, Procedure
+from cmfsim.bones.cuts.planes import CuttingPlane, Procedure
 from cmfsim.doctor.surgery.bone_overlap import jaw_of
 from cmfsim.errors import LandmarkError, LandmarkInputError
 from cmfsim.io import Case

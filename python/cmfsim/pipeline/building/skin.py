@@ -15,10 +15,10 @@ from cmfsim._core import Surface, TetMesh, rigid_fit
 from cmfsim.errors import CaseInputError, MeshError, MeshInputError, RegistrationError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.meshes.photos import read_photo
-from cmfsim.meshing import separated_mesh
 from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
 from cmfsim.meshing.lips.sheet import facing
-from cmfsim.meshing.node_kinds import DentalArches
+from cmfsim.meshing.node_kinds.arches import DentalArches
+from cmfsim.meshing.stuffing import separated_mesh
 from cmfsim.pipeline.building.case_checks import CaseLipContact, Head
 from cmfsim.pipeline.building.inputs import stated_frame
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts, without_tets

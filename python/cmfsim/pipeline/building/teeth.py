@@ -7,7 +7,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.io import read_surface
-from cmfsim.meshing import signed_level
+from cmfsim.meshing.levels import signed_level
 from cmfsim.pipeline.building.case_checks import Head
 from cmfsim.pipeline.building.stages import Stages
 from cmfsim.planning.occlusion.final_bite import fitted_scan

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.evaluation import error_table
+from cmfsim.evaluation.models import error_table
 from cmfsim.io import Case, replacing, replacing_files
 from cmfsim.io.cases.case_files import CASE_FILE
 from cmfsim.io.files.summaries import hashes_of, write_summary
@@ -66,11 +66,10 @@ from cmfsim.pipeline.building.inputs import input_hash
 from cmfsim.pipeline.building.stages import BuildKeywords
 from cmfsim.pipeline.evaluating import CaseEvaluation
 from cmfsim.pipeline.planning import PAGE_FILE, page_state
-from cmfsim.planning.face_measures import clinical_figures
-from cmfsim.planning.face_measures.clinical_figures import lateral_sites
+from cmfsim.planning.face_measures.clinical_figures import clinical_figures, lateral_sites
 from cmfsim.planning.face_measures.occlusion import poor_bite
 from cmfsim.planning.face_view import face_view
-from cmfsim.planning.occlusion import ContactMap, planned_contacts
+from cmfsim.planning.occlusion.contacts import ContactMap, planned_contacts
 from cmfsim.report import Document, Figure, case_document, findings_of, render_page
 from cmfsim.report.chart_page import A4, draw_chart_page
 from cmfsim.solving.models import planned_motions

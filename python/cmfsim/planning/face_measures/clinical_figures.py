@@ -26,7 +26,8 @@ from cmfsim.planning.face_measures.occlusion import (
     missing_for_occlusion,
     occlusion,
 )
-from cmfsim.planning.occlusion import bite_sites, first_molars, patient_rows, rigid_of
+from cmfsim.planning.occlusion.molars import first_molars
+from cmfsim.planning.occlusion.rows import bite_sites, patient_rows, rigid_of
 from cmfsim.surfaces.depth import distances
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats

@@ -13,7 +13,7 @@ import numpy as np
 from cmfsim.errors import CaseInputError, LandmarkInputError
 from cmfsim.planning.face_measures.definitions import MEASURES, measure_sites
 from cmfsim.planning.face_measures.profile import midline_profile
-from cmfsim.planning.occlusion import bite_sites, patient_rows
+from cmfsim.planning.occlusion.rows import bite_sites, patient_rows
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import label_key
 from cmfsim.values.patient_model import PatientModel

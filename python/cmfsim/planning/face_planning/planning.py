@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from cmfsim.errors import CaseInputError
 from cmfsim.planning.face_planning.targets import CarriedPoints, Target, Wish, wish_of
-from cmfsim.planning.replanning import PlanningModel
 from cmfsim.planning.replanning.expected_error import moving_segments
+from cmfsim.planning.replanning.model import PlanningModel
 from cmfsim.values.checks import Floats, as_positive
 from cmfsim.values.clinical_motion import ClinicalMotion, clinical_motion, planned_motion
 from cmfsim.values.prediction import Prediction

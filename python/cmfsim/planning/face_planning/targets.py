@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, SurfaceMotion
 from cmfsim.errors import CaseInputError
-from cmfsim.planning.face_measures import MEASURES, FaceSites, face_sites, measure_sites
-from cmfsim.planning.replanning import Motions, PlanningModel
+from cmfsim.planning.face_measures.definitions import MEASURES, measure_sites
+from cmfsim.planning.face_measures.sites import FaceSites, face_sites
+from cmfsim.planning.replanning.model import Motions, PlanningModel
 from cmfsim.surfaces.topology import edges_of
 from cmfsim.values.checks import Floats, as_positive, as_rows, keep
 from cmfsim.values.skin_motion import attachment

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import rigid_fit
 from cmfsim.errors import CaseInputError
-from cmfsim.meshing.node_kinds import dental_arches
+from cmfsim.meshing.node_kinds.arches import dental_arches
 from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import (

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import signed_distance_image
 from cmfsim.errors import CaseInputError, third_party
-from cmfsim.meshing import signed_level
+from cmfsim.meshing.levels import signed_level
 from cmfsim.planning.occlusion.contacts import contact_map, signed_gaps
 from cmfsim.planning.occlusion.rows import HALF_TOOTH, ToothRow, line_distance
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level

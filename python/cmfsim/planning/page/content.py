@@ -7,30 +7,22 @@ import numpy as np
 
 from cmfsim._core import __version__
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.planning.face_measures import (
-    MEASURES,
-    OCCLUSAL_MEASURES,
-    BoneSite,
-    FaceSites,
-    face_sites,
-    midline_profile,
-)
 from cmfsim.planning.face_measures.clinical_figures import bone_sites, unfound_molars
+from cmfsim.planning.face_measures.definitions import MEASURES
 from cmfsim.planning.face_measures.occlusion import (
+    OCCLUSAL_MEASURES,
     bite_frame,
     missing_for_occlusion,
     occlusal_terms,
 )
+from cmfsim.planning.face_measures.profile import midline_profile
+from cmfsim.planning.face_measures.sites import BoneSite, FaceSites, face_sites
 from cmfsim.planning.page.arrays import Arrays, PageContent, add_surface, framing, indices, singles
 from cmfsim.planning.page.row_overlap import row_overlap
 from cmfsim.planning.page.segment_points import segment_points
-from cmfsim.planning.replanning import (
-    ExpectedError,
-    Motions,
-    PlanBand,
-    PlanningModel,
-    segment_boxes,
-)
+from cmfsim.planning.replanning.expected_error import ExpectedError, segment_boxes
+from cmfsim.planning.replanning.model import Motions, PlanningModel
+from cmfsim.planning.replanning.plan_band import PlanBand
 from cmfsim.surfaces.depth import barycentric
 from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.checks import Floats

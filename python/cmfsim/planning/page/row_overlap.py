@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim._core import signed_distance_image
-from cmfsim.planning.occlusion import patient_rows
+from cmfsim.planning.occlusion.rows import patient_rows
 from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import carried

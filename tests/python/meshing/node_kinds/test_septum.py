@@ -8,7 +8,7 @@ import pytest
 import cmfsim
 from benches.accuracy.nose_ratios import ratios
 from cmfsim.lab.virtual.demo import write_demo_case
-from cmfsim.meshing.node_kinds import septum
+from cmfsim.meshing.node_kinds.septum import septum
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
 

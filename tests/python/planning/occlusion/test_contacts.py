@@ -5,8 +5,8 @@ import pytest
 from tooth_row_heads import closed_rows, rows_of
 
 import cmfsim
-from cmfsim.planning.occlusion import rigid_of
 from cmfsim.planning.occlusion.contacts import signed_gaps
+from cmfsim.planning.occlusion.rows import rigid_of
 
 pv = pytest.importorskip("pyvista")
 

@@ -8,8 +8,7 @@ import cmfsim
 import real_heads
 from cmfsim.phantom import model, skull
 from cmfsim.phantom.parameters import JawWarp
-from cmfsim.planning.occlusion import first_molars
-from cmfsim.planning.occlusion.molars import WIDTHS
+from cmfsim.planning.occlusion.molars import WIDTHS, first_molars
 
 pytest.importorskip("skimage")
 

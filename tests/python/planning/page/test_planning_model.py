@@ -11,9 +11,8 @@ import cmfsim
 import cmfsim.planning.page.content
 from cmfsim.cli import main
 from cmfsim.cli.plan_command import _correction_text
-from cmfsim.planning.occlusion import patient_rows
-from cmfsim.planning.replanning import plan_distance
-from cmfsim.planning.replanning.expected_error import plans_near
+from cmfsim.planning.occlusion.rows import patient_rows
+from cmfsim.planning.replanning.expected_error import plan_distance, plans_near
 from planning_head import other_plan
 
 pytest.importorskip("skimage")

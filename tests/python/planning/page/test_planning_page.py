@@ -12,7 +12,7 @@ from planning_steps import motions_of, saved, settle, type_number
 import cmfsim
 import cmfsim.planning.page.content
 from browser_page import open_page, until
-from cmfsim.planning.replanning import plan_distance
+from cmfsim.planning.replanning.expected_error import plan_distance
 from cmfsim.values.motion import plan_digits
 from planning_head import other_plan
 

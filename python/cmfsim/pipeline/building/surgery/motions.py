@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cmfsim.bones import part_segment
+from cmfsim.bones.cuts.cutting import part_segment
 from cmfsim.bones.motion import RemovedBone, sound_motion, torn_pieces
 from cmfsim.bones.pairs.paired_surfaces import REACH, StrayPatch
 from cmfsim.bones.pairs.shape_fit import OPEN, OpenDirection, ShapeFit

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, SurfaceMotion, TetMesh
-from cmfsim.bones import ContactSheet, SheetOptions, contact_sheet, sheet_departure
-from cmfsim.meshing.node_kinds import DentalArches, KindOptions
+from cmfsim.bones.contact_sheets import ContactSheet, SheetOptions, contact_sheet, sheet_departure
+from cmfsim.meshing.node_kinds.arches import DentalArches
+from cmfsim.meshing.node_kinds.options import KindOptions
 from cmfsim.surfaces.depth import distances
 from cmfsim.surfaces.levels import contact_surface
 from cmfsim.values.anatomy import Anatomy, BoneSegment

@@ -12,8 +12,12 @@ from cmfsim.muscles.equivalent import (
     equivalent_material,
     prepared_muscles,
 )
-from cmfsim.muscles.template import MuscleTemplate
-from cmfsim.muscles.template.muscle_template import MorphedMusculature, too_few, without_lost
+from cmfsim.muscles.template.muscle_template import (
+    MorphedMusculature,
+    MuscleTemplate,
+    too_few,
+    without_lost,
+)
 from cmfsim.values.case_parts import CaseMuscles
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding

@@ -9,22 +9,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmfsim._core import Surface, TetMesh, distance_image
 from cmfsim.io import Case, read_tet_mesh
-from cmfsim.meshing import (
+from cmfsim.meshing.levels import TissueRegion, near_skin
+from cmfsim.meshing.lips import LipSeam
+from cmfsim.meshing.node_kinds.arches import DentalArches
+from cmfsim.meshing.node_kinds.classification import classify_nodes
+from cmfsim.meshing.node_kinds.options import KindOptions
+from cmfsim.meshing.node_kinds.septum import lifted_tissue, septum
+from cmfsim.meshing.stuffing import (
     MeshOptions,
-    TissueRegion,
     mesh_findings,
     mesh_from_level,
     mesh_report,
-    near_skin,
     report_of_part,
-)
-from cmfsim.meshing.lips import LipSeam
-from cmfsim.meshing.node_kinds import (
-    DentalArches,
-    KindOptions,
-    classify_nodes,
-    lifted_tissue,
-    septum,
 )
 from cmfsim.pipeline.building.case_checks import (
     CaseLipContact,
