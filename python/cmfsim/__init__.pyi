@@ -133,9 +133,9 @@ from cmfsim.meshing.levels import TissueRegion as TissueRegion
 from cmfsim.meshing.levels import anatomy_from_surfaces as anatomy_from_surfaces
 from cmfsim.meshing.levels import signed_level as signed_level
 from cmfsim.meshing.levels import tissue_level as tissue_level
-from cmfsim.meshing.lips import LipSeam as LipSeam
-from cmfsim.meshing.lips import lip_regions as lip_regions
-from cmfsim.meshing.lips import lip_seam as lip_seam
+from cmfsim.meshing.lips.seam import LipSeam as LipSeam
+from cmfsim.meshing.lips.seam import lip_regions as lip_regions
+from cmfsim.meshing.lips.seam import lip_seam as lip_seam
 from cmfsim.meshing.node_kinds.arches import DentalArches as DentalArches
 from cmfsim.meshing.node_kinds.arches import dental_arches as dental_arches
 from cmfsim.meshing.node_kinds.classification import ClassifiedNodes as ClassifiedNodes

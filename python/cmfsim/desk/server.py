@@ -26,7 +26,7 @@ from cmfsim.errors import CaseInputError, CmfsimError, LandmarkError
 from cmfsim.io import Case, read_landmark_file, replacing, write_landmarks
 from cmfsim.io.files.reading_writing import toml_module
 from cmfsim.pipeline.building.inputs import plan_key, read_placed_sites
-from cmfsim.planning.landmark_page import landmark_page_text
+from cmfsim.planning.landmark_page.page import landmark_page_text
 from cmfsim.planning.page import PageContent
 from cmfsim.planning.page.document import Document, document_text, shown_values
 from cmfsim.planning.server import SOLVE, LocalServer, RefusedError, Reply, solved_reply

@@ -31,13 +31,10 @@ from cmfsim.doctor.surgery.operation import (
     pieces_of,
     vertices_of,
 )
-from cmfsim.doctor.surgery.plan import SizedMotion as SizedMotion
-from cmfsim.doctor.surgery.plan import check_motion_size as check_motion_size
 from cmfsim.doctor.surgery.plan import state_plan
 from cmfsim.io import CaseOrPath, as_case
 from cmfsim.values.clinical_motion import ClinicalMotion
 from cmfsim.values.finding import SEVERITIES, Finding
-from cmfsim.values.finding import findings_text as findings_text
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cmfsim.doctor import examine, findings_text
+from cmfsim.doctor import examine
 from cmfsim.errors import CaseError, CaseInputError, CmfsimError, error_text
 from cmfsim.evaluation.models import NO_CHANGE, ErrorTable
 from cmfsim.evaluation.statistics import DistanceStatistics
@@ -34,6 +34,7 @@ from cmfsim.processes.worker import Worker, WorkerEndedError, WorkerFailedError
 from cmfsim.report import Figure, study_document
 from cmfsim.report.study import table3_text
 from cmfsim.values.checks import as_whole
+from cmfsim.values.finding import findings_text
 
 # Lines of a failed case's log that are shown.
 SHOWN_LINES = 12

@@ -154,7 +154,7 @@ def test_colours_follow_the_terminal_and_no_color(monkeypatch):
     monkeypatch.setenv("NO_COLOR", "1")
     assert not in_colour(Terminal())
     finding = cmfsim.Finding("x", "something", severity="error")
-    assert "\x1b[31;1merror\x1b[0m" in cmfsim.doctor.findings_text([finding], colour=True)
+    assert "\x1b[31;1merror\x1b[0m" in cmfsim.values.finding.findings_text([finding], colour=True)
 
 
 def leaves(parser, name="cmfsim"):

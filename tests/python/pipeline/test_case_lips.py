@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 import cmfsim
 import phantom_case
-from cmfsim.meshing.lips import seam_faces
+from cmfsim.meshing.lips.seam import seam_faces
 
 pytest.importorskip("skimage", reason="needs scikit-image (pip install '.[imaging]')")
 

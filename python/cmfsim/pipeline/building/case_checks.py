@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import TetMesh
-from cmfsim.doctor import SizedMotion, check_motion_size
 from cmfsim.doctor.sites.landmarks import check_landmarks, nearest_of_level, nearest_of_surfaces
 from cmfsim.doctor.surgery.bone_overlap import BonePart, check_jaws, jaw_of
-from cmfsim.doctor.surgery.plan import SMALL, nothing_moves
+from cmfsim.doctor.surgery.plan import SMALL, SizedMotion, check_motion_size, nothing_moves
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.meshing.levels import TissueRegion
-from cmfsim.meshing.lips import LipSeam
+from cmfsim.meshing.lips.seam import LipSeam
 from cmfsim.meshing.node_kinds.arches import DentalArches
 from cmfsim.pipeline.building.surgery.motions import PlannedBones
 from cmfsim.pipeline.building.tissue.contacts import CaseContacts

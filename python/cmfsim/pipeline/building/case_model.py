@@ -20,7 +20,7 @@ from cmfsim.doctor.sites.landmarks import LANDMARK_CODES
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, CaseOrPath, as_case
 from cmfsim.meshing.levels import tissue_level
-from cmfsim.meshing.lips import seam_faces
+from cmfsim.meshing.lips.seam import seam_faces
 from cmfsim.meshing.node_kinds.arches import dental_arches
 from cmfsim.meshing.node_kinds.classification import segment_data
 from cmfsim.meshing.node_kinds.options import KindOptions, kind_options

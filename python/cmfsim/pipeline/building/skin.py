@@ -15,7 +15,7 @@ from cmfsim._core import Surface, TetMesh, rigid_fit
 from cmfsim.errors import CaseInputError, MeshError, MeshInputError, RegistrationError
 from cmfsim.io import Case, read_landmark_file, read_surface
 from cmfsim.io.meshes.photos import read_photo
-from cmfsim.meshing.lips import LipSeam, lip_regions, lip_seam
+from cmfsim.meshing.lips.seam import LipSeam, lip_regions, lip_seam
 from cmfsim.meshing.lips.sheet import facing
 from cmfsim.meshing.node_kinds.arches import DentalArches
 from cmfsim.meshing.stuffing import separated_mesh

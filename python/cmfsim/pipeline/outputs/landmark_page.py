@@ -4,7 +4,7 @@ from pathlib import Path
 
 from cmfsim.io import replacing
 from cmfsim.pipeline.proposing import GivenSites, ProposedHead, head_distribution
-from cmfsim.planning.landmark_page import PageSite, landmark_content, landmark_page_text
+from cmfsim.planning.landmark_page.page import PageSite, landmark_content, landmark_page_text
 from cmfsim.planning.page import PageContent
 from cmfsim.registration.proposed.shape_model.site_covariance import PLACED_STD, SiteDistribution
 from cmfsim.registration.proposed.template_head import average_head

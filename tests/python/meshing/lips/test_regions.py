@@ -6,7 +6,7 @@ import pytest
 import cmfsim
 import lip_head
 from cmfsim.errors import CaseError
-from cmfsim.meshing.lips import seam_faces
+from cmfsim.meshing.lips.seam import seam_faces
 from cmfsim.surfaces.topology import connected_labels, edges_of
 
 pytest.importorskip("scipy", reason="needs scipy (pip install '.[imaging]')")

@@ -77,7 +77,7 @@ def test_a_row_without_a_premolar_has_no_sixth_tooth(monkeypatch):
 
 def test_a_bar_without_teeth_has_no_molars():
     upper, _ = heads.closed_rows()
-    smooth = cmfsim.planning.occlusion.ToothRow(upper.segment, horseshoe(upper.arch), upper.arch)
+    smooth = cmfsim.ToothRow(upper.segment, horseshoe(upper.arch), upper.arch)
     assert all("gaps" in why or "ends" in why for why in first_molars(smooth).values())
 
 

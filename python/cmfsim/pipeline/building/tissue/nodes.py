@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim._core import Surface, TetMesh, distance_image
 from cmfsim.io import Case, read_tet_mesh
 from cmfsim.meshing.levels import TissueRegion, near_skin
-from cmfsim.meshing.lips import LipSeam
+from cmfsim.meshing.lips.seam import LipSeam
 from cmfsim.meshing.node_kinds.arches import DentalArches
 from cmfsim.meshing.node_kinds.classification import classify_nodes
 from cmfsim.meshing.node_kinds.options import KindOptions
