@@ -220,17 +220,21 @@ def _columella(profile: Floats, known: Mapping[str, Floats]) -> Floats:
 def _lips(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
     """The profiles of the upper and the lower lip, divided at the deepest point between them."""
     part = _between(profile, known, "labiale_superius", "labiale_inferius")
-    deepest = _deepest(part)
-    if not 0 < deepest < len(part) - 1:
-        raise LandmarkInputError("the profile shows no cleft between the lips")
+    deepest = _deepest(part, "the profile shows no cleft between the lips")
     return part[: deepest + 1], part[deepest:]
 
 
-def _deepest(part: Floats) -> int:
-    """The point of a part of the profile furthest behind, or above, the line between its ends."""
+def _deepest(part: Floats, without: str) -> int:
+    """The point of a part of the profile furthest behind, or above, the line between its ends.
+
+    without: What the error says where that is one of the ends.
+    """
     (dy, dz) = (part[-1] - part[0])[1:]
     away = part - part[0]
-    return int(np.argmax(away[:, 2] * dy - away[:, 1] * dz))
+    deepest = int(np.argmax(away[:, 2] * dy - away[:, 1] * dz))
+    if not 0 < deepest < len(part) - 1:
+        raise LandmarkInputError(without)
+    return deepest
 
 
 def _stomia(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]:
@@ -251,10 +255,7 @@ def _open(profile: Floats, known: Mapping[str, Floats]) -> tuple[Floats, Floats]
 def _sublabiale(profile: Floats, known: Mapping[str, Floats]) -> Floats:
     """The point between lower lip and chin furthest behind the line that connects them."""
     part = _between(profile, known, "labiale_inferius", "pogonion")
-    deepest = _deepest(part)
-    if not 0 < deepest < len(part) - 1:
-        raise LandmarkInputError("the profile has no fold between lower lip and chin")
-    fold: Floats = part[deepest]
+    fold: Floats = part[_deepest(part, "the profile has no fold between lower lip and chin")]
     return fold
 
 
@@ -278,10 +279,7 @@ def _cervical_point(profile: Floats, known: Mapping[str, Floats]) -> Floats:
         raise LandmarkInputError(
             f"the image does not show the skin {LEAST_THROAT:g} mm below menton, down the neck"
         )
-    corner = _deepest(throat)
-    if not 0 < corner < len(throat) - 1:
-        raise LandmarkInputError("there is no angle between chin and neck")
-    angle: Floats = throat[corner]
+    angle: Floats = throat[_deepest(throat, "there is no angle between chin and neck")]
     return angle
 
 
