@@ -294,11 +294,18 @@ def _check_jaw_of_placed(
 
 
 def _not_found(reason: str, count: int) -> Finding:
-    code, what = "landmarks-not-found", "the case names no landmarks, and none"
     if count:
-        code = "landmarks-not-completed"
-        what = f"the case names {count} landmarks of the skull, and no others"
-    return Finding(code, f"{what} were found automatically: {reason}", where="landmarks")
+        return Finding(
+            "landmarks-not-completed",
+            f"the case names {count} landmarks of the skull, and no others were found "
+            f"automatically: {reason}",
+            where="landmarks",
+        )
+    return Finding(
+        "landmarks-not-found",
+        f"the case names no landmarks, and none were found automatically: {reason}",
+        where="landmarks",
+    )
 
 
 def landmark_summary(found: ProposedLandmarks) -> dict[str, Any]:
