@@ -25,6 +25,7 @@ from cmfsim.imaging.morphology import (
 )
 from cmfsim.imaging.skins.skin import Skin
 from cmfsim.imaging.working_grid import Working
+from cmfsim.registration.proposed.shape_model.fitted_head import FittedHead
 from cmfsim.values.checks import Floats
 from cmfsim.values.finding import Finding
 
@@ -92,6 +93,9 @@ BEFORE_RAMUS = 5.0
 # within 2 mm in the four joints of two skulls in which it was measured.
 CONDYLE = (15.0, 0.5, -12.0)
 CONDYLES = ("condyle_L", "condyle_R")
+# Within this of its middle, along each axis, a condyle is what hangs on the mandible below the
+# first of these heights, from its middle, below which nothing of the skull does, mm.
+JOINT_BOX, CONDYLE_ENDS = 20.0, (3.0, 0.0, -3.0)
 # Depth in bone that counts as much as FLOOD_HU, mm.
 FLOOD_DEPTH = 3.0
 # A joint space is dark before it is open, HU.
@@ -165,6 +169,7 @@ def part_jaws(
         if bone.cavity is not None:
             seeds[bone.cavity[box]] = 2
         _tooth_rows(seeds, sites, *_axes(part, domain), crown=crown)
+        _joint_seeds(seeds, domain, part, head)
         _placed(seeds, domain, part, given)
     height = None if rows is None else float(rows[0][2])
     if not ((seeds == 1).any() and (seeds == 2).any()):
@@ -289,6 +294,33 @@ def _placed(
     _balls(seeds, domain, work, landmarks, names=ON_CRANIUM, value=2)
     _balls(seeds, domain, work, landmarks, names=(*ON_MANDIBLE, *CONDYLES), value=1)
     seeds[~domain] = 0
+
+
+def _joint_seeds(seeds: NDArray[np.int32], domain: Mask, work: Working, head: FittedHead) -> None:
+    """Adds a ball of the mandible in each condyle of the model, unless the mouth is open.
+
+    One that touches its fossa would be cut off at its neck, which is narrower. A condyle hangs on
+    the mandible below the joints; what lies behind it, before the ear, does not. That of an open
+    mouth has left its fossa.
+    """
+    if (head.jaw != np.eye(4)).any():
+        return
+    own = {name: head.state.into(p[None])[0] for (_, name), p in head.sites.items()}
+    joints = {name: head.state.out(p[None])[0] for name, p in _condyles(own).items()}
+    up = head.state.linear[2] / head.state.scale
+    for name, place in joints.items():
+        low, high = ((place - work.origin + d) / work.spacing for d in (-JOINT_BOX, JOINT_BOX))
+        ends = zip(low, high, domain.shape, strict=True)
+        box = tuple(slice(max(int(a), 0), max(min(int(b), n), 0)) for a, b, n in ends)
+        part, bone, near = seeds[box], domain[box], work.part(box)
+        if not bone.any():
+            continue
+        height = sum(a * u for a, u in zip(_axes(near, bone), up, strict=True)) - float(place @ up)
+        for end in CONDYLE_ENDS:
+            held = reached(bone & (height < end), part == 1)
+            if not (part[held] == 2).any():
+                _balls(part, held, near, joints, names=(name,), value=1)
+                break
 
 
 def _axes(work: Working, domain: Mask) -> tuple[Any, Any, Any]:
