@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmfsim.registration.proposed.definitions.groups import FAR_JAW, jaw_distance
+from cmfsim.registration.proposed.definitions.side_sites import HIDDEN_RAMUS
 from cmfsim.registration.proposed.definitions.skull_sites import LOWER_CROWN
 from cmfsim.registration.proposed.pose import Pose
 from cmfsim.values.checks import Floats, Indices
@@ -37,7 +38,8 @@ LEAST_SIDE = 1.0 / 3.0
 # Error that sites are expected to have on such a jaw, mm of the average head: those of the molars
 # and the ramus were off by up to 10 mm, the others by up to 4.
 WEAK_ERROR, WEAK_FRONT_ERROR = 10.0, 5.0
-BACK_SITES = ("sub_m2", "supra_m2", "occlusal_line", "gonion")
+MOLAR_SITES = ("sub_m2", "supra_m2", "occlusal_line")
+BACK_SITES = (*MOLAR_SITES, "gonion")
 FRONT_SITES = ("infradentale", "supradentale", "mid_philtrum", "supramentale", "pogonion", "menton")
 MOUTH_SITES = ("labiale_inferius", "cheilion")
 # Sites of the average head that separate jaws whose own sites are not known.
@@ -52,12 +54,14 @@ class JawEvidence:
 
     impossible: Why it cannot be a lower jaw; empty where it can.
     doubts: Why its sites, and those of the upper tooth row, may be wrong.
+    hidden: The sides, "L" and "R", on which the front of its ramus is hidden.
     is_open: Whether the rows are too far apart to tell of each other.
     """
 
     impossible: str
     doubts: tuple[str, ...]
     is_open: bool = False
+    hidden: tuple[str, ...] = ()
 
     @property
     def is_only_open(self) -> bool:
@@ -76,7 +80,7 @@ def jaw_evidence(
     """Evidence against a jaw.
 
     sites: mapping of str to (3,), of the skull, in the frame and size of the average head, with the
-        edges of the incisors as "_upper_edge" and "_lower_edge".
+        edges of the incisors as "_upper_edge" and "_lower_edge", and `HIDDEN_RAMUS`.
     lower: The mandible, mm.
     left_out: Sites of the jaw that do not fit the others, with how far they are off, average-head
         mm.
@@ -84,7 +88,8 @@ def jaw_evidence(
     sides = _volumes(pose.into(lower.vertices) / pose.size, lower.triangles)
     impossible = "; ".join(_impossible(sites, sum(sides), pose.size))
     doubts = tuple(_doubts(sites, sides, pose.size, left_out))
-    return JawEvidence(impossible, doubts, _opening(sites) > WIDE)
+    hidden = tuple(side for side in "LR" if f"{HIDDEN_RAMUS}{side}" in sites)
+    return JawEvidence(impossible, doubts, _opening(sites) > WIDE, hidden)
 
 
 def _impossible(sites: Mapping[str, Floats], volume: float, size: float) -> Iterator[str]:
@@ -178,11 +183,15 @@ def weakened(
     Those of the skin rest on the jaw where the mouth is open: its corners and the lower lip are
     looked for where a closed one has them.
     """
-    if not evidence.reason or (kind == "skin" and not evidence.is_open):
-        return dict(sites)
-    weak = (*BACK_SITES, *FRONT_SITES) if kind == "skull" else MOUTH_SITES
     result = dict(sites)
-    for name, site in sites.items():
+    for name in (f"{site}_{side}" for site in MOLAR_SITES for side in evidence.hidden):
+        if kind == "skull" and name in sites:
+            reason = "crowns of metal or streaks hide the front of the ramus"
+            result[name] = sites[name].doubted(reason, size * WEAK_ERROR)
+    if not evidence.reason or (kind == "skin" and not evidence.is_open):
+        return result
+    weak = (*BACK_SITES, *FRONT_SITES) if kind == "skull" else MOUTH_SITES
+    for name, site in result.items():
         least = WEAK_ERROR if name.startswith(BACK_SITES) else WEAK_FRONT_ERROR
         if name.startswith(weak):
             result[name] = site.doubted(f"its jaw: {evidence.reason}", size * least)
