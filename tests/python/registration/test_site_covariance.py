@@ -5,7 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cmfsim.registration.proposed.proposal import SitesOfKind, likeliest, without_outliers
+from cmfsim.registration.proposed.proposal import (
+    SitesOfKind,
+    likeliest,
+    with_model,
+    without_outliers,
+)
 from cmfsim.registration.proposed.shape_model.site_covariance import (
     PLACED_STD,
     SITES,
@@ -117,6 +122,19 @@ def test_a_site_far_from_the_models_goes_where_the_others_put_it_and_takes_none_
     found = likeliest([SitesOfKind("skull", sites, {}, {False: object(), True: object()})], model)
     for name, place in head.items():
         assert np.linalg.norm(found["skull", name][0] - place) < 1.0, name
+
+
+def test_a_site_that_its_definition_finds_elsewhere_is_as_unsure_as_half_their_distance():
+    place = np.array([60.0, -10.0, 5.0])
+    key = ("skull", "supraglenoid_L")
+    head = SimpleNamespace(sites={key: place}, shows=lambda _: True)
+    surface = SimpleNamespace(closest=lambda points: (points, None, None))
+    errors = []
+    for gaps in ({}, {key: 18.0}):
+        missing = {key[1]: "it is inconsistent"}
+        found = SitesOfKind("skull", {}, missing, {False: surface}, gaps)
+        errors.append(with_model(found, {key: (place, 2.9)}, head, 1.0)[0][key[1]].error)
+    assert errors == [2.9, 9.0]
 
 
 def test_a_head_in_another_pose_and_size_has_the_same_distribution(bone):

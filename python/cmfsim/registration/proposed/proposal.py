@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -57,6 +57,8 @@ DOUBTFUL, REPLACED = 1.75, 2.5
 # Share of its distance from the model's that adds to the expected error of a site: the least with
 # which 95 % of the sites of five unseen scans lie within twice the error; of four, 0.15 to 0.3.
 GAP_SHARE = 0.3
+# Share of the distance of two places that a site is expected to be off, if either may be right.
+GAP_HALF = 0.5
 # How far from its surface a likely place may lie, mm of the average head.
 FARTHEST = 8.0
 
@@ -72,12 +74,16 @@ LEVEL_ROUNDS, LAST_ROUNDS = 6, 5
 
 @dataclass(frozen=True, eq=False)
 class SitesOfKind:
-    """Sites of skull or skin, those that are missing, and the surface of each site."""
+    """Sites of skull or skin, those that are missing, and the surface of each site.
+
+    gaps: mm. How far from where the others place it a site was found that contradicts them.
+    """
 
     kind: str
     sites: Mapping[str, ProposedSite]
     missing: Mapping[str, str]
     surfaces: Mapping[bool, Surface]
+    gaps: Mapping[SiteKey, float] = field(default_factory=dict)
 
     def surface_of(self, name: str) -> Surface | None:
         """The surface a site lies on; True is that of the lower jaw."""
@@ -154,7 +160,8 @@ def with_model(
         if deviations >= DOUBTFUL:
             reason = f"the shape of the whole head places it {gap:.1f} mm away"
             reason += "; placed by the others" * (deviations > REPLACED and moved is not None)
-            sites[name] = ProposedSite(point, site.error, site.doubt).doubted(reason, 0.5 * gap)
+            doubtful = ProposedSite(point, site.error, site.doubt)
+            sites[name] = doubtful.doubted(reason, GAP_HALF * gap)
     for name, reason in found.missing.items():
         if IMAGE_ENDS in reason or found.surface_of(name) is None:
             continue
@@ -162,8 +169,10 @@ def with_model(
         moved = _surface_place(found, name, place, size) if head.shows(place) else None
         if moved is not None:
             doubt = f"{reason}; placed by the shape of the head"
-            # A place that no surface is near is less certain than the shapes of heads tell.
+            # A place that no surface is near is less certain than the shapes of heads tell, as is
+            # one that its definition contradicts.
             error = float(np.hypot(error, np.linalg.norm(moved - place)))
+            error = max(error, GAP_HALF * found.gaps.get((kind, name), 0.0))
             sites[name] = ProposedSite(moved, error, doubt)
             del missing[name]
     order = [name for of, name in head.sites if of == kind and name in sites]
@@ -249,10 +258,10 @@ def landmarks_from(
     if evidence.impossible or parts.lower is None:
         # The model puts no site on a surface that is no jaw.
         del surface[True]
-    of_skull = SitesOfKind("skull", weakened(sites, evidence, pose.size), gone.skull, surface)
+    of_skull = SitesOfKind("skull", weakened(sites, evidence, pose.size), gone.skull, surface, odd)
     lost = gone.skin if skin is not None else dict.fromkeys(SKIN_LANDMARKS, "no skin is given")
     of_mouth = weakened(judged(on_skin, pose, max(likeness)), evidence, pose.size, "skin")
-    of_skin = SitesOfKind("skin", of_mouth, lost, by_skin)
+    of_skin = SitesOfKind("skin", of_mouth, lost, by_skin, odd)
     of_skull, of_skin = without_outliers((of_skull, of_skin))
     likely = likeliest((of_skull, of_skin), fitted)
     all_skull, missing_skull = with_model(of_skull, likely, fitted, pose.size)
