@@ -145,7 +145,11 @@ def segmented(
     air = None if hollow is None else work.image(hollow)
     levels = skinned.result(), bones, air, teeth
     boxes = tuple(thing.box for thing in attached)
-    return Anatomy(*levels, findings, shown=work.shown, attached=boxes), head
+    vessels = np.zeros((0, 3))
+    if bone.vessels is not None:
+        # Every second voxel shows where they lie.
+        vessels = work.origin + 2.0 * work.spacing * np.argwhere(bone.vessels[::2, ::2, ::2])
+    return Anatomy(*levels, findings, shown=work.shown, attached=boxes, vessels=vessels), head
 
 
 def _opened(

@@ -47,6 +47,8 @@ VOXEL_ERROR = 0.5
 # A site of the skin this near to something on the face may lie on it, and is then expected to be
 # off by the second, mm.
 ON_THINGS, UNDER_THINGS = 5.0, 8.0
+# What is left of a vessel that was taken out of the bone lies within this of it, mm.
+BY_VESSEL = 8.0
 # A site that moves by more when the jaws are separated again is doubtful, mm.
 MOVED = 3.5
 # What a template head keeps its surfaces in.
@@ -229,7 +231,8 @@ def _proposed(anatomy: Anatomy, heads: Sequence[TemplateHead]) -> ProposedHead:
         # The voxels of an image blur what the definitions read.
         blur = VOXEL_ERROR * float(anatomy.skin.spacing.max())
         on_skin = _under_things(_blurred(found.skin, blur), anatomy.attached)
-        found = replace(found, skull=_blurred(found.skull, blur), skin=on_skin)
+        on_bone = _by_vessels(_blurred(found.skull, blur), anatomy.vessels)
+        found = replace(found, skull=on_bone, skin=on_skin)
     return ProposedHead(anatomy, bones, skin, found)
 
 
@@ -246,6 +249,16 @@ def _under_things(
         near = ((b[0] - ON_THINGS < site.point) & (site.point < b[1] + ON_THINGS) for b in boxes)
         if any(inside.all() for inside in near):
             reason = "something that is no part of the face lies there (skin-attachment)"
+            result[name] = site.doubted(reason, UNDER_THINGS)
+    return result
+
+
+def _by_vessels(sites: Mapping[str, ProposedSite], vessels: Floats) -> dict[str, ProposedSite]:
+    """The sites of the skull, those doubtful beside which a vessel was taken out of the bone."""
+    result = dict(sites)
+    for name, site in sites.items():
+        if (np.linalg.norm(vessels - site.point, axis=1) < BY_VESSEL).any():
+            reason = "a vessel with contrast agent was taken out of the bone there (bone-vessels)"
             result[name] = site.doubted(reason, UNDER_THINGS)
     return result
 

@@ -67,6 +67,8 @@ class Anatomy(Frozen):
         What padding surrounds in the image, mm; None where there is none.
     attached : tuple of (2, 3) float64
         The lowest and the highest corner of each thing on the face that is no part of it, mm.
+    vessels : (n, 3) float64, mm
+        Where vessels with contrast agent were taken out of the bone.
     """
 
     skin: ImageData
@@ -77,6 +79,7 @@ class Anatomy(Frozen):
     surfaces: Mapping[str, SurfaceData] = field(default_factory=dict)
     shown: ShownRegion | None = None
     attached: tuple[Floats, ...] = ()
+    vessels: Floats = field(default_factory=lambda: np.zeros((0, 3)))
 
     __repr__ = brief
 

@@ -9,6 +9,8 @@ import pytest
 import cmfsim
 from benches.scenes.clinic_scans import with_contrast
 from cmfsim import SegmentOptions, segment_head
+from cmfsim.pipeline.proposing import UNDER_THINGS, _by_vessels
+from cmfsim.values.proposed_landmarks import ProposedSite
 from synthetic_head import made_head
 
 pytest.importorskip("SimpleITK", reason="needs SimpleITK (pip install '.[imaging]')")
@@ -56,6 +58,10 @@ def test_vessels_leave_the_bone_as_it_is_without_them(head, plain):
     (finding,) = [f for f in found.findings if f.code == "bone-vessels"]
     assert finding.severity == "warning"
     assert "320 HU" in finding.what
+    away = np.hypot(np.abs(found.vessels[:, 0]) - 36.0, found.vessels[:, 1] - 20.0)
+    assert len(away)
+    assert np.quantile(away, 0.95) < 7.0
+    assert not len(plain.vessels)
     assert "bone-vessels" not in codes(plain)
     assert added(found, plain) < 200.0
     assert added(plain, found) < 200.0
@@ -72,6 +78,15 @@ def test_bone_that_is_no_vessel_stays(head, plain, hu, length, radius):
     assert added(found, plain) > 2000.0
 
 
+def test_sites_beside_a_vessel_that_was_taken_out_are_doubtful():
+    sites = {"near": ProposedSite(np.zeros(3), 2.0), "far": ProposedSite(np.full(3, 6.0), 2.0)}
+    marked = _by_vessels(sites, np.array([[3.0, 0.0, 0.0], [-90.0, 0.0, 0.0]]))
+    assert "bone-vessels" in marked["near"].doubt
+    assert marked["near"].error == UNDER_THINGS
+    assert marked["far"] is sites["far"]
+    assert _by_vessels(sites, np.zeros((0, 3))) == sites
+
+
 @pytest.mark.parametrize(("density", "vessel"), [(900.0, True), (400.0, False)])
 def test_bone_that_is_nowhere_compact_is_no_vessel(density, vessel):
     """A rod of 320 HU beside a plate: a vessel only where the plate is much denser."""
@@ -80,8 +95,9 @@ def test_bone_that_is_nowhere_compact_is_no_vessel(density, vessel):
     hu[:12] = density
     rod = np.broadcast_to(np.hypot(x - 28.0, y - 20.0) < 5.0, hu.shape)
     hu[rod] = 320.0
-    _, kept, findings = without_vessels(hu, hu > 250.0, np.ones(3))
+    _, kept, vessels, findings = without_vessels(hu, hu > 250.0, np.ones(3))
     assert bool(findings) is vessel
+    assert (vessels is not None) is vessel
     assert bool((kept & rod).any()) is not vessel
     assert kept[:12].all()
 

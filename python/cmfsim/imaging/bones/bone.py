@@ -76,6 +76,7 @@ class Bone:
     bare: (nx, ny, nz) bool. Pieces as dense as bone that are none: no tissue covers them.
     cavity: (nx, ny, nz) bool or None, where the brain is; None where no skull encloses it in the
         image.
+    vessels: (nx, ny, nz) bool or None. Where contrast agent was taken out.
     """
 
     hu: Volume
@@ -84,6 +85,7 @@ class Bone:
     solid: Mask
     bare: Mask
     cavity: Mask | None
+    vessels: Mask | None
     findings: tuple[Finding, ...]
 
 
@@ -101,7 +103,7 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     hu = metal.hu
     solid = without_streaks(hu > threshold, metal, work.spacing, bone=True)
     solid &= under > options.least_skin
-    hu, solid, vessels = without_vessels(hu, solid, work.spacing)
+    hu, solid, vessels, noticed = without_vessels(hu, solid, work.spacing)
     solid, bare, islands = _without_islands(solid, under < thin, work, options)
     with ThreadPoolExecutor(1) as beside:
         walls = beside.submit(_walls, hu, solid, under, work, options)
@@ -110,7 +112,8 @@ def find_bone(work: Working, metal: Metal, skin: Skin, options: SegmentOptions) 
     surface = hu
     if options.bone_threshold is None:
         surface, mask = at_half_height(hu, mask, threshold, BONE_SCALE, work.spacing)
-    return Bone(hu, surface, mask, solid & mask, bare, cavity, (*vessels, *islands))
+    findings = (*noticed, *islands)
+    return Bone(hu, surface, mask, solid & mask, bare, cavity, vessels, findings)
 
 
 def bone_level(bone: Bone, options: SegmentOptions) -> Volume:

@@ -27,18 +27,18 @@ FEWEST = 30
 
 def without_vessels(
     hu: Volume, solid: Mask, spacing: NDArray[np.float64]
-) -> tuple[Volume, Mask, list[Finding]]:
-    """HU with vessels as soft tissue, bone without them, and a finding if there are any.
+) -> tuple[Volume, Mask, Mask | None, list[Finding]]:
+    """HU with vessels as soft tissue, bone without them, the vessels and a finding on them.
 
     A vessel is a long slender piece of bone that is nowhere compact, with what is as dense near it.
     """
     thick = shrunk(solid)
     if not thick.any():
-        return hu, solid, []
+        return hu, solid, None, []
     sparse = solid & (hu < min(COMPACT, PART_OF_MEDIAN * float(np.median(hu[thick]))))
     vessels = _long_pieces(shrunk(sparse), spacing)
     if not vessels.any():
-        return hu, solid, []
+        return hu, solid, None, []
     apart = depth(vessels, spacing, BRANCHES)
     densest = float(np.quantile(hu[vessels], 0.95))
     branches = opened(sparse & (hu <= densest), BRANCH, spacing) & (apart > -BRANCHES)
@@ -51,7 +51,8 @@ def without_vessels(
         "were taken out of the bone"
     )
     cleared = np.where(blurred, np.minimum(hu, np.float32(SOFT)), hu)
-    return np.asfortranarray(cleared), solid & ~found, [Finding("bone-vessels", what, where="bone")]
+    finding = Finding("bone-vessels", what, where="bone")
+    return np.asfortranarray(cleared), solid & ~found, found, [finding]
 
 
 def _long_pieces(mask: Mask, spacing: NDArray[np.float64]) -> Mask:
