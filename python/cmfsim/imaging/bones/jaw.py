@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -93,9 +94,10 @@ BEFORE_RAMUS = 5.0
 # within 2 mm in the four joints of two skulls in which it was measured.
 CONDYLE = (15.0, 0.5, -12.0)
 CONDYLES = ("condyle_L", "condyle_R")
-# Within this of its middle, along each axis, a condyle is what hangs on the mandible below the
-# first of these heights, from its middle, below which nothing of the skull does, mm.
-JOINT_BOX, CONDYLE_ENDS = 20.0, (3.0, 0.0, -3.0)
+# Within this of its middle, along each axis, a condyle is what hangs on the mandible through bone
+# deeper than the first of these, below the first of these heights from its middle, with which
+# nothing of the skull does, mm.
+JOINT_BOX, CORES, CONDYLE_ENDS = 20.0, (1.5, 2.0), (3.0, 0.0, -3.0)
 # Depth in bone that counts as much as FLOOD_HU, mm.
 FLOOD_DEPTH = 3.0
 # A joint space is dark before it is open, HU.
@@ -312,12 +314,14 @@ def _joint_seeds(seeds: NDArray[np.int32], domain: Mask, work: Working, head: Fi
         low, high = ((place - work.origin + d) / work.spacing for d in (-JOINT_BOX, JOINT_BOX))
         ends = zip(low, high, domain.shape, strict=True)
         box = tuple(slice(max(int(a), 0), max(min(int(b), n), 0)) for a, b, n in ends)
-        part, bone, near = seeds[box], domain[box], work.part(box)
+        part, near = seeds[box], work.part(box)
+        bone = np.asfortranarray(domain[box])
         if not bone.any():
             continue
         height = sum(a * u for a, u in zip(_axes(near, bone), up, strict=True)) - float(place @ up)
-        for end in CONDYLE_ENDS:
-            held = reached(bone & (height < end), part == 1)
+        deep = depth(bone, work.spacing)
+        for core, end in product(CORES, CONDYLE_ENDS):
+            held = reached((deep > core) & (height < end), part == 1)
             if not (part[held] == 2).any():
                 _balls(part, held, near, joints, names=(name,), value=1)
                 break
