@@ -231,7 +231,8 @@ MOLAR_SHARE, OVERJET, LEAST_CROWN = 0.803, 6.0, 6.0
 # From the plane where the molars meet up and down to the sites, and how far back the lower is, mm.
 OVER_MOLARS, UNDER_MOLARS, LOWER_BEHIND = 13.0, 19.5, 3.8
 # The front of the ramus lies within 5.3 mm of where it is so far above the teeth, in two real heads
-# in eight shapes each: what stands farther in front are crowns of metal and their streaks, mm.
+# in eight shapes each: what stands farther in front are crowns of metal and their streaks. They may
+# also have erased it. mm.
 ABOVE_CROWNS, MOST_AHEAD = 12.0, 6.0
 # Where molars stand across, mm.
 MOLAR_ROW = (12.0, 32.0)
@@ -253,13 +254,13 @@ def _teeth_line(view: SideView, found: Sites) -> None:
     hidden = f"{HIDDEN_RAMUS}{view.letter}"
     for _ in range(3):
         front, above = (_ramus_front(view.jaw, level + up) for up in (0.0, ABOVE_CROWNS))
+        found.pop(hidden, None)
+        if above is not None and (front is None or front < above - MOST_AHEAD):
+            front = above
+            found[hidden] = np.array([0.0, front, level])
         if front is None:
             return
         border = front
-        found.pop(hidden, None)
-        if above is not None and front < above - MOST_AHEAD:
-            border = above
-            found[hidden] = np.array([0.0, border, level])
         molar = float(neck[1]) + MOLAR_SHARE * (border - behind - float(neck[1]))
         row = teeth[np.abs(teeth[:, 1] - molar - behind) < 4.0]
         if len(row) < 10:
