@@ -15,7 +15,7 @@ from cmfsim.cli import DONE, FAILED
 from cmfsim.cli.case_commands import band_options, case_of, checked
 from cmfsim.cli.terminal import Notices, StageProgress, escaped, print_json, print_text
 from cmfsim.errors import CmfsimError
-from cmfsim.io import Cohort, Variants, read_landmark_file, replacing
+from cmfsim.io import Cohort, Variants, read_landmark_file, replace_text
 from cmfsim.io.results.predictions import predictions_of
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs import results
@@ -184,10 +184,9 @@ def sensitivity(options: argparse.Namespace) -> int:
             observer=notices,
         )
     values = {**found.as_dict(), "findings": notices.as_dicts()}
-    text = json.dumps(values, indent=1, allow_nan=False)
     case.output.mkdir(parents=True, exist_ok=True)
-    with replacing(case.output / "sensitivity.json") as file:
-        file.write(f"{text}\n".encode())
+    text = json.dumps(values, indent=1, allow_nan=False)
+    replace_text(case.output / "sensitivity.json", f"{text}\n")
     if options.json:
         print_json(values)
         return DONE

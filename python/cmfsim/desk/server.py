@@ -23,7 +23,7 @@ from cmfsim.desk.case_text import (
 from cmfsim.desk.cut_preview import cut_preview, procedure_choices
 from cmfsim.desk.session import Session
 from cmfsim.errors import CaseInputError, CmfsimError, LandmarkError
-from cmfsim.io import Case, read_landmark_file, replacing, write_landmarks
+from cmfsim.io import Case, read_landmark_file, replace_text, write_landmarks
 from cmfsim.io.files.reading_writing import toml_module
 from cmfsim.pipeline.building.inputs import plan_key, read_placed_sites
 from cmfsim.planning.landmark_page.page import landmark_page_text
@@ -293,8 +293,7 @@ class Calls:
         return text
 
     def _write(self, text: str) -> None:
-        with replacing(self._session.case_file) as file:
-            file.write(text.encode())
+        replace_text(self._session.case_file, text)
 
 
 def _digest(text: str) -> str:

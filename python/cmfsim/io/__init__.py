@@ -16,6 +16,7 @@ from cmfsim.io.cases.scenes import write_scene as write_scene
 from cmfsim.io.cases.tables import CaseChanges as CaseChanges
 from cmfsim.io.files.folders import finish_writing as finish_writing
 from cmfsim.io.files.folders import replacing_files as replacing_files
+from cmfsim.io.files.reading_writing import replace_text as replace_text
 from cmfsim.io.files.reading_writing import replacing as replacing
 from cmfsim.io.images.image_files import read_image as read_image
 from cmfsim.io.images.image_files import write_image as write_image

@@ -11,7 +11,7 @@ import numpy as np
 
 from cmfsim.doctor.surgery.bone_overlap import jaw_of, joint_heads
 from cmfsim.errors import CaseInputError, LandmarkInputError
-from cmfsim.io import CaseOrPath, as_case, read_landmarks, read_surface, replacing, write_plan
+from cmfsim.io import CaseOrPath, as_case, read_landmarks, read_surface, replace_text, write_plan
 from cmfsim.pipeline.building.case_model import planned_head
 from cmfsim.pipeline.building.stages import BuildKeywords, build_options
 from cmfsim.pipeline.predicting import build_patient, named_models, prepare
@@ -237,10 +237,7 @@ def write_planning_page(
     >>> cmfsim.write_planning_page("plan.html", content)  # doctest: +SKIP
     5550695
     """
-    data = page_text(content, case_file=case_file).encode()
-    with replacing(Path(path)) as file:
-        file.write(data)
-    return len(data)
+    return replace_text(Path(path), page_text(content, case_file=case_file))
 
 
 def page_state(path: str | os.PathLike[str]) -> str | None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, PRESETS
 from cmfsim.errors import CaseInputError
 from cmfsim.io.cases.tables import Table
-from cmfsim.io.files.reading_writing import is_there, replacing
+from cmfsim.io.files.reading_writing import is_there, replace_text
 from cmfsim.io.slicer.transforms import DIRECTION_CHOICE, is_itk_file, motion_in_lps
 from cmfsim.values import case_parts
 from cmfsim.values.case_parts import DIRECTIONS, PROCEDURES, CaseMotion, CaseOsteotomy
@@ -460,8 +460,7 @@ def write_plan(path: AnyPath, plan: Mapping[str, ArrayLike], *, made_for: str = 
     for name, motion in plan.items():
         matrix = rigid_matrix(motion, f"motion of {name!r}")
         lines += ["", plan_head(name), *matrix_rows(matrix)]
-    with replacing(path) as file:
-        file.write(("\n".join(lines) + "\n").encode())
+    replace_text(path, "\n".join(lines) + "\n")
 
 
 def plan_head(segment: str) -> str:

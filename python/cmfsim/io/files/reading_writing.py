@@ -81,6 +81,12 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
+def replace_text(path: Path, text: str) -> int:
+    """The size in bytes of a text, now in a file in place of what was there; as `replacing`."""
+    with replacing(path) as file:
+        return file.write(text.encode())
+
+
 def deleted_meanwhile(folder: Path) -> CmfsimError:
     """The error of a folder that went while results were written to it: no fault of the input."""
     return CmfsimError(

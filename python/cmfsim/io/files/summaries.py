@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.reading_writing import parsed_json, replacing
+from cmfsim.io.files.reading_writing import parsed_json, replace_text
 from cmfsim.values.finding import SEVERITIES
 
 # Above these a summary is not what it says it is: bytes, characters of a text, entries of a list.
@@ -134,8 +134,7 @@ def write_record(path: Path, values: Mapping[str, Any]) -> None:
     Raises `ValueError`: NaN or infinity among the values.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        file.write(json.dumps(values, indent=1, allow_nan=False).encode())
+    replace_text(path, json.dumps(values, indent=1, allow_nan=False))
 
 
 def kept_record(path: Path, **made_from: object) -> dict[str, Any] | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim.errors import CalibrationError, CaseInputError
-from cmfsim.io.files.reading_writing import FORMAT_VERSION, check_readable, named, replacing
+from cmfsim.io.files.reading_writing import FORMAT_VERSION, check_readable, named, replace_text
 from cmfsim.io.files.summaries import Closed, Maybe, Shape, Span, check, plain_json
 from cmfsim.values.calibration import Calibration, CalibrationCase
 from cmfsim.values.checks import AnyPath, check_one_of, keep
@@ -98,8 +98,7 @@ class Population:
             "settings": dict(self.settings),
             "patients": {name: entry.as_dict() for name, entry in self.patients.items()},
         }
-        with replacing(folder / POPULATION_FILE) as file:
-            file.write((json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
+        replace_text(folder / POPULATION_FILE, json.dumps(found, indent=1, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, folder: AnyPath) -> "Population":
@@ -198,5 +197,4 @@ def write_calibration(path: AnyPath, calibration: Calibration) -> None:
         ],
     }
     text_of = json.dumps(content, indent=1, sort_keys=False, allow_nan=False, ensure_ascii=False)
-    with replacing(Path(path)) as file:
-        file.write(f"{text_of}\n".encode())
+    replace_text(Path(path), f"{text_of}\n")

@@ -18,7 +18,7 @@ from cmfsim.io.cases.scenes import write_scene
 from cmfsim.io.files import summaries
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.io.files.folders import replacing_files
-from cmfsim.io.files.reading_writing import named, replacing
+from cmfsim.io.files.reading_writing import named, replace_text, replacing
 from cmfsim.io.meshes.mesh_files import read_mesh
 from cmfsim.io.meshes.surfaces import write_surface
 from cmfsim.io.meshes.vtk_writing import write_tets, write_triangles
@@ -395,8 +395,7 @@ def write_metrics(path: AnyPath, metrics: Any) -> None:
         text = _call(path, metrics, "csv")
     else:
         raise CaseInputError(f"{path.name}: figures are written as .json or .csv")
-    with replacing(path) as file:
-        file.write(text.encode("utf-8"))
+    replace_text(path, text)
 
 
 def _call(path: Path, metrics: Any, method: str) -> Any:

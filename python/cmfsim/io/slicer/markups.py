@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmfsim.errors import LandmarkInputError
-from cmfsim.io.files.reading_writing import MAX_WHOLE, check_readable, parsed_json, replacing
+from cmfsim.io.files.reading_writing import MAX_WHOLE, check_readable, parsed_json, replace_text
 from cmfsim.values.checks import AnyPath, Floats, as_rows
 
 # What Slicer calls markups whose points follow one another along a line.
@@ -125,8 +125,7 @@ def markup_of(
 
 def write_markups(path: Path, markups: Sequence[Mapping[str, Any]]) -> None:
     """Replaces a `.mrk.json` file in one step."""
-    with replacing(path) as file:
-        file.write(markups_text(markups).encode())
+    replace_text(path, markups_text(markups))
 
 
 def markups_text(markups: Sequence[Mapping[str, Any]]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io.files.reading_writing import MAX_TEXT, check_readable, named, replacing
+from cmfsim.io.files.reading_writing import MAX_TEXT, check_readable, named, replace_text
 from cmfsim.io.slicer.itk_hdf5 import read_itk_hdf5
 from cmfsim.values.case_parts import DIRECTIONS, FRAMES
 from cmfsim.values.checks import AnyPath, Floats, as_floats, check_one_of
@@ -238,8 +238,7 @@ def write_transform(
         raise CaseInputError(
             f"{path.name}: a transform is written as .tfm or .txt, not {path.suffix!r}"
         )
-    with replacing(path) as file:
-        file.write(text.encode())
+    replace_text(path, text)
 
 
 def transform_text(matrix: Floats, *, direction: str) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cmfsim.errors import CaseInputError
-from cmfsim.io import replacing
+from cmfsim.io import replace_text
 from cmfsim.io.results.populations import (
     CALIBRATION,
     FAILED,
@@ -237,8 +237,7 @@ def _write(folder: Path, table: BenchmarkTable, predictions: Path) -> tuple[Path
         f"{table.part}_times.csv": _times(table, predictions),
     }
     for name, text in texts.items():
-        with replacing(folder / name) as file:
-            file.write(text.encode())
+        replace_text(folder / name, text)
     found = [folder / name for name in texts]
     for result in table.results:
         if result.method in MODELS and result.band is not None:

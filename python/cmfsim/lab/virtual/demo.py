@@ -15,7 +15,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
-from cmfsim.io.files.reading_writing import replacing
+from cmfsim.io.files.reading_writing import replace_text
 from cmfsim.lab.virtual.population import PATIENTS, template_text
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
@@ -54,8 +54,7 @@ def write_phantom_case(
     write_image(head.ct((spacing, spacing, spacing), seed=seed), folder / "ct.nrrd")
     write_landmarks(folder / "skull.mrk.json", head.skull_landmarks)
     write_landmarks(folder / "skin.mrk.json", head.skin_landmarks)
-    with replacing(folder / "case.toml") as file:
-        file.write(template_text("phantom").encode())
+    replace_text(folder / "case.toml", template_text("phantom"))
     return folder / "case.toml"
 
 
@@ -127,8 +126,7 @@ def write_demo_case(folder: str | os.PathLike[str], *, edge_length: float = 6.0)
     anatomy = head.anatomy(float(np.clip(edge_length / VOXELS_PER_EDGE, *VOXEL_BOUNDS)))
     folder.mkdir(parents=True, exist_ok=True)
     # First, so that a run that stops here leaves a folder that the next one knows.
-    with replacing(folder / "case.toml") as file:
-        file.write(_case_text(head, edge_length).encode())
+    replace_text(folder / "case.toml", _case_text(head, edge_length))
     options = SurfaceOptions(max_triangles=MOST_TRIANGLES, smoothing=0)
     for name, level in {"skin": anatomy.skin, **anatomy.bones}.items():
         write_surface(folder / f"{name}.ply", surface_of_level(name, level, options))

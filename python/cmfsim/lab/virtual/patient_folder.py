@@ -17,7 +17,7 @@ from cmfsim._core import __version__
 from cmfsim.errors import third_party
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.cases.cohorts import COHORT_FORMAT
-from cmfsim.io.files.reading_writing import replacing
+from cmfsim.io.files.reading_writing import replace_text
 from cmfsim.io.files.summaries import kept_record, write_record
 from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
 from cmfsim.lab.virtual.population import (
@@ -118,8 +118,7 @@ def virtual_patients(
     complete = [
         p.name for p in PATIENTS.values() if (Path(folder) / p.name / TRUTH / RECORD).exists()
     ]
-    with replacing(Path(folder) / COHORT) as file:
-        file.write(cohort_text("virtual patients", complete).encode())
+    replace_text(Path(folder) / COHORT, cohort_text("virtual patients", complete))
     return [Path(folder) / patient.name / "case.toml" for patient in patients]
 
 
@@ -254,8 +253,7 @@ def _write_case(
     write_landmarks(folder / "skull.mrk.json", skull)
     skin = _placed(head.skin_landmarks, SKIN_NOISE, [seed, patient.number, SKIN_DRAW])
     write_landmarks(folder / "skin.mrk.json", skin)
-    with replacing(folder / "case.toml") as file:
-        file.write(case_text(patient, skull, COARSER * edge_length).encode())
+    replace_text(folder / "case.toml", case_text(patient, skull, COARSER * edge_length))
     return Case.load(folder / "case.toml")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
-from cmfsim.io import replacing
+from cmfsim.io import replace_text
 from cmfsim.io.files.summaries import kept_record, write_record
 from cmfsim.io.results.populations import (
     FAILED,
@@ -179,13 +179,11 @@ def _write(folder: Path, record: dict[str, Any], entries: dict[str, PopulationEn
     for part in PARTS:
         names = population.named(MADE, part)
         if names:
-            with replacing(folder / f"{part}.toml") as file:
-                file.write(cohort_text(f"virtual patients, {part}", names).encode())
+            replace_text(folder / f"{part}.toml", cohort_text(f"virtual patients, {part}", names))
     everyone = population.named(MADE)
     if everyone:
         text = cohort_text("virtual patients, plans as carried out", everyone, executed=True)
-        with replacing(folder / EXECUTED) as file:
-            file.write(text.encode())
+        replace_text(folder / EXECUTED, text)
 
 
 def _made(jobs: list[_Job], workers: int, scheduler: str | None) -> Iterator[tuple[_Job, str, str]]:

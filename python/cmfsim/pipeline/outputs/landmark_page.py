@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from cmfsim.io import replacing
+from cmfsim.io import replace_text
 from cmfsim.pipeline.proposing import GivenSites, ProposedHead, head_distribution
 from cmfsim.planning.landmark_page.page import PageSite, landmark_content, landmark_page_text
 from cmfsim.planning.page import PageContent
@@ -73,7 +73,4 @@ def _sites(
 
 def write_landmark_page(path: Path, content: PageContent) -> int:
     """The size in bytes of a page of landmarks, written in one step; `CaseError` if not finite."""
-    data = landmark_page_text(content).encode()
-    with replacing(path) as file:
-        file.write(data)
-    return len(data)
+    return replace_text(path, landmark_page_text(content))

@@ -19,7 +19,7 @@ import numpy as np
 
 from cmfsim.errors import CaseInputError, CmfsimError
 from cmfsim.evaluation.models import error_table
-from cmfsim.io import Case, replacing, replacing_files
+from cmfsim.io import Case, replace_text, replacing_files
 from cmfsim.io.cases.case_files import CASE_FILE
 from cmfsim.io.files.summaries import hashes_of, write_summary
 from cmfsim.io.images.dicom_series import write_dicom_pdf
@@ -633,6 +633,5 @@ def write_report_page(folder: Path, document: Document) -> str | None:
     except CmfsimError as error:
         _log.warning("no report: %s", error)
         return None
-    with replacing(folder / REPORT_FILE) as file:
-        file.write(page.encode())
+    replace_text(folder / REPORT_FILE, page)
     return REPORT_FILE
