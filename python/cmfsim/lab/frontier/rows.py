@@ -15,7 +15,7 @@ from cmfsim.evaluation.statistics import DistanceStatistics, distance_statistics
 from cmfsim.io.files.archives import member_of, read_archive, write_archive
 from cmfsim.lab.frontier.choice import Choice
 from cmfsim.surfaces.depth import distances
-from cmfsim.values.checks import Floats, Plain, as_floats, as_rows, in_files
+from cmfsim.values.checks import Floats, Plain, as_rows, in_files
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS
 from cmfsim.values.patient_model import PatientModel
 from cmfsim.values.table import csv_of
@@ -284,9 +284,7 @@ def pareto_front(first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
     >>> pareto_front([1.0, 2.0, 3.0, 2.5], [9.0, 4.0, 4.0, 1.0]).tolist()
     [True, True, False, True]
     """
-    x, y = as_floats("first cost", first), as_floats("second cost", second)
-    if x.ndim != 1 or x.shape != y.shape:
-        raise CaseInputError(f"costs have shapes {x.shape} and {y.shape}: two of (k,) are needed")
+    x, y = np.asarray(first), np.asarray(second)
     # By the first cost, then by the second: what comes before a row costs no more in the first.
     order = np.lexsort((y, x))
     on_front = np.zeros(len(x), dtype=bool)

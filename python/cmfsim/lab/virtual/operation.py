@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmfsim._core import Surface, signed_distance_image
-from cmfsim.errors import CaseInputError, third_party
+from cmfsim.errors import third_party
 from cmfsim.lab.virtual.mechanics.equilibrium import penalty
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.checks import Floats
 from cmfsim.values.image_data import ImageData
-from cmfsim.values.motion import decompose_motion, rigid_motion
+from cmfsim.values.motion import carried, decompose_motion, rigid_motion
 from cmfsim.values.scene import NodeKinds
 
 # Pressure per depth of penetration, MPa/mm: under the pressures of soft tissue (a few kPa), nodes
@@ -85,9 +85,6 @@ class BoneContact:
     def __post_init__(self) -> None:
         rest = {name: np.minimum(b(self.points[self.nodes]), 0.0) for name, b in self.bones.items()}
         object.__setattr__(self, "_rest", rest)
-        for name in self.bones:
-            if name not in self.motion:
-                raise CaseInputError(f"contact with {name!r}, whose motion is not given")
 
     def depths(self, displacements: Floats, part: float) -> dict[str, Floats]:
         """Depth of each touching node in each bone, (k,) mm; 0 outside."""
@@ -176,9 +173,7 @@ class Operation:
         moved = np.zeros_like(self.points)
         for number, motion in enumerate(self.motion.values()):
             mine = self.owner == number
-            matrix = motion(part)
-            points = self.points[mine]
-            moved[mine] = points @ matrix[:3, :3].T + matrix[:3, 3] - points
+            moved[mine] = carried(motion(part), self.points[mine]) - self.points[mine]
         return moved
 
 
@@ -302,14 +297,8 @@ def operate(
         was opened.
     Raises `CaseError`: The plan names an unknown segment; scipy is not installed.
     """
-    for name in plan:
-        if name not in distances:
-            raise CaseInputError(f"the plan moves {name!r}; segments are: {', '.join(distances)}")
     names = list(distances)
-    matrices = [plan.get(name, np.eye(4)) for name in names]
-    motion = {
-        name: screw(matrix, centres[name]) for name, matrix in zip(names, matrices, strict=True)
-    }
+    motion = {name: screw(plan[name], centres[name]) for name in names}
     kind = kinds.kind
     owner = np.full(len(nodes), -1, dtype=np.int64)
     joined = kinds.nodes("joined")
@@ -317,9 +306,9 @@ def operate(
     owner[joined] = of_kinds[kinds.segment[joined]]
     held = np.isin(kind, (1, 2))
     targets = np.zeros_like(nodes)
-    for number, matrix in enumerate(matrices):
+    for number, name in enumerate(names):
         mine = owner == number
-        targets[mine] = nodes[mine] @ matrix[:3, :3].T + matrix[:3, 3] - nodes[mine]
+        targets[mine] = carried(plan[name], nodes[mine]) - nodes[mine]
     loose = _near_cuts(nodes, held, targets) | _crushed(nodes, tets, held, targets)
     held &= ~loose
     opened = np.zeros(len(nodes), dtype=bool)

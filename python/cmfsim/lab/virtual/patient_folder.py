@@ -30,6 +30,7 @@ from cmfsim.lab.virtual.population import (
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth, scanned
 from cmfsim.phantom import PhantomHead, make_head
 from cmfsim.values.checks import Floats, as_positive, as_whole
+from cmfsim.values.motion import carried
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
 
@@ -408,12 +409,10 @@ def _write_truth(
     for name in ("bones", "bones_before"):
         (folder / name).mkdir()
     for name, segment in truth.segments.items():
-        before, matrix = segment.surface.vertices, truth.motions[name]
-        after = before @ matrix[:3, :3].T + matrix[:3, 3]
-        write_surface(folder / "bones_before" / f"{name}.ply", segment.surface)
-        write_surface(
-            folder / "bones" / f"{name}.ply", SurfaceData(after, segment.surface.triangles)
-        )
+        before = segment.surface
+        after = SurfaceData(carried(truth.motions[name], before.vertices), before.triangles)
+        write_surface(folder / "bones_before" / f"{name}.ply", before)
+        write_surface(folder / "bones" / f"{name}.ply", after)
 
 
 def is_made(folder: Path, settings: Mapping[str, Any]) -> bool:

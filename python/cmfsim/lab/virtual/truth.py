@@ -40,7 +40,7 @@ from cmfsim.pipeline.building.case_model import build_model, kind_options_of
 from cmfsim.surfaces.depth import moved_outward, tissue_depth
 from cmfsim.surfaces.topology import tet_bodies
 from cmfsim.values.anatomy import Anatomy, BoneSegment
-from cmfsim.values.checks import Floats, as_index_rows, as_number, as_positive, as_rows
+from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
 from cmfsim.values.image_data import ImageData
 from cmfsim.values.motion import rigid_motion
 from cmfsim.values.patient_model import PatientModel
@@ -418,8 +418,6 @@ def carried(
     places = as_rows("points", points, 3)
     corners = as_rows("nodes", nodes, 3)
     moves = as_rows("displacements", displacements, 3)
-    if len(moves) != len(corners):
-        raise CaseInputError(f"{len(moves)} displacements for {len(corners)} nodes")
     rows = as_index_rows("tets", tets, 4, len(corners), "nodes").astype(np.int64)
     spatial = third_party("scipy.spatial", "skins of virtual patients are made", "study")
     tree = spatial.cKDTree(corners[rows].mean(axis=1))
@@ -454,9 +452,6 @@ def scanned(
         that changes over a few edges (waves of the reconstruction).
     Raises `CaseError`: A negative deviation; scipy is not installed.
     """
-    for name, value in (("white", white), ("smooth", smooth)):
-        if as_number(f"{name} noise", value) < 0.0:
-            raise CaseInputError(f"{name} noise is {value:g} mm: 0 or more is needed")
     vertices, triangles = surface.vertices, surface.triangles
     generator = np.random.default_rng(seed)
     offset = white * generator.standard_normal(len(vertices))

@@ -48,13 +48,6 @@ def test_the_front_is_what_brute_force_finds(pairs):
     assert pareto_front(first, second).tolist() == brute
 
 
-def test_costs_that_are_no_numbers_are_refused():
-    with pytest.raises(CaseInputError, match=r"second cost\[1\]"):
-        pareto_front([1.0, 2.0], [0.5, np.nan])
-    with pytest.raises(CaseInputError, match="shapes"):
-        pareto_front([1.0, 2.0], [0.5])
-
-
 def test_errors_are_those_of_a_known_difference():
     """|(3, 4, 0) s| = 5 s: by hand over all points and over a part of them."""
     size = np.arange(1.0, 5.0)

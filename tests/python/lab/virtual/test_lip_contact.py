@@ -232,14 +232,6 @@ def test_lips_that_leave_each_other_do_not_pull():
     assert contact.penetration(u) < 1e-6
 
 
-def test_a_node_of_both_lips_is_an_error_with_its_place():
-    """Lips that are one surface cannot push each other."""
-    nodes, _, upper, lower = two_blocks(0.1)
-    whole = Lip.of(np.vstack([lower.triangles, upper.triangles[:1]]), np.ones(len(nodes)))
-    with pytest.raises(CaseInputError, match=r"node \d+ at .* mm belongs to both lips"):
-        LipContact(nodes, upper, whole)
-
-
 def test_the_slit_separates_the_lips():
     """Upper and lower landmarks lie on their sides; the slit is as thick as the gap and shut aside.
 

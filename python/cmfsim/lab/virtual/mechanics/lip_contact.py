@@ -22,7 +22,7 @@ from cmfsim.phantom import PhantomHead
 from cmfsim.phantom.parameters import JawWarp
 from cmfsim.phantom.skull import UPPER_ARCH
 from cmfsim.values.anatomy import Anatomy
-from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
+from cmfsim.values.checks import Floats
 
 # The slit between the lips in the canonical head, mm: distance from the midline and height of its
 # line, as in the phantom's skin. Its thickness is constant almost to the corner, because the mesh
@@ -259,20 +259,6 @@ class LipContact:
     lower: Lip
     stiffness: float = STIFFNESS
     onset: float = ONSET
-
-    def __post_init__(self) -> None:
-        as_rows("points", self.points, 3)
-        as_positive("stiffness", self.stiffness)
-        as_positive("onset", self.onset)
-        for name, lip in (("upper", self.upper), ("lower", self.lower)):
-            as_index_rows(f"{name} lip", lip.triangles, 3, len(self.points), "points")
-        shared = np.intersect1d(self.upper.triangles, self.lower.triangles)
-        if len(shared):
-            x, y, z = self.points[shared[0]]
-            raise CaseInputError(
-                f"node {shared[0]} at ({x:.1f}, {y:.1f}, {z:.1f}) mm belongs to both lips: "
-                "surfaces that touch must be separate"
-            )
 
     def penetration(self, displacements: Floats) -> float:
         """Largest depth of a node inside the other lip, mm."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from cmfsim.phantom import Muscle, PhantomHead
 from cmfsim.phantom.muscles import MELT
 from cmfsim.phantom.shapes import Tube, smooth_max
-from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows, check_one_of
+from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
 
 # Barycentric places at which a tet is asked whether it is muscle: corners of the four smaller tets
 # about its corners and the middle, drawn in so that none lies on a face.
@@ -90,9 +90,7 @@ def muscle_field(
     """
     points = as_rows("nodes", nodes, 3)
     rows = as_index_rows("tets", tets, 4, len(points), "nodes")
-    shifts = dict(offsets or {})
-    for name in shifts:
-        check_one_of("muscle with an offset", name, tuple(muscles))
+    shifts = offsets or {}
     corners = points[rows]
     middles = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
