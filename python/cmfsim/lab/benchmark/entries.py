@@ -64,11 +64,7 @@ TIMES = ".seconds"
 
 @dataclass(frozen=True, eq=False)
 class PartialLeastSquares:
-    """A linear map by partial least squares (SIMPLS, de Jong 1993).
-
-    mean_x, mean_y: (p,) and (q,).
-    coefficients: (p, q).
-    """
+    """A linear map by partial least squares (SIMPLS, de Jong 1993), with means (p,) and (q,)."""
 
     mean_x: Floats
     mean_y: Floats
@@ -78,8 +74,7 @@ class PartialLeastSquares:
     def fit(cls, x: Floats, y: Floats, components: int) -> "PartialLeastSquares":
         """The map that leads from the rows of x (n, p) to those of y (n, q).
 
-        Columns are centred and not scaled. With as many components as x has rank it is that of
-        ordinary least squares.
+        Columns are centred, not scaled. With as many components as x has rank, it is least squares.
         """
         mean_x, mean_y = x.mean(axis=0), y.mean(axis=0)
         centred = x - mean_x
@@ -113,8 +108,7 @@ class PartialLeastSquares:
 class LearnedFace:
     """The model learned from the training part.
 
-    landmarks: (14, 3), mm, of the skin of the person whose points are compared.
-    points: (k, 3), mm, on that skin.
+    landmarks: (14, 3), mm, of the skin of the person whose points (k, 3), mm, are compared.
     map: From the plan in numbers to the displacements of the points.
     components: Chosen within the training part, each patient left out once.
     """
@@ -137,10 +131,7 @@ class LearnedFace:
 
 
 def learn_face(patients: Sequence[BenchmarkPatient]) -> LearnedFace:
-    """The training data of the patients of a part.
-
-    Raises `CaseError`: Fewer than four patients; scipy is not installed.
-    """
+    """The training data of the patients of a part; an error if they are fewer than four."""
     if len(patients) < LEAST_TRAINED:
         raise CaseInputError(
             f"the training part has {len(patients)} patients with a truth: {LEAST_TRAINED} are "
@@ -189,8 +180,7 @@ def _tree(points: Floats):  # type: ignore[no-untyped-def]
 class Ratio:
     """The share of a bone's motion that a landmark of the skin follows.
 
-    bone: The landmark of the skull whose planned motion counts.
-    segments: Who carries it: the first of these that the plan moves.
+    The landmark `bone` of the skull moves with the first of the segments that the plan moves.
     """
 
     skin: str
@@ -245,10 +235,7 @@ def predict_by_ratios(patient: BenchmarkPatient) -> Floats:
 
 @dataclass(frozen=True)
 class EntryFolder:
-    """Where the predictions of a population are stored.
-
-    folder: `predictions`, with a folder for each method.
-    """
+    """Where the predictions of a population are stored: a folder for each method."""
 
     folder: Path
 
@@ -290,10 +277,7 @@ class EntryFolder:
 
 
 def times_of(folder: Path, method: str, patients: Sequence[str]) -> dict[str, float]:
-    """The run times of predictions, s, where they were recorded: `PATIENT.seconds`.
-
-    Raises `CaseError`: A file that does not contain a number.
-    """
+    """The run times of predictions, s, where they were recorded: `PATIENT.seconds`."""
     found = {}
     for patient in patients:
         path = EntryFolder(folder).file(method, patient, TIMES)
@@ -309,9 +293,7 @@ def times_of(folder: Path, method: str, patients: Sequence[str]) -> dict[str, fl
 def patient_entries(
     patient: str, folder: str, methods: Sequence[str], banded: Sequence[str] = ()
 ) -> None:
-    """Predicts one patient by the entries that need no other patient.
-
-    A model that fails is recorded with its reason.
+    """Predicts one patient by the entries that need no other; a failed model is recorded with why.
 
     patient, folder: The patient's folder, and that of all predictions.
     banded: Models whose predictions state a standard deviation, from which a band is calibrated.
@@ -382,10 +364,7 @@ def _entered(patient: BenchmarkPatient, prediction: Prediction, made_from: str) 
 
 
 def check_own(method: str, prediction: SkinPrediction, patient: BenchmarkPatient) -> None:
-    """Refuses an entry of the package made by another version, or for an earlier patient.
-
-    Raises `CaseError`.
-    """
+    """Refuses an entry of the package made by another version, or for an earlier patient."""
     own = (*ENTRIES, *ON_REQUEST)
     if method in own and not prediction.made_from.endswith(patient.digest()):
         raise CaseInputError(
@@ -397,11 +376,9 @@ def check_own(method: str, prediction: SkinPrediction, patient: BenchmarkPatient
 def learned_entries(
     training: Sequence[BenchmarkPatient], patients: Sequence[BenchmarkPatient], folder: Path
 ) -> None:
-    """Predicts patients by the learned entry; none of them may be in the training part.
+    """Predicts patients by the learned entry; an error if one of them is in the training part.
 
     If there is nothing to learn from, the entry is recorded as failed.
-
-    Raises `CaseError`: A patient to predict is in the training part.
     """
     both = {patient.name for patient in training} & {patient.name for patient in patients}
     if both:

@@ -291,10 +291,7 @@ class BenchmarkPatient:
         return np.eye(4)
 
     def planned_moves(self, carriers: Mapping[str, Sequence[str]]) -> Floats:
-        """How far the plan moves skull landmarks, by the first that it moves of what carries each.
-
-        Returns: (3 k,), mm, landmark by landmark.
-        """
+        """How far the plan moves skull landmarks, (3 k,) mm: with the first moved carrier of each."""
         moves = []
         for name, segments in carriers.items():
             place, matrix = self.skull_landmarks[name], self.planned_motion(*segments)
@@ -313,10 +310,7 @@ class BenchmarkPatient:
 def patients_of(
     folder: Path, population: Population, parts: Iterable[str]
 ) -> list[BenchmarkPatient]:
-    """The patients of some parts who have a truth.
-
-    Raises `CaseError`: One of them has no folder, or none is there.
-    """
+    """The patients of some parts who have a truth; an error if a file of one of them is missing."""
     names = population.named(MADE, *parts)
     for name in names:
         for file in (*READ, TRUE_SKIN):
@@ -331,7 +325,7 @@ def patients_of(
 def far_from_models(patients: Sequence[BenchmarkPatient]) -> tuple[str, ...]:
     """The half of the patients whose truth differs most from what predictions can know.
 
-    None of them where it is not stated how much the truth of each differs.
+    None where it is not stated how much the truth of each differs.
     """
     known = [(p.departure, p.name) for p in patients if p.departure is not None]
     if len(known) < len(patients):

@@ -44,11 +44,7 @@ PREDICTIONS, RESULTS = "predictions", "benchmark"
 
 @dataclass(frozen=True)
 class Benchmark:
-    """The results of a benchmark, and their files.
-
-    files: CSV, Markdown, JSON and calibrations of bands, the same bytes each time; and the run
-        times.
-    """
+    """The results of a benchmark, and their files: the same bytes each time, but for run times."""
 
     table: BenchmarkTable
     files: tuple[Path, ...]

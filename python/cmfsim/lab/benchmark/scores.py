@@ -43,7 +43,6 @@ class MethodBand:
     """How many of a method's standard deviations cover 90 % of patients, by region.
 
     factors: Empty where the calibration part has too few predictions with a standard deviation.
-    cases: The patients that it was calibrated on.
     settings: What the standard deviations depend on apart from the patient.
     missing: Patients of the calibration part without one.
     """
@@ -73,9 +72,8 @@ def calibrated_band(
 ) -> MethodBand | None:
     """The band of a method; None if it states no standard deviation for any of these patients.
 
-    folder: The folder of all predictions.
-    patients: The calibration part; none of them may be scored.
-    Raises `CaseError`: A prediction of another skin, or made under other settings than the first.
+    The patients are the calibration part: none of them may be scored. Predictions of another skin,
+    or made under other settings than the first, are an error.
     """
     place = EntryFolder(folder)
     cases: list[CalibrationCase] = []
@@ -118,14 +116,12 @@ def _check_settings(prediction: SkinPrediction, settings: str) -> None:
 
 @dataclass(frozen=True)
 class RegionScore(Plain):
-    """Errors of a prediction in a region of one patient.
+    """Errors of a prediction in a region of one patient, mm.
 
-    mean, p95: mm, of the length of the difference from the true displacement, over vertices.
+    mean, p95: Of the length of the difference from the true displacement, over vertices.
     within: Share of vertices with 2 mm or less.
-    normal: mm. Mean size of the difference along the normal of the skin: without sliding along
-        itself.
-    covered: Whether the true skin lies within the stated band at all vertices; None without a band.
-    half_width: mm, or None. Mean of that band.
+    normal: Mean size of the difference along the normal of the skin: without sliding along itself.
+    covered: Whether the true skin lies within the stated band, of this mean half width, everywhere.
     """
 
     mean: float = field(metadata=in_files("mean_mm"))
@@ -147,9 +143,7 @@ def score(
 ) -> dict[str, RegionScore]:
     """The scores of a prediction by region.
 
-    factors: How many standard deviations of the prediction its band has in a region; none without a
-        calibration.
-    Raises `CaseError`: The prediction is of another skin.
+    factors: How many standard deviations of the prediction its band has in a region, if calibrated.
     """
     prediction.check_vertices(patient.skin)
     off = prediction.displacement - patient.truth
@@ -191,11 +185,9 @@ def _rounded(value: Any) -> float:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """The scores of one method.
+    """The scores of one method, by patient and region.
 
-    scores: By patient, then by region.
-    missing: Patients without a prediction.
-    failed: The reasons that the method gives for some of them, by patient.
+    missing, failed: Patients without a prediction, and the reasons that the method gives for some.
     band: Calibration of its standard deviations on the calibration part, where it states any.
     """
 

@@ -156,10 +156,8 @@ def _hash(of: str, values: Mapping[str, Any]) -> str:
 def reference_choice(
     base: Choice, edge_length: float, *, kinematics: str = "hyperelastic"
 ) -> Choice:
-    """The reference of a sweep: quadratic tets, large deformation, many samples.
+    """The reference of a sweep: quadratic tets, large deformation, many samples; else as the base.
 
-    base: Its contact, its tolerance, mixing and model are the reference's.
-    edge_length: mm.
     kinematics: "corotational" where a hyperelastic solution is out of reach.
     """
     return replace(

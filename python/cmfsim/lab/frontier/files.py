@@ -168,11 +168,7 @@ def _spread(spread: Spread | None) -> str:
 
 
 def write_frontier(folder: Path, found: Frontier) -> list[str]:
-    """The names of the files written: table, page, picture and, last, all figures as JSON.
-
-    Raises `CaseError`: matplotlib is missing.
-    Raises `OSError`: The folder cannot be written to.
-    """
+    """The names of the files written: table, page, picture and, last, all figures as JSON."""
 
     def fill(fresh: Path) -> Sequence[str]:
         write_metrics(fresh / TABLE, found)
@@ -194,9 +190,6 @@ def chart_frontier(path: str | os.PathLike[str], found: Frontier) -> None:
     Colours are elements, marks are kinematics, figures beside them edge lengths in mm. Filled marks
     are of the grid; hollow ones have one other factor changed. The line joins what no other choice
     beats in that panel's time, the ring is the base.
-
-    path: Ends in `.png`, `.svg` or `.pdf`.
-    Raises `CaseError`: matplotlib is missing, another ending, no choice that has an error.
     """
     rows = [row for row in found.rows if row.mean and not row.is_reference]
     if not rows:

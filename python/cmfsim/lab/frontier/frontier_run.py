@@ -198,10 +198,7 @@ class _Jobs:
         )
 
     def _answer(self, doing: str, file: Path, made: Sequence[Path], job: Answer) -> Answer:
-        """The answer that an earlier run left in a file, with all that it made, or that of a job.
-
-        doing: What to report when the job is run.
-        """
+        """The answer that an earlier run left, with all that it made, or that of the job."""
         answer = None if self.fresh else kept_record(file)
         if answer is None or ("error" not in answer and not all(path.exists() for path in made)):
             self.say(doing)

@@ -38,9 +38,6 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
 
     They are vertices of the detailed face, so that they are the same however the tissue is meshed.
     Without all of the skin's landmarks the face is all of them, in one part.
-
-    Raises `CaseError`: There is no detailed face: the case is an image, and scikit-image is not
-        installed. No point of it lies on the face.
     """
     face = patient.face
     if face is None:
@@ -69,11 +66,9 @@ def skin_points(patient: PatientModel) -> tuple[Floats, Regions]:
 def skin_errors(
     moved: ArrayLike, reference: ArrayLike, regions: Mapping[str, NDArray[np.bool_]]
 ) -> dict[str, DistanceStatistics]:
-    """Figures of |u - u_ref| at the same points, mm: over each region that has points.
+    """Figures of |u - u_ref| at the same points, mm, over each region that has points.
 
     moved, reference: (k, 3), mm. Displacements by a prediction and by the reference.
-    regions: mapping of str to (k,) bool.
-    Raises `CaseError`: Another number of points, NaN.
     """
     ours, theirs = as_rows("moved", moved, 3), as_rows("reference", reference, 3)
     if len(ours) != len(theirs):
@@ -271,18 +266,9 @@ def _spread_columns(name: str, unit: str, spread: Spread | None) -> dict[str, fl
 
 
 def pareto_front(first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
-    """Which rows no other row beats: as low in both costs, and lower in one. (k,) bool.
+    """Which rows no other row beats, (k,) bool: as low in both costs (k,), and lower in one.
 
     Rows that are equal in both do not beat each other.
-
-    first, second: (k,). Costs: the lower the better.
-    Raises `CaseError`: Unlike lengths, NaN.
-
-    Examples
-    --------
-    >>> from cmfsim.lab.frontier import pareto_front
-    >>> pareto_front([1.0, 2.0, 3.0, 2.5], [9.0, 4.0, 4.0, 1.0]).tolist()
-    [True, True, False, True]
     """
     x, y = np.asarray(first), np.asarray(second)
     # By the first cost, then by the second: what comes before a row costs no more in the first.

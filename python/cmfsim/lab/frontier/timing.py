@@ -120,10 +120,7 @@ def peak_memory() -> float | None:
 
 
 def machine(threads: int | None) -> dict[str, Any]:
-    """Processor, cores and threads, versions and commit: plain values.
-
-    threads: That processes were given; all cores if None.
-    """
+    """Processor, cores, threads of the processes (None: all cores), versions and commit."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "processor": _processor(),
@@ -160,11 +157,9 @@ def _commit() -> str | None:
 def run_job(job: Mapping[str, Any], *, threads: int | None, time_limit: float) -> Answer:
     """The answer of a job, now in the file that it names: figures, or why there are none.
 
-    A process that is killed or takes longer than the limit has an error for an answer too.
+    A process that is killed or takes longer than the limit, s, has an error for an answer too.
 
-    job: What `cmfsim.lab.frontier.timing.measured` takes; `answer` is the file's path.
-    threads: All cores if None.
-    time_limit: s.
+    job: What `measured` takes; `answer` is the file's path.
     """
     path = Path(job["answer"])
     path.parent.mkdir(parents=True, exist_ok=True)

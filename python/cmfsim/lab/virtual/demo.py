@@ -108,16 +108,7 @@ class DemoCase:
 def write_demo_case(folder: str | os.PathLike[str], *, edge_length: float = 6.0) -> DemoCase:
     """The embedded case, written as `case.toml` with surfaces, and without any landmark.
 
-    folder: Made if it is not there; empty, or an earlier demo's.
-    edge_length: mm, of the tets.
-    Raises `CaseError`: A folder with other files in it; scikit-image is missing.
-    Raises `OSError`: The folder cannot be made or written to.
-
-    Examples
-    --------
-    >>> from cmfsim.lab.virtual.demo import write_demo_case
-    >>> made = write_demo_case("cmfsim-demo")  # doctest: +SKIP
-    >>> prediction = cmfsim.predict(made.case, model="M")  # doctest: +SKIP
+    The folder is made, empty, or an earlier demo's; edges of the tets in mm.
     """
     edge_length = as_positive("edge length", edge_length)
     folder = Path(folder)

@@ -31,7 +31,7 @@ DIFFERENCE = 1e-2
 class SmoothDistance:
     """The distance outside a bone, negative inside, twice continuously differentiable near it.
 
-    level: Positive inside, about a distance near the surface.
+    The level is positive inside, and about a distance near the surface.
     """
 
     def __init__(self, level: ImageData) -> None:
@@ -69,10 +69,8 @@ class BoneContact:
 
     A node that starts inside the blurred bone may stay at that depth.
 
-    points: (n, 3), mm. All nodes at rest.
-    nodes: (k,) whole numbers. Nodes that may touch bone.
+    points, nodes: (n, 3), mm, all at rest, and (k,), those that may touch bone.
     area: (k,), mm². Boundary area around each.
-    bones: At rest.
     motion: The rigid motion (4, 4) of each bone after a fraction of it, 0 to 1.
     """
 
@@ -153,12 +151,10 @@ REACH, SPACING, ROOM = 12.0, 1.5, 8.0
 class Operation:
     """The action of the bones on the tissue.
 
-    held: (k,) int64. Nodes attached to bone, or fixed where the tissue ends.
-    owner: (k,) int64. Segment to which each is joined, as an index into `motion`; −1 if it does not
-        move.
+    held, points: (k,) and (k, 3), mm. Nodes attached to bone, or fixed where tissue ends, at rest.
+    owner: (k,). Segment to which each is joined, as an index into `motion`; −1 if it does not move.
     motion: Rigid motion (4, 4) of each segment after a fraction of it, 0 to 1.
     stripped: Number of nodes that the operation detached from bone.
-    points: (k, 3), mm. The held nodes at rest.
     """
 
     held: NDArray[np.int64]
@@ -178,11 +174,7 @@ class Operation:
 
 
 def screw(matrix: Floats, centre: Floats) -> Callable[[float], Floats]:
-    """The rigid motion (4, 4) after a fraction of it: rotation and translation grow together.
-
-    matrix: (4, 4), mm. The whole motion.
-    centre: (3,), mm.
-    """
+    """The rigid motion (4, 4) after a fraction of it: turn about the centre and shift together."""
     whole = decompose_motion(matrix, centre)
 
     def after(part: float) -> Floats:
@@ -194,11 +186,9 @@ def screw(matrix: Floats, centre: Floats) -> Callable[[float], Floats]:
 
 
 def bone_distances(nodes: Floats, segments: Mapping[str, BoneSegment]) -> dict[str, ImageData]:
-    """Depth inside each segment, negative outside, mm, in the bounding box of nodes plus `ROOM`.
+    """Depth inside each segment, negative outside, mm, in the box of the nodes (n, 3) plus `ROOM`.
 
     A segment's level is a distance only within two voxels of its surface, this one up to `REACH`.
-
-    nodes: (n, 3), mm.
     """
     lowest = nodes.min(axis=0) - ROOM
     shape = np.ceil((np.ptp(nodes, axis=0) + 2.0 * ROOM) / SPACING).astype(int) + 1
@@ -217,12 +207,10 @@ def bone_distances(nodes: Floats, segments: Mapping[str, BoneSegment]) -> dict[s
 def without_bite(
     nodes: Floats, tets: NDArray[Any], upper: ImageData, lower: ImageData, gap: float
 ) -> NDArray[np.bool_]:
-    """Which tets are tissue, (m,): those outside the gap between the tooth rows.
+    """Which tets (m, 4) are tissue, (m,): those outside the gap between the tooth rows.
 
-    nodes, tets: (n, 3) mm, (m, 4).
     upper, lower: Depths inside the bones that bear the teeth.
-    gap: mm. A tet lies between them if the distances of its centroid to both add up to less than
-        this.
+    gap: mm. The distances of a tet's centroid to both add up to less than this between them.
     """
     middles = nodes[tets].mean(axis=1)
     return -upper.sample(middles) - lower.sample(middles) >= gap
@@ -241,11 +229,8 @@ def without_gaps(
     tet lies between two bones if the distances of its centroid to both add up to less than their
     shift plus `BETWEEN`, and the bones are not on the same side of it.
 
-    nodes, tets: (n, 3) mm, (m, 4).
-    distances: As returned by `bone_distances`.
-    motions: mapping of str to (4, 4), mm, of each of them.
-    kept_between: Bones between which tissue is kept: jaws that no cut separates, if the mouth is
-        open.
+    distances, motions: As returned by `bone_distances`, and (4, 4) mm of each of them.
+    kept_between: Jaws that no cut separates, if the mouth is open: tissue between them is kept.
     """
     middles = nodes[tets].mean(axis=1)
     kept = np.ones(len(middles), dtype=bool)
@@ -287,15 +272,9 @@ def operate(
     Joined and fixed nodes near a cut whose sides separate are stripped off the bone. Like sliding
     nodes, they are then free, and bone can only push them.
 
-    nodes: (n, 3), mm.
-    tets: (m, 4) uint32.
-    boundary: (t, 3) uint32. Boundary triangles.
-    distances: Depth inside each segment.
-    centres: mapping of str to (3,), mm. Centre about which each segment rotates.
-    plan: mapping of str to (4, 4), mm. Segments that are not named do not move.
-    bared: (k,) whole numbers. Other free nodes that may touch bone, because the tissue next to them
-        was opened.
-    Raises `CaseError`: The plan names an unknown segment; scipy is not installed.
+    boundary: (t, 3). Boundary triangles of the tets (m, 4).
+    distances, centres, plan: By segment: depth inside, centre of its turn (3,), motion (4, 4).
+    bared: Other free nodes that may touch bone, because the tissue next to them was opened.
     """
     names = list(distances)
     motion = {name: screw(plan[name], centres[name]) for name in names}

@@ -295,10 +295,8 @@ def case_text(
 ) -> str:
     """The text of `case.toml`, or of the case with the operation as it was carried out.
 
-    skull: mapping of str to (3,), mm. Landmarks about which the turns of the plan are.
-    edge_length: mm, of the mesh.
-    executed: mapping of str to (4, 4), mm. True motions of the segments, which replace the plan in
-        a file in the folder of the truth.
+    skull: Landmarks about which the turns of the plan are.
+    executed: (4, 4), mm. True motions of the segments: they replace the plan, beside the truth.
     """
     place, truth = ("", f"{TRUTH}/") if executed is None else ("../", "")
     what = (

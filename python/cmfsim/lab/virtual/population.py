@@ -95,10 +95,8 @@ VESTIBULE: Distribution = (0.0, 2.0, 4.0)
 class Relocation:
     """The motion of a segment in a planner's numbers, as in Table 2 of Kim et al. (2010).
 
-    translation: tuple of 3 float, mm. Left, backwards, up.
-    angle: degrees, about `axis` by the right-hand rule, through the landmark `centre`.
-    axis: tuple of 3 float.
-    centre: A skull landmark.
+    translation: mm. Left, backwards, up.
+    angle: degrees, about `axis` by the right-hand rule, through the skull landmark `centre`.
     """
 
     translation: Triple
@@ -116,8 +114,7 @@ class TrueTissue:
 
     muscle_young: MPa, of muscle along and across its fibres; None: those of the phantom.
     skin_young, skin_thickness: MPa and mm, of a layer of skin; none if the thickness is 0.
-    offsets: mapping of str to 3 float, mm, by muscle, the distance left, backwards and up by which
-        it lies elsewhere.
+    offsets: mm, by muscle, the distance left, backwards and up by which it lies elsewhere.
     absent: Muscles that the person does not have.
     slides_on: Where tissue slides at the tooth rows: "sheet" or "bone", as `KindOptions` has it.
     vestibule: mm, by how much the zone in which it slides is deeper than models assume.
@@ -144,12 +141,9 @@ class VirtualPatient:
         the same for the mandible; G genioplasty.
     muscle_thickness, muscle_stiffness: Of the true muscles, relative to those of the phantom and to
         the default moduli.
-    osteotomies: Procedures, in their order.
-    plan: By segment.
     separate_lips: Whether the true lips are separate down to the teeth and touch each other.
         Otherwise they are connected behind the slit in the skin, as on a CT.
-    departures: By segment, how the operation departs from the plan. The case file has only the
-        plan.
+    departures: How the operation departs from the plan, the only one that the case file has.
     thickness_change: Swelling of the soft tissue after the operation, as a share of its depth.
     """
 
@@ -206,10 +200,7 @@ PATIENTS: Mapping[int, VirtualPatient] = MappingProxyType(
 
 
 def patient_named(number: int) -> VirtualPatient:
-    """One of the virtual patients.
-
-    Raises `CaseError`: A number other than 1 to 6.
-    """
+    """One of the virtual patients, 1 to 6."""
     if number not in PATIENTS:
         raise CaseInputError(
             f"patient is {number!r}: {', '.join(map(str, PATIENTS))} are available"

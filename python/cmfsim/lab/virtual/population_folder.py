@@ -41,10 +41,9 @@ GRID, SKIN_SPACING = 0.25, 0.375
 
 @dataclass(frozen=True)
 class PatientOutcome:
-    """The outcome of a patient, and the number of finished patients.
+    """The outcome of a patient, why it failed, and the number of finished patients.
 
     status: "made", "kept" (there from an earlier run, of the same settings) or "failed".
-    reason: Why it failed.
     """
 
     name: str

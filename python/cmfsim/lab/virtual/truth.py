@@ -71,14 +71,12 @@ ZONE = ("upper_front", "upper_molars", "lower_front", "lower_molars")
 class PostoperativeTruth:
     """A virtual patient after the operation, without scanner noise.
 
-    nodes, tets: (n, 3), mm, (m, 4) uint32. The true mesh at rest.
-    displacements: (n, 3), mm.
+    nodes, tets, displacements: The true mesh at rest, and how it moves, (n, 3) mm.
     fraction, fibre: (m,) and (m, 3), of muscle, true.
     skin_before, skin: The whole head's skin before and after, vertex by vertex.
-    skin_landmarks, skull_landmarks: mapping of str to (3,), mm, after the operation.
-    segments: Before it.
-    motions: mapping of str to (4, 4), mm. Actual motion of every segment: the plan plus the
-        patient's departures from it; the identity for segments that do not move.
+    skin_landmarks, skull_landmarks: After the operation; `segments` are those before it.
+    motions: (4, 4), mm. Actual motion of every segment: the plan plus the patient's departures from
+        it; the identity for segments that do not move.
     volume_ratios: (m,). Ratio of each tet's volume after the operation to that before.
     last_step: mm. Largest motion of the skin in the last Newton iteration.
     lips: The contact of the lips, if they are separate.
@@ -128,16 +126,10 @@ def postoperative_truth(  # noqa: PLR0913 (options by name)
     that pushes and never pulls, periosteum stripped at the cuts, no tissue between the tooth rows,
     and skin that swells.
 
-    patient: How the true muscles differ from those of the phantom, and the departures from the
-        plan.
     case: Its osteotomies, plan and landmarks are used; its image is not read.
-    edge_length: mm, of the true mesh.
     refine: Whether tets are smaller where tissue is thin; always so if the lips are separate.
-    grid: mm. Spacing of the level images from which the mesh is made.
-    skin_spacing: mm, of the marching cubes that make the skin.
+    grid, skin_spacing: mm, of the level images that the mesh is made from, and of the skin's cubes.
     options: By default, `STEPS_WITH_LIPS` steps if the lips are separate.
-    progress: Called with the name of each stage as it begins.
-    Raises `CmfsimError`: Any error of a stage.
     """
     stage = progress or no_progress
     separate = patient.separate_lips
@@ -350,10 +342,7 @@ def _opened(
     distances: Mapping[str, ImageData],
     motions: Mapping[str, Floats],
 ) -> _Opened:
-    """The largest body that remains without the tissue between tooth rows and separated bones.
-
-    If the mouth is open already, nothing is removed from between the jaws.
-    """
+    """The largest body without tissue between separated bones and, in a shut mouth, tooth rows."""
     nodes, tets, open_mouth = model.scene.nodes, model.scene.tets, drawn.slit is not None
     upper = next((name for name in ("maxilla", "cranium") if name in distances), None)
     lower = next((name for name in ("mandible_body", "mandible") if name in distances), None)
@@ -370,11 +359,9 @@ def _opened(
 
 
 def largest_body(tets: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which tets belong to the largest body connected through faces, (m,).
+    """Which tets (m, 4) belong to the largest body connected through faces, (m,).
 
     A flap attached by a single edge or node would move without resistance.
-
-    tets: (m, 4).
     """
     body = tet_bodies(tets)
     largest: NDArray[np.bool_] = body == np.argmax(np.bincount(body))
@@ -404,16 +391,10 @@ SMOOTHING = 12
 def carried(
     points: ArrayLike, nodes: ArrayLike, tets: ArrayLike, displacements: ArrayLike
 ) -> Floats:
-    """The displacements (k, 3) mm of points in or just outside a deformed mesh.
+    """The displacements (k, 3) mm of points (k, 3) in or just outside a deformed mesh.
 
     A point takes the linear field of the tet that holds it; a point outside that of the tet it is
     least outside of, with its weights cut to 0…1, so that nothing is carried beyond the mesh.
-
-    points: (k, 3), mm, at rest.
-    nodes: (n, 3), mm.
-    tets: (m, 4) uint32.
-    displacements: (n, 3), mm, of the nodes.
-    Raises `CaseError`: Misshapen arrays; scipy is not installed.
     """
     places = as_rows("points", points, 3)
     corners = as_rows("nodes", nodes, 3)
@@ -450,7 +431,6 @@ def scanned(
 
     white, smooth: mm. Standard deviations of the noise that is new at each vertex, and of the noise
         that changes over a few edges (waves of the reconstruction).
-    Raises `CaseError`: A negative deviation; scipy is not installed.
     """
     vertices, triangles = surface.vertices, surface.triangles
     generator = np.random.default_rng(seed)

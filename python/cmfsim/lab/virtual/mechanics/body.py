@@ -24,10 +24,9 @@ PAIRS = tuple((p, q) for p in range(4) for q in range(p + 1, 4))
 
 @dataclass(frozen=True)
 class Moduli:
-    """Small-strain constants of one tissue.
+    """Small-strain constants of one tissue: Young's moduli along and across the fibre, MPa.
 
-    young_along, young_across: MPa, along and across the fibre.
-    poisson: Of loading along the stiffer direction, and across the fibre.
+    Poisson's ratio is of loading along the stiffer direction, and across the fibre.
     """
 
     young_along: float
@@ -72,10 +71,7 @@ MUSCLE = Moduli(0.79, 0.5, 0.43)
 
 @dataclass(frozen=True, eq=False)
 class SkinLayer:
-    """A layer of skin in a mesh, whose share of a tet replaces fat and muscle there.
-
-    share: (m,). Part of each tet's volume that is skin, 0 to 1.
-    """
+    """A layer of skin, whose share (m,) of each tet, 0 to 1, replaces fat and muscle there."""
 
     moduli: Moduli
     share: Floats
@@ -124,8 +120,6 @@ class HyperelasticTissue:
         fraction: (m,). Part of each tet's volume that is muscle, 0 to 1.
         fibre: (m, 3). Unit vectors; not read where the fraction is 0.
         stiffness: Of this person's muscle, in the ordinary muscle's.
-        Raises `CaseError`: Shapes that do not match, a fraction out of range, a fibre that is no
-            unit vector, stiffness not positive.
         """
         p = np.asarray(fraction, dtype=np.float64)
         a = np.asarray(fibre, dtype=np.float64)
@@ -155,10 +149,7 @@ class HyperelasticTissue:
         return HyperelasticTissue(*(getattr(self, f.name)[..., rows] for f in fields(self)))
 
     def energy(self, gradient: Floats) -> Floats:
-        """ψ of each tet, (m,) MPa.
-
-        gradient: (3, 3, m). F.
-        """
+        """ψ of each tet, (m,) MPa, at gradients F (3, 3, m)."""
         _, det = cofactor(gradient)
         _, c, i4 = self._fibre_strain(gradient)
         growth = det - 1.0
@@ -171,10 +162,7 @@ class HyperelasticTissue:
         return psi
 
     def stress(self, gradient: Floats) -> Floats:
-        """The first Piola–Kirchhoff stress P = ∂ψ/∂F, (3, 3, m) MPa.
-
-        gradient: (3, 3, m). F.
-        """
+        """The first Piola–Kirchhoff stress P = ∂ψ/∂F, (3, 3, m) MPa, at gradients F (3, 3, m)."""
         cof, det = cofactor(gradient)
         m, c, i4 = self._fibre_strain(gradient)
         fc = np.einsum("ijt,jt->it", gradient, c)
@@ -185,9 +173,8 @@ class HyperelasticTissue:
         return stress
 
     def tangent(self, gradient: Floats, *, convex: bool = False) -> Floats:
-        """∂P/∂F, (m, 9, 9) MPa, symmetric, over the entries of F row by row.
+        """∂P/∂F, (m, 9, 9) MPa, symmetric, over the entries of F (3, 3, m) row by row.
 
-        gradient: (3, 3, m). F.
         convex: Sets negative eigenvalues to 0, so that every step along it falls in energy (Teran,
             Sifakis, Irving & Fedkiw 2005).
         """
@@ -283,10 +270,7 @@ class HyperelasticBody:
     Forces come from scikit-fem (Gustafsson & McBain 2020): the equilibrium that the truth satisfies
     is that library's, not the mass tensors'. The stiffness only leads Newton's method there.
 
-    nodes: (n, 3), mm.
-    tets: (m, 4) uint32. Positively oriented.
-    Raises `CaseError`: Misshapen arrays, a tet without volume, tissue of another number of tets;
-        scikit-fem or scipy is not installed.
+    nodes, tets: (n, 3), mm, and (m, 4), positively oriented.
     """
 
     def __init__(self, nodes: ArrayLike, tets: ArrayLike, tissue: HyperelasticTissue) -> None:
@@ -349,9 +333,8 @@ class HyperelasticBody:
     def stiffness(
         self, displacements: Floats, added: Floats | None = None, *, convex: bool = False
     ) -> Any:
-        """∂ forces / ∂ displacements, (3n, 3n) in 3 × 3 blocks (scipy BSR), N/mm.
+        """∂ forces / ∂ displacements (n, 3) mm: (3n, 3n) in 3 × 3 blocks (scipy BSR), N/mm.
 
-        displacements: (n, 3), mm.
         added: (n, 3, 3), N/mm. What else resists at each node, such as contact.
         convex: Of every tet, as `HyperelasticTissue.tangent` takes it.
         """

@@ -66,12 +66,10 @@ def penalty(depth: Floats, onset: float) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True)
 class EquilibriumOptions:
-    """Options of the search for equilibrium.
+    """Options of the search for equilibrium, in so many steps of the motion.
 
-    steps: Number of steps into which the motion is divided.
     tolerance: Largest residual at the end: the norm of the forces on free nodes, relative to the
-        largest norm of the forces on held nodes so far.
-    loose: The same at the end of all other steps.
+        largest norm of the forces on held nodes so far; `loose` is that of all other steps.
     """
 
     steps: int = 2
@@ -86,9 +84,8 @@ class EquilibriumOptions:
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
-    """The tissue in equilibrium with the bones moved.
+    """The tissue in equilibrium with the bones moved: displacements (n, 3) mm.
 
-    displacements: (n, 3), mm.
     residual: As defined for `EquilibriumOptions.tolerance`.
     energy: N·mm. Elastic energy plus that of contact.
     history: Fraction of the motion and residual, for each Newton iteration.
@@ -111,13 +108,10 @@ def find_equilibrium(
     contacts: Sequence[Contact] = (),
     options: EquilibriumOptions | None = None,
 ) -> Equilibrium:
-    """The equilibrium of a body whose held nodes have moved along a path.
+    """The equilibrium of a body whose held nodes (k,) have moved along a path.
 
-    held: (k,) whole numbers. Nodes with prescribed displacements.
     path: Their displacements (k, 3) mm after a fraction of the motion, 0 to 1; zero at 0.
-    Raises `SolverError`: Newton's method does not converge, or a tet is inverted at the end (with
-        its index).
-    Raises `CaseError`: PyAMG or scikit-fem is not installed.
+    Raises `SolverError`: Newton's method does not converge, or a tet is inverted at the end.
     """
     return _Search(body, held, path, contacts, options or EquilibriumOptions()).run()
 

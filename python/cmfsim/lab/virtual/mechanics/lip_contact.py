@@ -44,11 +44,7 @@ TEETH_SPACING, TEETH_REACH = 1.0, 12.0
 
 @dataclass(frozen=True, eq=False)
 class MouthSlit:
-    """The slit between the lips of a phantom.
-
-    head: With a gap between the lips of `LEAST_GAP` or more.
-    Raises `CaseError`: The gap is smaller.
-    """
+    """The slit between the lips of a phantom with a gap between them of `LEAST_GAP` or more."""
 
     head: PhantomHead
 
@@ -87,7 +83,7 @@ class MouthSlit:
     def lips(self, points: Floats, margin: float = 0.0) -> NDArray[np.int8]:
         """The lip to which points (k, 3) belong, (k,): 1 the upper, −1 the lower, 0 none.
 
-        With a margin, mm, only points further inside than that count.
+        Only points further inside than the margin, mm, count.
         """
         u, v, _ = self._drawn(points)
         height = self.height(points)
@@ -106,9 +102,7 @@ def _arch(u: Floats) -> Floats:
 def with_open_mouth(head: PhantomHead, anatomy: Anatomy, bite: float) -> Anatomy:
     """The anatomy without tissue in the slit between the lips and between the tooth rows.
 
-    anatomy: Level images of it.
     bite: mm. There is no tissue where the distances to both tooth rows add up to less than this.
-    Raises `CaseError`: The gap between the lips is smaller than `LEAST_GAP`.
     """
     slit = MouthSlit(head)
     skin = anatomy.skin
@@ -158,10 +152,9 @@ ON_EDGE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Lip:
-    """The surface of one lip.
+    """The surface of one lip: boundary triangles (t, 3), outward normals.
 
-    triangles: (t, 3) whole numbers. Boundary triangles, outward normals.
-    nodes: (k,) whole numbers. Nodes of the triangles that may touch the other lip.
+    nodes: (k,). Those of the triangles that may touch the other lip.
     area: (k,), mm². Boundary area around each.
     """
 
@@ -171,9 +164,9 @@ class Lip:
 
     @classmethod
     def of(cls, triangles: NDArray[Any], area: Floats, nodes: NDArray[Any] | None = None) -> "Lip":
-        """The lip of boundary triangles (t, 3); area (n,) mm² of every node of the mesh.
+        """The lip of boundary triangles (t, 3), whose nodes may all touch the other lip by default.
 
-        By default, all nodes of the triangles may touch the other lip.
+        area: (n,), mm², of every node of the mesh.
         """
         chosen = np.unique(triangles if nodes is None else nodes).astype(np.int64)
         return cls(triangles.astype(np.int64), chosen, area[chosen])
@@ -203,12 +196,9 @@ class Lip:
 def lips_of(
     slit: MouthSlit, nodes: Floats, boundary: NDArray[Any], area: Floats
 ) -> tuple[Lip, Lip]:
-    """The upper and the lower lip: boundary triangles whose three nodes belong to one of them.
+    """The upper and the lower lip: boundary triangles (t, 3) whose nodes all belong to one of them.
 
-    nodes: (n, 3), mm.
-    boundary: (t, 3) uint32. Boundary triangles of the mesh.
-    area: (n,), mm². Boundary area around each node.
-    Raises `CaseError`: The mesh has no upper or no lower lip, or the two are not separate.
+    area: (n,), mm². Boundary area around each node (n, 3).
     """
     side, inner = slit.lips(nodes)[boundary], slit.lips(nodes, MARGIN)
     lips = []
@@ -244,14 +234,10 @@ class _Touch:
 
 @dataclass(frozen=True, eq=False)
 class LipContact:
-    """Two lips that push each other apart, without friction.
+    """Two lips that push each other apart, without friction; nodes (n, 3) mm at rest are apart.
 
     The nodes of each lip are pushed out of the other with half the pressure, so that neither lip is
-    the master.
-
-    points: (n, 3), mm. All nodes at rest, where the lips do not penetrate each other.
-    stiffness: MPa/mm.
-    onset: mm. Depth over which the stiffness grows to its full value.
+    the master. The stiffness, MPa/mm, grows to its full value over the depth `onset`, mm.
     """
 
     points: Floats

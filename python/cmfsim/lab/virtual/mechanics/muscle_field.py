@@ -36,10 +36,7 @@ FAR = -24.0
 
 
 def thickened(muscles: Mapping[str, Muscle], factor: float) -> dict[str, Muscle]:
-    """Muscles whose straps are thicker by a factor, along the same courses.
-
-    factor: Of the thickness, not of the width; above 0.
-    """
+    """Muscles whose straps are thicker by a factor, though not wider, along the same courses."""
     times = as_positive("factor of muscle thickness", factor)
     return {
         name: replace(
@@ -50,12 +47,9 @@ def thickened(muscles: Mapping[str, Muscle], factor: float) -> dict[str, Muscle]
 
 
 def skin_share(nodes: ArrayLike, tets: ArrayLike, depth: Floats, thickness: float) -> Floats:
-    """The part of each tet that lies within a depth below the skin, (m,), asked at eleven places.
+    """The part of each tet (m, 4) that lies within a thickness, mm, below the skin, (m,).
 
-    nodes: (n, 3), mm.
-    tets: (m, 4) uint32.
-    depth: (n,), mm, of the nodes below the skin.
-    thickness: mm.
+    Asked at eleven places; nodes (n, 3) lie at a depth (n,), mm, below the skin.
     """
     points = as_rows("nodes", nodes, 3)
     rows = as_index_rows("tets", tets, 4, len(points), "nodes")
@@ -80,13 +74,8 @@ def muscle_field(
     tet is asked for its level. Fractions of muscles that overlap add up to 1 at most; the fibre is
     the principal axis of Σ p a aᵀ over them.
 
-    muscles: Of this head, perhaps `thickened`.
-    nodes: (n, 3), mm.
-    tets: (m, 4) uint32.
-    depth: (n,), mm, of the nodes below the skin.
-    offsets: mapping of str to 3 float, mm, by muscle, the distance left, backwards and up by which
-        it lies elsewhere.
-    Raises `CaseError`: Misshapen arrays; an offset of no muscle.
+    depth: (n,), mm, of the nodes (n, 3) below the skin.
+    offsets: mm, by muscle, the distance left, backwards and up by which it lies elsewhere.
     """
     points = as_rows("nodes", nodes, 3)
     rows = as_index_rows("tets", tets, 4, len(points), "nodes")
@@ -138,10 +127,9 @@ def _folded(muscle: Muscle, drawn: NDArray[np.floating]) -> Floats:
 
 
 def _level(muscle: Muscle, asked: Floats, room: float) -> Floats:
-    """The level of a muscle's straps at places in tets, (t, p) mm.
+    """The level of a muscle's straps at places in tets, (t, p) mm; only near segments are asked.
 
     `asked` (t, p, 3) lies in the symmetric head, all places of a tet within `room` mm of its first.
-    Only segments that come near a tet are asked.
     """
     middles = asked[:, 0]
     levels: list[Floats] = []
