@@ -210,10 +210,7 @@ def band_options(options: argparse.Namespace, case: Case) -> BandOptions | None:
 def checked(
     options: argparse.Namespace, case: Case, models: Sequence[str] | None = None
 ) -> tuple[Notices, tuple[Finding, ...]]:
-    """The notices of a command, and the doctor's findings for a case unless it is not asked.
-
-    Raises `FindingsError`: An error is among the findings.
-    """
+    """The notices of a command, and the doctor's findings for a case unless it is not asked."""
     notices = Notices(quiet=options.quiet)
     if options.no_doctor:
         return notices, ()
@@ -257,11 +254,7 @@ def view(options: argparse.Namespace) -> int:
 
 
 def parts_of(path: Path, model: str | None = None) -> list[ViewPart]:
-    """The surfaces to show of a folder or file.
-
-    Raises `FileNotFoundError`: It is not there.
-    Raises `CaseError`: It holds nothing that can be shown.
-    """
+    """The surfaces to show of a folder or file."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_dir():

@@ -243,8 +243,7 @@ class Notices(Observer):
     def summarise(self, where: str | None) -> None:
         """Prints the list at the end: nothing if there are no findings.
 
-        where: The file that lists all findings in full, for the first line; None lists notes as
-            well.
+        where: The file that lists all findings in full; None lists notes here as well.
         """
         groups = grouped(self._found)
         if where is not None or self._quiet:

@@ -53,10 +53,7 @@ def open_questions(text: str) -> list[dict[str, Any]]:
 
 
 def answered(text: str, line: int, toml: str) -> str:
-    """The text with one question answered by TOML; by nothing, the line goes.
-
-    Raises `CaseError`: There is no such question; the answer is not one value of TOML.
-    """
+    """The text with one question answered by TOML; by nothing, the line goes."""
     asked = {question["line"]: question for question in open_questions(text)}
     if line not in asked:
         raise CaseInputError("this question is no longer open: reload the page")
@@ -89,8 +86,7 @@ def with_tables(
     """The text with other tables in place of some; comments in and below those stay.
 
     is_replaced: Whether a table goes, by its path and its rows as text.
-    tables: The rows of new ones, by their head; they stand where the first one stood, or at the
-        end.
+    tables: New rows by their head; they stand where the first one stood, or at the end.
     """
     new = [row for head, rows in tables.items() for row in ("", head, *rows)]
     kept: list[str] = []
@@ -171,10 +167,7 @@ def with_plan(
 
 
 def read_as(text: str, file: Path, changed: Sequence[str], before: str) -> Case:
-    """The case that a changed text describes, after checks that nothing else has changed.
-
-    Raises `CaseError`: It is no valid case; another table reads as something else.
-    """
+    """The case that a changed text describes, after checks that nothing else has changed."""
     try:
         old, new = (toml_module().loads(given) for given in (before, text))
     except ValueError as error:

@@ -38,9 +38,7 @@ def cut_preview(
     """What procedures cut: planes as polygons, pieces as half spaces, handles, and problems.
 
     cuts: The options of each procedure that differ from its defaults.
-    landmarks: mapping of str to (3,), mm. Of the skull.
-    bones: mapping of str to (v, 3), mm. The vertices of each bone.
-    Raises `CaseError`: An unknown procedure or option, or a value out of its range.
+    landmarks, bones: Of the skull, (3,), mm, and the vertices of each bone (v, 3), mm.
     """
     shown: dict[str, Any] = {"planes": [], "pieces": [], "handles": [], "problems": []}
     # What every bone that is left was cut from.

@@ -54,11 +54,7 @@ CHANGED = (
 
 
 def desk_server(session: Session, port: int | socket.socket = 0) -> LocalServer:
-    """The server of a folder on the desk, which does not run yet.
-
-    Raises `CaseError`: Starlette or Uvicorn, of the extra `serve`, is not installed.
-    Raises `OSError`: The port is taken.
-    """
+    """The server of a folder on the desk, which does not run yet; an error if the port is taken."""
     calls = Calls(session)
     pages: dict[str, Callable[[], Reply]] = {
         "": lambda: _html(desk_text(session, list(calls.bones()))),

@@ -96,10 +96,7 @@ class Session:
             self.start("open_head" if text else "set_up")
 
     def start(self, kind: str) -> None:
-        """Starts a work, whose answer is kept in `made`.
-
-        Raises `RefusedError`: Another one runs.
-        """
+        """Starts a work, whose answer is kept in `made`; `RefusedError` while another one runs."""
         with self._asking:
             self._refuse_busy()
             if kind in {"compute", "report"}:
@@ -136,10 +133,7 @@ class Session:
         self.made[kind] = worker.ask(f"{WORK}{kind}", {"case_file": str(self.case_file)})
 
     def ask(self, function: str, **arguments: Any) -> Answer:
-        """The answer of the worker to a short question.
-
-        Raises `RefusedError`: It is at work.
-        """
+        """The answer of the worker to a short question, unless it is at work: `RefusedError`."""
         with self._asking:
             self._refuse_busy()
             arguments["case_file"] = str(self.case_file)

@@ -46,14 +46,10 @@ NOT_PLACED = frozenset({"0", "1"})
 
 @dataclass(frozen=True, eq=False)
 class LandmarkFile:
-    """The landmarks of a file, and what to know about them.
+    """The landmarks of a file by label, LPS, mm, in its order, and what to know about them.
 
-    points: mapping of str to (3,), mm. LPS, by label, in the order of the file.
-    frame: The frame of the numbers in the file, "LPS" or "RAS".
-    stated: Whether the file states it.
-    findings: An unstated frame, points that were never placed.
-    unset: The labels of the points that were never placed.
-    descriptions: Of the points that have one, by label.
+    frame, stated: The frame of the numbers in the file, and whether the file states it.
+    findings, unset: An unstated frame; points that were never placed, by label.
     """
 
     points: Mapping[str, Floats]

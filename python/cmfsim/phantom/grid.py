@@ -67,10 +67,7 @@ def level_grid(field: Field, axes: Sequence[Floats], clip: float) -> NDArray[np.
 
 
 def gradient_at(field: Field, points: Floats, level: Level | None = None) -> Floats:
-    """The gradient of the level at points, (n, 3), by forward differences.
-
-    `level` is the level at the points, where it is known.
-    """
+    """The gradient of the level, which may be known, at points, (n, 3), by forward differences."""
     here = field(*points.T) if level is None else level
     steps = DIFFERENCE * np.eye(3)
     return np.column_stack([(field(*(points + s).T) - here) / DIFFERENCE for s in steps])
@@ -102,11 +99,7 @@ def to_surface(
 
 
 def level_surface(field: Field, low: Floats, high: Floats, spacing: float) -> SurfaceData:
-    """The closed zero surface of a level within a box, normals outward.
-
-    Raises `CaseError`: The spacing is too coarse: no point of the grid lies inside.
-    Raises `ImportError`: scikit-image is not installed.
-    """
+    """The closed zero surface of a level within a box, normals outward."""
     try:
         from skimage.measure import marching_cubes  # noqa: PLC0415
     except ImportError as error:

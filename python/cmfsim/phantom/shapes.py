@@ -58,11 +58,9 @@ def smooth_step(value: Level | float, start: float, end: float) -> Level:
 
 
 def smooth_curve(points: ArrayLike, steps: int = 4, *, closed: bool = False) -> Floats:
-    """Points on the Catmull–Rom curve through rows of numbers, `steps` per interval.
+    """Points on the Catmull–Rom curve through rows of numbers (n, k), `steps` per interval.
 
-    points: (n, k). Places, and what belongs to them (radii), in any unit.
-    closed: Whether the curve returns to its first point, which then is not repeated.
-    Returns: ((n − 1) steps + 1, k), closed curves (n steps + 1, k).
+    A closed curve returns to its first row, which is not repeated in `points`, but in the result.
     """
     rows = np.asarray(points, dtype=np.float64)
     if closed:
@@ -94,9 +92,8 @@ def turn_about(axis: str, degrees: float) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A smooth function of one coordinate through rounded table values.
+    """A smooth function of one coordinate through values (n,) at ascending places, mm.
 
-    places, values: (n,). Ascending places, mm.
     rounding: mm. Standard deviation of the Gaussian that rounds the corners.
     """
 
@@ -167,11 +164,9 @@ def _root(total: Level, n: Level | float) -> Level:
 
 @dataclass(frozen=True, eq=False)
 class Egg:
-    """A superellipsoid whose radii differ between the lower and the upper side of each axis.
+    """A superellipsoid whose radii differ between the lower and the upper side of each axis, mm.
 
-    centre: (3,) mm.
-    low, high: (3,) mm. Radii towards smaller and larger coordinates; `high` as `low` where left
-        out.
+    low, high: (3,). Radii towards smaller and larger coordinates; `high` as `low` where left out.
     power: 2 is an ellipsoid, more is boxier.
     turn: (3, 3) or None. Rows are the egg's own axes.
     """
@@ -221,10 +216,7 @@ class Egg:
 
 @dataclass(frozen=True, eq=False)
 class Reaches:
-    """Boxes of many things, to find those that come near an asked box.
-
-    low, high: (n, 3) mm. Grown by how far each thing matters.
-    """
+    """Boxes (n, 3), mm, of many things, grown by how far each matters, to find those near a box."""
 
     low: Floats
     high: Floats
@@ -245,9 +237,8 @@ class Reaches:
 
 @dataclass(frozen=True, eq=False)
 class Tube:
-    """A tube of elliptic or round section along a polyline.
+    """A tube of elliptic or round section along a polyline (n, 3), mm.
 
-    points: (n, 3) mm.
     normals: (n, 3). Unit vectors along which the section is thin.
     thick, wide: (n,) mm. Half axes of the section, along the normal and across it.
     """
@@ -294,11 +285,7 @@ class Tube:
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """The half-space on the side that the normal looks away from.
-
-    point: (3,) mm.
-    normal: (3,). Unit vector, outward.
-    """
+    """The half-space behind a point (3,), mm, as seen along the outward unit normal (3,)."""
 
     point: Sequence[float]
     normal: Sequence[float]
@@ -320,8 +307,7 @@ class Loft:
     """A body whose horizontal sections are superellipses that change with height.
 
     middle: mm. y of the widest place of every section.
-    front, back, width, power: Of z: y of the foremost and hindmost point, half width, and the
-        exponent of the section.
+    front, back, width, power: Of z: y of the foremost and hindmost point, half width, exponent.
     """
 
     middle: float
@@ -352,9 +338,8 @@ class Loft:
 
 @dataclass(frozen=True, eq=False)
 class Engraving:
-    """A groove or ridge along a curve drawn on the face as seen from in front.
+    """A groove or ridge along a curve (n, 2) of x and z, mm, on the face as seen from in front.
 
-    curve: (n, 2) mm. x and z.
     width: mm. Half width, where the groove ends with no corner.
     depth: (n,) mm. How far the surface moves in; negative moves out.
     behind: mm. y beyond which nothing is engraved.
@@ -392,10 +377,9 @@ class Engraving:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What one shape does to the shapes before it.
+    """What one shape does to the shapes before it, rounded over `melt` mm.
 
     how: "join" adds the shape, "cut" takes it away, "meet" keeps what lies in both.
-    melt: mm. Width of the rounding.
     """
 
     how: str

@@ -229,11 +229,9 @@ def add_sizes(plotter: Any, shape: Any, name: str, largest: float, **more: Any) 
 def add_scale_bar(
     plotter: Any, place: tuple[float, float], labels: int, form: str, letters: int = 14
 ) -> None:
-    """Adds an upright scale in mm to a view.
+    """Adds an upright scale in mm to a view, with its lower left corner at shares of it.
 
-    place: Its lower left corner, as shares of the view.
-    form: Of their numbers, as printf has it.
-    letters: Their height, pixels.
+    form, letters: Of its numbers, as printf has it, and their height, pixels.
     """
     bar = plotter.add_scalar_bar(
         title="mm",

@@ -68,13 +68,9 @@ def chart_errors(
 def write_figure(
     path: Path, size: tuple[float, float], draw: Callable[[Any], None], *, dpi: int = 150
 ) -> None:
-    """Writes what `draw` puts into an empty figure; an old file goes in one step.
+    """Writes what `draw` puts into an empty figure of matplotlib; an old file goes in one step.
 
-    path: Ends in `.png`, `.svg` or `.pdf`.
-    size: inches.
-    draw: Takes matplotlib's figure.
-    dpi: Of a `.png`.
-    Raises `CaseError`: matplotlib is missing, another ending.
+    path: Ends in `.png`, of so many dots per inch, `.svg` or `.pdf`; size in inches.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise CaseInputError(

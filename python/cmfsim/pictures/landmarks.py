@@ -54,8 +54,8 @@ class Label:
 class LabelPlaces:
     """Where names stand in a view, in pixels from its lower left corner.
 
-    left: (n,) bool. Whether a name stands in the left column.
-    lines: (n, 2), where its line begins: the inner end of the text, at half its height.
+    left, lines: (n,), whether a name stands in the left column; (n, 2), where its line begins: the
+        inner end of the text, at half its height.
     boxes: (n, 4). What its text may take: left, bottom, right, top.
     """
 
@@ -71,15 +71,12 @@ def column_width(names: Sequence[str]) -> float:
 
 
 def spread(heights: ArrayLike, gap: float, low: float, high: float) -> Floats:
-    """Heights in the same order, at least `gap` apart, between two bounds.
+    """Heights (n,) in the same order, at least `gap` apart, between two bounds.
 
     They have the least sum of squared distances from those given: with i·gap subtracted from the
     i-th from below, that is isotonic regression, by pooling adjacent violators (Barlow,
     Bartholomew, Bremner & Brunk 1972), cut at the bounds. Where there is no room for all, they
     stand closer than `gap`.
-
-    heights: (n,).
-    Returns: (n,).
     """
     given = np.asarray(heights, dtype=np.float64)
     count = len(given)
@@ -102,10 +99,9 @@ def spread(heights: ArrayLike, gap: float, low: float, high: float) -> Floats:
 
 
 def label_places(points: ArrayLike, names: Sequence[str], size: tuple[float, float]) -> LabelPlaces:
-    """Where the names of points stand: in the column that is closer, from the middle in turns.
+    """Where the names of points (n, 2) stand: in the closer column, from the middle in turns.
 
-    points: (n, 2), in pixels from the lower left corner of the view.
-    size: Of the view, pixels.
+    Both the points and the size of the view are pixels, from its lower left corner.
     """
     at = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     width, height = size
@@ -129,10 +125,7 @@ def label_places(points: ArrayLike, names: Sequence[str], size: tuple[float, flo
 
 
 def add_labels(plotter: Any, toward: Floats, labels: Sequence[Label]) -> None:
-    """Adds names and lines to a view whose camera stands, in parallel projection.
-
-    toward: (3,). The unit vector from the head to the camera.
-    """
+    """Adds names and lines to a view, with the unit vector (3,) from the head to the camera."""
     if not labels:
         return
     pv = canvas.pyvista_module()

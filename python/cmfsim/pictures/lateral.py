@@ -64,10 +64,7 @@ class LateralView:
 def picture_lateral(
     path: str | os.PathLike[str], *, before: LateralView, planned: LateralView
 ) -> None:
-    """Writes the tracing before the operation, and as planned over that before.
-
-    Raises `CaseError`: matplotlib is missing, another ending.
-    """
+    """Writes the tracing before the operation, and as planned over that before."""
     clouds = np.array([p for v in (before, planned) for n, p in v.sites.items() if n in SHOWN])
     low, high = clouds[:, 1].min() - BELOW, clouds[:, 1].max() + ABOVE
     front = clouds[:, 0].max() + FRONT

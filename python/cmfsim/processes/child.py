@@ -37,11 +37,9 @@ def read_in_child(
 ) -> worker.Answer:
     """The answer of a function of the package that is called in the child process.
 
-    task: "module:function" within cmfsim; the `LIBRARIES` of the module are imported before its
-        time begins.
+    task: "module:function"; the `LIBRARIES` of the module are imported before its time begins.
     **arguments: Plain values that JSON holds; paths as text, absolute.
-    Raises `ReaderError`: The child crashed, or passed a limit. The text is a clause without the
-        file's name.
+    Raises `ReaderError`: The child crashed, or passed a limit: a clause without the file's name.
     Raises `CmfsimError`, `ValueError`, `OSError`: What the function raises, with its class.
     """
     with _LOCK:

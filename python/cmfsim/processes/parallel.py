@@ -18,16 +18,10 @@ ANSWER_TIME = 10.0
 def on_cluster(
     scheduler: str, function: Callable[..., Any], jobs: Sequence[Sequence[Any]]
 ) -> Iterator[tuple[int, Any, Exception | None]]:
-    """What a function answers to each job, with the job's index, as they end.
+    """The index of each job, and either what a function answers to it or raised, as they end.
 
     A job whose machine is lost is given to another one, as Dask does it; only one that loses
-    several machines in a row is given up.
-
-    scheduler: Address of the cluster.
-    function: The machines import it by its name.
-    jobs: Arguments.
-    Yields: Index, and either the answer or what the function raised, or the cluster for it.
-    Raises `CaseError`: No Dask installed, or no cluster at the address.
+    several machines in a row is given up. The machines import the function by its name.
     """
     distributed = third_party("distributed", "work is distributed over a cluster", "study")
     try:
@@ -54,15 +48,10 @@ def answers(
 ) -> Iterator[tuple[int, Any]]:
     """What a function answers to each job, with the job's index, as they end.
 
-    function: "module:name" of this package; it takes a job's values by name and returns plain
-        values.
-    jobs: Plain values, as JSON has them.
-    workers: Processes.
-    scheduler: Address of a Dask cluster that sees the same files; it then decides how many run at a
-        time.
+    function: "module:name" of this package; it takes a job's plain values by name and returns some.
+    workers: Processes; on a Dask cluster, which must see the same files, its scheduler decides.
     Raises `CmfsimError`: What the function raises, with its class.
-    Raises `CaseError`: A process died, or met an error of another kind, which its text has; no
-        cluster answers.
+    Raises `CaseError`: A process died, or met an error of another kind, which its text has.
     """
     if scheduler is not None:
         asked = [(function, dict(job)) for job in jobs]
@@ -97,7 +86,6 @@ def as_they_end(
     """What a function here makes of each job, in threads, with the job's index, as they end.
 
     run: Takes a job, and what starts a `Worker`. All workers end when the caller stops listening.
-    workers: Threads.
     """
     lock, ended = threading.Lock(), threading.Event()
     started: list[Worker] = []

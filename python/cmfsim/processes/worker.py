@@ -52,10 +52,9 @@ LENGTH = struct.Struct("<Q")
 
 
 class WorkerEndedError(CaseError):
-    """A worker process ended before it answered.
+    """A worker process ended before it answered, perhaps because it was late.
 
     code: Its exit code; minus the signal that ended it.
-    late: Whether it passed its time.
     """
 
     def __init__(self, code: int, late: bool = False) -> None:  # noqa: FBT001, FBT002 (pickled so)
@@ -71,10 +70,7 @@ class WorkerEndedError(CaseError):
 
 
 class WorkerFailedError(CaseError):
-    """A function raised an error that is not of the package.
-
-    kinds: Names of its class and of those that it is made from.
-    """
+    """A function raised an error that is not of the package, but of these kinds, its own first."""
 
     def __init__(self, kinds: list[str], text: str, trace: str) -> None:
         super().__init__(kinds, text, trace)
@@ -90,8 +86,7 @@ class WorkerFailedError(CaseError):
 class ReadLimits:
     """What one request may use.
 
-    seconds: Processor time; six times as much on the clock, more where others keep the processor
-        busy.
+    seconds: Processor time; six times as much on the clock, more on a busy machine.
     memory: Bytes beyond what the worker holds when the request begins; on Linux only.
     """
 
@@ -154,11 +149,10 @@ class Worker:
         *,
         seconds: float | None = None,
     ) -> Answer:
-        """The answer of a function of the package that is called in the process.
+        """The answer of a function, "module:name", of the package that is called in the process.
 
-        function: "module:name"; it takes the arguments by name and returns an `Answer` or plain
-            values.
-        arguments: Plain values that JSON holds.
+        It takes arguments by name and returns an `Answer` or plain values: those that JSON holds.
+
         seconds: Time on the clock.
         Raises `CmfsimError`: What the function raises, with its class.
         Raises `WorkerFailedError`: It raises an error of another kind.
@@ -235,12 +229,9 @@ class Worker:
 def run_program(
     name: str, words: Sequence[str], given: bytes = b"", *, seconds: float
 ) -> subprocess.CompletedProcess[bytes]:
-    """What another program printed, and the code that it ended with, whatever that is.
+    """What another program, given some bytes, printed, and the code that it ended with.
 
-    name: What a message calls it.
-    words: The program and its arguments; no shell reads them.
-    given: For its standard input.
-    Raises `CaseError`: It cannot be started, or has not ended after so many seconds.
+    name, words: What a message calls it; itself and its arguments, which no shell reads.
     """
     try:
         return subprocess.run(  # noqa: S603 (words of ours, and no shell)

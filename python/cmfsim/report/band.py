@@ -10,10 +10,7 @@ Values: TypeAlias = Mapping[str, Any]
 
 
 def not_operated_blocks(evaluation: Values) -> list[Note | Table]:
-    """The error where nothing was operated on; that it is not known, where it is not.
-
-    evaluation: What `metrics.json` holds.
-    """
+    """The error where nothing was operated on (of `metrics.json`); or that it is not known."""
     if "not_operated" not in evaluation:
         return []  # of an earlier version
     found = evaluation["not_operated"]
@@ -76,10 +73,7 @@ def summary_blocks(evaluation: Values) -> list[Note | Table]:
 
 
 def statistics_table(regions: Mapping[str, Values], caption: str, of: str = "region") -> Table:
-    """Statistics of signed distances by region.
-
-    regions: `DistanceStatistics.as_dict()` by region, or by what `of` calls it.
-    """
+    """Statistics of signed distances, `DistanceStatistics.as_dict()`, by region or by what `of` says."""
     columns = (of, "mean", "SD", "median", "RMS", "90 %", "95 %", "max", "signed", "< 2 mm")
     keys = ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm")
     rows = tuple(
@@ -111,11 +105,7 @@ CALIBRATED = (
 
 
 def band_section(band: Values, figures: list[Figure]) -> Section:
-    """The band of one prediction.
-
-    band: `SkinBand.as_dict()`.
-    figures: Its picture, where there is one.
-    """
+    """The band of one prediction (`SkinBand.as_dict()`), with its picture, where there is one."""
     missing = Note("Not covered by the sources: " + "; ".join(band["not_covered"]) + ".")
     notes = [Note(f"{text}.") for text in band["notes"]]
     statement, widths = band_blocks(band)

@@ -63,13 +63,11 @@ def case_document(
 ) -> Document:
     """The report of a case.
 
-    predictions: What `prediction.json` holds, one per model, all of one plan.
-    shown: The model whose pictures are given, and whose figures stand at the top; the last if left
-        out.
-    evaluation: What `metrics.json` holds.
+    predictions, evaluation: What `prediction.json` (one per model, all of one plan) and
+        `metrics.json` hold.
+    shown: The model whose pictures are given, and whose figures stand at the top; else the last.
     pictures: PNG files of the model that is shown, by name, those of `PICTURES` first.
-    figures: Plots of the evaluation.
-    view: (str, str). Markup and script policy of a view of the model that is shown.
+    figures, view: Plots of the evaluation; markup and script policy of a view of the shown model.
     left_out: What does not belong to these predictions and is missing for that.
     Raises `CaseError`: Predictions, or predictions and evaluation, that do not belong together.
     """
@@ -144,10 +142,7 @@ def _named(model: str) -> str:
 
 
 def _facts(prediction: Values, evaluation: Values | None) -> dict[str, str]:
-    """The plan at teeth and chin, and the figures of the model that is shown.
-
-    Errors only where this model was evaluated.
-    """
+    """The plan at teeth and chin, and figures of the shown model; errors if it was evaluated."""
     skin, model = prediction["skin"], prediction["model"]
     facts = {}
     for name, motion in prediction["plan"].items():

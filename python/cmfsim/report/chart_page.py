@@ -143,11 +143,9 @@ class _Page:
 def draw_chart_page(
     figure: Any, prediction: Values, pictures: Mapping[str, bytes], findings: Sequence[Finding]
 ) -> None:
-    """Draws the page of one plan onto an empty figure of matplotlib, of the size `A4`.
+    """Draws the page of one plan (`prediction.json`) onto an empty figure of the size `A4`.
 
-    The prediction is what `prediction.json` holds; pictures are PNG files, "prediction",
-    "lateral" and "plan", which stands below the others; findings are those of
-    all stages.
+    Pictures are PNG files, "prediction", "lateral" and "plan", which stands below the others.
     """
     page, y = _Page(figure), MARGIN
     page.line(MARGIN, y, f"{prediction['case']}: predicted face", TITLE, weight="bold")

@@ -26,9 +26,9 @@ NORMS = (
 
 
 def clinical_sections(prediction: Values, contacts: Sequence[Figure] = ()) -> list[Section]:
-    """The sections on measures and landmarks of `prediction.json`; none in that of older versions.
+    """The sections on measures, with a picture of contacts, and on landmarks of `prediction.json`.
 
-    contacts: The picture of the tooth rows' contacts, if there is one.
+    There are none in that of older versions.
     """
     found = prediction.get("clinical")
     if found is None:

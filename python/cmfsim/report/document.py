@@ -36,10 +36,9 @@ class View:
 
 @dataclass(frozen=True)
 class Alert:
-    """A message at the top of a report: one line, with the details collapsed below it.
+    """A message, "error", "warning" or "note", at the top of a report: one line, and its details.
 
-    kind: "error", "warning" or "note".
-    details: Shown when the line is opened, and on paper.
+    The details are shown when the line is opened, and on paper.
     """
 
     kind: str
@@ -57,12 +56,10 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """A whole report.
+    """A whole report: the few figures that a reader looks for first, and sections; alerts on top.
 
-    alerts: Above everything else.
     facts_title: Whose figures the facts are.
     links: Names of files in the same folder that belong to it, by what they are.
-    facts: The few figures that a reader looks for first.
     """
 
     title: str

@@ -59,8 +59,6 @@ def render_page(document: Document) -> str:
     """The page of a report: all text escaped, pictures inside, no addresses.
 
     It has no script but that of its view, which is allowed by its hash.
-
-    Raises `CaseError`: Jinja2, of the extra `report`, is not installed.
     """
     jinja2 = third_party("jinja2", "reports are made", "report")
     environment = jinja2.Environment(

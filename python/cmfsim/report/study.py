@@ -17,10 +17,7 @@ PAPER_MUSCLES_SLIDING = (1.21, 2.14, 1.58, 2.56)
 
 
 def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document:
-    """The report of a study.
-
-    study: `StudyReport.as_dict()`.
-    """
+    """The report of a study, as `StudyReport.as_dict()` has it."""
     models = tuple(study["models"])
     done = [case for case in study["cases"] if case["status"] != "failed"]
     failed = [case for case in study["cases"] if case["status"] == "failed"]
@@ -44,8 +41,7 @@ def study_document(study: Values, *, figures: Sequence[Figure] = ()) -> Document
 def table3_text(study: Values, table: ErrorTable) -> str:
     """Table 3 of Kim et al. (2010) for a study, in Markdown, with the means that the paper states.
 
-    study: `StudyReport.as_dict()`.
-    table: Of the same study.
+    The study is `StudyReport.as_dict()`, the table its own.
     """
     models = tuple(study["models"])
     blocks = [f"# {plain_line(study['cohort'])}: errors by patient and model"]

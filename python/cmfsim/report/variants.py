@@ -135,10 +135,7 @@ def _failures(values: Values) -> list[tuple[str, str]]:
 
 
 def variants_document(values: Values) -> Document:
-    """The report of a study of variants.
-
-    values: `VariantsReport.as_dict()`.
-    """
+    """The report of a study of variants, `VariantsReport.as_dict()`."""
     alerts = [
         Alert("error", f"{where} failed", tuple(error.splitlines()))
         for where, error in _failures(values)
@@ -173,10 +170,7 @@ def _variants_table(values: Values) -> Table:
 
 
 def variants_text(values: Values) -> str:
-    """The tables of a study of variants as plain text; the short ones come last.
-
-    values: `VariantsReport.as_dict()`.
-    """
+    """The tables of a study of variants as plain text; the short ones come last."""
     blocks = [note for note in (values["note"], values["description"]) if note]
     regions, patients = _tables(values)
     blocks += [table.text for table in (*patients, *regions)]
@@ -184,10 +178,7 @@ def variants_text(values: Values) -> str:
 
 
 def variants_markdown(values: Values) -> str:
-    """The tables of a study of variants in Markdown.
-
-    values: `VariantsReport.as_dict()`.
-    """
+    """The tables of a study of variants in Markdown."""
     blocks = [f"# {plain_line(values['cohort'])}: variants"]
     blocks += [plain_line(note) for note in (values["note"], values["description"]) if note]
     blocks.append(_variants_table(values).markdown)

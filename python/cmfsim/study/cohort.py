@@ -61,7 +61,6 @@ Errors = Mapping[str, Mapping[str, SkinErrors]]
 class CaseJob:
     """One case of a study, as plain values that travel to another process or machine.
 
-    threads: That the case may use.
     changes: Of its settings, as `CaseChanges.as_json` writes them; empty if there are none.
     """
 
@@ -75,11 +74,9 @@ class CaseJob:
 
 @dataclass(frozen=True)
 class CaseOutcome:
-    """The outcome of one case.
+    """The outcome of one case: what `cmfsim evaluate` wrote or, if it failed, its log's last lines.
 
     status: "done", "kept" (finished by an earlier run, nothing has changed since) or "failed".
-    error: The last lines of its log, where it failed.
-    evaluation: What `cmfsim evaluate` wrote; empty where it failed.
     """
 
     name: str
@@ -175,11 +172,9 @@ def run_studies(
     *,
     progress: Callable[[Cohort, CaseOutcome], None],
 ) -> list[StudyReport]:
-    """The reports of several cohorts, whose cases share the workers.
+    """The reports of several cohorts with different output folders, whose cases share the workers.
 
-    cohorts: Each with a different output folder.
     progress: Called with each outcome as soon as it is known.
-    Raises `CaseError`, `OSError`: As `run_study`.
     """
     cores = os.cpu_count() or 1
     workers = max(1, cores // 2) if options.workers is None else options.workers
@@ -429,10 +424,8 @@ _log = logging.getLogger(__name__)
 def evaluate_case(file: str, output: str, changes: str, models: Sequence[str]) -> bool:
     """Whether a case was compared, though some of its models may have failed.
 
-    It writes what `cmfsim evaluate` writes; if so, `metrics.json` is whole and new.
-
-    file, output: The case, and its output folder.
-    changes: Of its settings, as `CaseChanges.as_json` writes them, or an empty text.
+    It writes what `cmfsim evaluate` writes; if so, `metrics.json` is whole and new. Changes of its
+    settings are as `CaseChanges.as_json` writes them, or an empty text.
     """
     logging.basicConfig(format="cmfsim: %(message)s", level=logging.WARNING, stream=sys.stderr)
     try:

@@ -31,13 +31,11 @@ LANDMARK_SD = 2.0
 
 @dataclass(frozen=True, eq=False)
 class LandmarkTrial:
-    """One trial: landmarks placed again, and what that changes.
+    """One trial: landmarks placed again, and what that changes, mm.
 
-    landmarks: mapping of str to (3,), mm.
-    landmark_deviation: mm. Mean distance of the landmarks from those of the case.
-    muscle_deviation: mm. Mean distance of each muscle's vertices from where the case's landmarks
-        put them.
-    skin_deviation: (k,), mm. Distance of each vertex of the predicted skin from that of the case.
+    landmark_deviation: Mean distance of the landmarks from those of the case.
+    muscle_deviation: Mean distance of each muscle's vertices from where those put them.
+    skin_deviation: (k,). Distance of each vertex of the predicted skin from that of the case.
     """
 
     landmarks: Mapping[str, Floats]

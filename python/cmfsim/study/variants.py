@@ -200,10 +200,7 @@ def _folder(cohort: Cohort, variants: Variants) -> Path:
 
 
 def _same_as_given(cohort: Cohort, variants: Variants) -> dict[str, frozenset[str]]:
-    """By variant, the cases with the settings of "as-given", and those that cannot be read.
-
-    Raises `CaseError`: A variant has a key or value that a case cannot have.
-    """
+    """By variant, the cases with the settings of "as-given", and those that cannot be read."""
     same: dict[str, set[str]] = {name: set() for name in variants.variants}
     for name, file in cohort.cases.items():
         try:

@@ -207,11 +207,7 @@ CaseOrPath: TypeAlias = Case | AnyPath
 
 
 def as_case(case: CaseOrPath) -> Case:
-    """The case itself, or the one that the file or folder at a path describes.
-
-    Raises `FileNotFoundError`, `CaseError`: As `Case.load`; `CaseError` (also `ValueError`) also
-        for anything else.
-    """
+    """The case itself, or the one that the file or folder at a path describes, as `Case.load`."""
     if isinstance(case, Case):
         return case
     if isinstance(case, str | os.PathLike):

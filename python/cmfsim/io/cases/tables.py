@@ -87,8 +87,6 @@ def read_tables(path: Path, what: str = "case file", *, json_too: bool = False) 
 
     what: What the file is, for errors.
     json_too: Whether the file may be JSON; then an error names its keys, but no line.
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `CaseError`: Not TOML, not UTF-8, larger than 1 MiB, a pipe, keys of many parts.
     """
     reading_writing.check_readable(path)
     endings = (".toml", ".json") if json_too else (".toml",)
@@ -240,10 +238,7 @@ class Table:
         return f"{self._file}:{line_of(self._lines, path)}" if self._lines else self._file
 
     def changed(self, changes: CaseChanges) -> "Table":
-        """The whole file with changes; an error names the file in which its key stands.
-
-        Raises `CaseError`: A key to be removed that the file does not have.
-        """
+        """The whole file with changes; an error names the file in which its key stands."""
         values, lines = copy.deepcopy(dict(self._values)), dict(self._lines)
         for name in changes.without:
             *tables, key = name.split(".")

@@ -51,8 +51,7 @@ class TemplateSurvey:
 def read_template(path: AnyPath) -> TemplateData:
     """The template of a folder with `template.toml`, or of an `.npz` archive.
 
-    Raises `FileNotFoundError`: The folder or archive, or a file that it names, does not exist.
-    Raises `CaseError`: Anything else: file, line and key, and how many more there are.
+    An error names file, line and key of what is wrong first, and how many more there are.
     """
     survey = survey_template(path)
     errors = [f for f in survey.findings if f.severity == "error"]
@@ -65,10 +64,7 @@ def read_template(path: AnyPath) -> TemplateData:
 
 
 def survey_template(path: AnyPath) -> TemplateSurvey:
-    """What a template on disk holds, and everything that keeps it from being read.
-
-    Raises `FileNotFoundError`: There is no such folder or archive.
-    """
+    """What a template on disk holds, and everything that keeps it from being read."""
     path = Path(path)
     if not is_there(path):
         raise FileNotFoundError(f"{path}: no such template")
@@ -92,12 +88,8 @@ def write_template(
     """Writes a template: a folder, or one archive if the name ends in `.npz`.
 
     A report is written beside it in the folder, as `report.json`; an archive has no place for one.
-
     The files of a folder take their places together. A folder that is there must hold a template
     and nothing else; files that the new one lacks go.
-
-    Raises `CaseError`: The folder holds files that are not of a template.
-    Raises `OSError`: The place cannot be written to.
     """
     path = Path(path)
     if path.suffix == ".npz":

@@ -137,14 +137,10 @@ def _unpacked(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
 def read_archive(
     path: Path, format_name: str, text_name: str
 ) -> tuple[dict[str, Any], Mapping[str, NDArray[Any]]]:
-    """Header and arrays of an archive of this format; an array is unpacked when it is asked for.
+    """Header and arrays of an archive of this format, which its header states as its `format`.
 
-    format_name: What the header states as its format.
-    text_name: The member that is the header, a JSON text.
-    Returns: The header.
-    Returns: Looking one up raises `CaseError` where it is damaged or too large.
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `CaseError`: Not an archive, cut short, another format, version or units.
+    An array is unpacked when it is asked for: looking one up is an error where it is damaged or too
+    large. `text_name` is the member that is the header, a JSON text.
     """
     check_readable(path)
     try:

@@ -55,13 +55,9 @@ def replacing_files(
     missing, so that nothing reads old and new files as one.
 
     summary: The JSON file whose "files" lists what was written; `fill` writes it last.
-    is_ours: Whether a file of a name may be removed.
     fill: Writes the files into the folder that it is given, and returns their names: plain ones, or
         one folder and a name ("M/prediction.vtp").
-    stale: The names in the folder that do not belong to what `fill` wrote; called after it.
-    Raises `CaseError`: A subfolder that files are to be written to is a link or a file.
-    Raises `CmfsimError`: The folder was deleted meanwhile.
-    Raises `OSError`: The folder cannot be made or written to; names it.
+    is_ours, stale: Whether a file of a name may be removed; names that go, asked after `fill`.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
@@ -98,8 +94,6 @@ def finish_writing(folder: Path) -> None:
 
     What a stranger put there under such a name can neither lead out of the folder nor keep a run
     from working.
-
-    Raises `OSError`: Files that are whole cannot take their places; names the folder.
     """
     for left in abandoned(folder, f"{PREFIX}*", folders=True):
         undo, ready = _journal(left / UNDO), _journal(left / READY)
@@ -116,8 +110,6 @@ def check_below(folder: Path, base: Path) -> None:
 
     A case comes from strangers, and a link in it could have results replace files anywhere. A
     folder that does not lie below is the user's own choice.
-
-    Raises `CaseError`: Where the link leads.
     """
     if not folder.absolute().is_relative_to(base.absolute()):
         return
@@ -137,9 +129,6 @@ def check_writable(folder: Path) -> None:
     """Finds before the work that a folder cannot be made or written to, by writing to it.
 
     Permissions do not tell: root has them all, and a disk may be read-only or full.
-
-    Raises `CaseError`: It is a file, or would be in one.
-    Raises `OSError`: It cannot be written to.
     """
     there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():

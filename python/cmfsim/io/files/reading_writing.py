@@ -97,9 +97,7 @@ def deleted_meanwhile(folder: Path) -> CmfsimError:
 def check_readable(path: Path, error: type[ValueError] = CaseInputError) -> None:
     """Refuses what is no plain file: opening a pipe waits for ever, a device may never end.
 
-    Raises `FileNotFoundError`: There is nothing of this name.
-    Raises `CaseError`, `or the error that is given`: A folder, a pipe or device, a name that no
-        file can have, no permission.
+    Raises `FileNotFoundError`: There is nothing of this name; for all else, the given error.
     """
     mode = _mode(path, error)
     if mode is None:
@@ -114,11 +112,7 @@ def check_readable(path: Path, error: type[ValueError] = CaseInputError) -> None
 
 
 def is_there(path: Path, error: type[ValueError] = CaseInputError) -> bool:
-    """Whether there is a file or folder of this name.
-
-    Raises `CaseError`, `or the error that is given`: A name that no file can have, links in a
-        circle, no permission.
-    """
+    """Whether there is a file or folder of this name; an error for names that no file can have."""
     return _mode(path, error) is not None
 
 
@@ -205,10 +199,7 @@ def is_below(path: Path, folder: Path) -> bool:
 
 
 def utf8_text(data: bytes) -> str:
-    """The text of a file in UTF-8, with or without a mark at its beginning.
-
-    Raises `CaseError`: Another encoding; names the line, and says how to save the file.
-    """
+    """The text of a file in UTF-8, with or without a mark at its beginning."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise CaseInputError(
             'is UTF-16 (Notepad calls it "Unicode"): save it as UTF-8 in your editor'
@@ -241,10 +232,7 @@ def toml_hint(text: str, message: str) -> str:
 
 
 def check_plain_toml(text: str) -> None:
-    """Refuses keys of more than 8 parts: their tables in tables take a thousand times the text.
-
-    Raises `CaseError`: With the line.
-    """
+    """Refuses keys of more than 8 parts: their tables in tables take a thousand times the text."""
     # Usually there is no such key, in texts and comments neither.
     found = re.search(DEEP_KEY, text) and next(
         (match for match in OUTSIDE_TEXTS.finditer(text) if match["deep"]), None
@@ -258,7 +246,6 @@ def check_numbers(value: object, *, finite: bool = False) -> None:
     """Refuses whole numbers beyond a float's range anywhere in plain values of a text.
 
     finite: Whether other numbers must be finite as well: JSON reads 1e400 as infinity.
-    Raises `CaseError`: With the number of its digits.
     """
     left = [value]
     while left:
@@ -365,11 +352,8 @@ def walk_xml(
     """Calls back for each element of a text that begins and ends, and for its words.
 
     The encoding is UTF-8 whatever the text states: nothing hides behind another one. Entities could
-    grow without bound.
-
-    most: Elements, and how deeply they are nested.
-    separator: Between namespace and name; without one, namespaces are not resolved.
-    Raises `CaseError`: Not XML in UTF-8, zero bytes, a document type, entities, or more
+    grow without bound. Elements, and how deeply they are nested, are limited; without a separator
+    between namespace and name, namespaces are not resolved.
     """
     if b"\0" in text:
         raise CaseInputError("is not XML in UTF-8: it holds zero bytes")

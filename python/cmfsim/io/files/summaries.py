@@ -67,12 +67,7 @@ FINDING: Shape = {
 def write_summary(
     path: Path, values: Mapping[str, Any], sealed: Mapping[str, str] | None = None
 ) -> None:
-    """Writes a summary with the hashes of files next to it, and its own.
-
-    values: Plain values.
-    sealed: The files in the same folder that it answers for: their `hashes_of`.
-    Raises `ValueError`: NaN or infinity among the values.
-    """
+    """Writes a summary with its own hash, and those of the files next to it that it answers for."""
     content = {**values, "sha256": dict(sealed or {})}
     # As a reader will have it: tuples are lists, keys are texts.
     content = json.loads(json.dumps(content, allow_nan=False))
@@ -81,13 +76,9 @@ def write_summary(
 
 
 def read_summary(path: Path, shape: Shape, again: str) -> dict[str, Any]:
-    """The content of a summary that is whole, unchanged and as it must be.
+    """The content of a summary that is whole, unchanged and of a shape, as `check` takes it.
 
-    shape: As `check` takes it.
     again: What makes the file again, for the error.
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `CaseError`: It is a link or no file, too large, not JSON; its digest is missing or
-        another; a value of another type or out of range, with its place.
     """
     try:
         content = plain_json(path)
@@ -108,11 +99,7 @@ def read_summary(path: Path, shape: Shape, again: str) -> dict[str, Any]:
 
 
 def checked_file(folder: Path, summary: Mapping[str, Any], name: str, again: str) -> Path:
-    """The path of a file next to a summary that is the one it was written with.
-
-    Raises `FileNotFoundError`: There is none.
-    Raises `CaseError`: The summary does not list it, or it is another file.
-    """
+    """The path of a file next to a summary that is the one it was written with."""
     path = folder / name
     known = summary["sha256"].get(name)
     if known is None or "/" in name or "\\" in name or name in {"", ".", ".."}:
@@ -129,19 +116,13 @@ def checked_file(folder: Path, summary: Mapping[str, Any], name: str, again: str
 
 
 def write_record(path: Path, values: Mapping[str, Any]) -> None:
-    """Writes the record of a finished job, in one step, for `kept_record`.
-
-    Raises `ValueError`: NaN or infinity among the values.
-    """
+    """Writes the record of a finished job, in one step, for `kept_record`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_text(path, json.dumps(values, indent=1, allow_nan=False))
 
 
 def kept_record(path: Path, **made_from: object) -> dict[str, Any] | None:
-    """The record of a job that an earlier run finished; None if the job is to be done again.
-
-    made_from: What the record must state of its inputs, by the names in it.
-    """
+    """The record of an earlier job that states these inputs; None if it is to be done again."""
     try:
         found = plain_json(path)
     except (OSError, ValueError):
@@ -152,8 +133,7 @@ def kept_record(path: Path, **made_from: object) -> dict[str, Any] | None:
 def plain_json(path: Path) -> dict[str, Any]:
     """The table of names and values in a JSON file that is no link and not too large.
 
-    Raises `CaseError`: Anything else; without the file's name.
-    Raises `OSError`: It cannot be opened.
+    Raises `CaseError`: Anything else, without the file's name; `OSError` where it cannot be opened.
     """
     mode = path.lstat().st_mode
     if not stat.S_ISREG(mode):

@@ -18,12 +18,10 @@ SHOWN = 40
 
 
 def real_numbers(words: Sequence[bytes], where: Callable[[int], str], kind: str = "f8") -> Floats:
-    """Words as finite float64, one for one.
+    """Words as finite float64, (n,), one for one.
 
     where: The place of a word, by its index, as an error names it: "line 3".
     kind: "f4" where the file states single precision: numbers become those that it can hold.
-    Returns: (n,).
-    Raises `CaseError`: A word that is no number, NaN or infinity.
     """
     try:
         values = np.fromiter(map(float, words), np.float64, len(words))
@@ -45,12 +43,7 @@ def real_numbers(words: Sequence[bytes], where: Callable[[int], str], kind: str 
 
 
 def whole_numbers(words: Sequence[bytes], where: Callable[[int], str]) -> NDArray[np.int64]:
-    """Words as int64, one for one.
-
-    where: The place of a word, by its index, as an error names it.
-    Returns: (n,) int64.
-    Raises `CaseError`: A word that is no whole number, or one beyond 64 bits.
-    """
+    """Words as int64, (n,), one for one; `where` as in `real_numbers`."""
     try:
         values = np.fromiter(map(int, words), np.int64, len(words))
     except (ValueError, OverflowError):
@@ -100,12 +93,10 @@ VALUE_TOKEN = re.compile(r"\"\"\"|'''|\"|'|#|[\[\]{}]|\n")
 
 
 def toml_lines(text: str) -> dict[KeyPath, int]:
-    """The line, from 1 on, on which each table and key of a TOML text stands.
+    """The line, from 1 on, on which each table and key of a valid TOML text stands.
 
     Keys inside inline tables and arrays are not listed: they have the line of the key before them
     (`line_of`).
-
-    text: A text that a TOML reader has accepted.
     """
     lines: dict[KeyPath, int] = {}
     counts: dict[KeyPath, int] = {}

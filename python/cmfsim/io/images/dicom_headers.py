@@ -133,11 +133,7 @@ def numbers_of(text: str, count: int) -> NDArray[np.float64] | None:
 
 
 def dicom_header(path: Path) -> DicomHeader | None:
-    """What a DICOM file states; None where the file is no DICOM.
-
-    Raises `ImageError`: A DICOM file that is cut short, damaged or packed as a whole; pydicom is
-        not installed.
-    """
+    """What a DICOM file states; None where the file is no DICOM."""
     with path.open("rb", buffering=0) as file:
         begin = file.read(PREAMBLE + 4)
         marked = begin[PREAMBLE:] == b"DICM"

@@ -84,7 +84,6 @@ def read_dicom_folder(
     """The CT of a folder, its modality, and findings on how it lay there.
 
     series: UID or number of the series that is meant.
-    Raises `ImageError`: No CT, several to choose from, slices that do not make a volume.
     """
     chosen, findings = _meant(folder, series)
     slices = [s for header in chosen.headers for s in slices_of(header)]
@@ -92,10 +91,7 @@ def read_dicom_folder(
 
 
 def study_date(path: Path, series: str | None) -> str:
-    """The date of the study of a DICOM folder or file, YYYYMMDD; empty where none is stated.
-
-    Raises `ImageError`: As `read_dicom_folder`.
-    """
+    """The date of the study of a DICOM folder or file, YYYYMMDD; empty where none is stated."""
     header = _meant(path, series)[0].first if path.is_dir() else dicom_header(path)
     return "" if header is None else header.text("study_date")
 
@@ -115,10 +111,7 @@ def _meant(folder: Path, series: str | None) -> tuple[Series, list[Finding]]:
 
 
 def read_dicom_file(path: Path) -> tuple[ImageData, str, tuple[Finding, ...]]:
-    """The CT of a DICOM file of several frames.
-
-    Raises `ImageError`: No DICOM image, one slice, no CT, frames that do not make a volume.
-    """
+    """The CT of a DICOM file of several frames."""
     header = dicom_header(path)
     if header is None or not header.has_pixels:
         raise ImageInputError(
@@ -147,12 +140,10 @@ def dicom_files(folder: Path) -> list[Path]:
 
 
 def dicom_places(folders: Sequence[Path]) -> list[tuple[Path, str | None]]:
-    """Where the images in some folders are read, and which series of a place is meant.
+    """Where images in folders with DICOM files are read, and which series of a place is meant.
 
     Folders that have parts of one series are one place: the folder that all of them lie in. The
     series is None where the place holds nothing else.
-
-    folders: That directly hold DICOM files.
     """
     held = {folder: Counter[str]() for folder in folders}
     for folder, counts in held.items():
@@ -337,13 +328,7 @@ SERIES_NUMBER = 9001
 
 
 def write_dicom_pdf(path: Path, pdf: bytes, source: Path, title: str) -> None:
-    """Writes a PDF as a DICOM file of its own series in the study of a CT.
-
-    source: The folder of the CT's series, or one file of it.
-    Raises `CaseError`: pydicom is not installed.
-    Raises `ImageError`: No DICOM, or that of several patients or studies.
-    Raises `OSError`: A file cannot be read or written.
-    """
+    """Writes a PDF as a DICOM file of its own series in the study of a CT: a folder, or a file."""
     pydicom = third_party("pydicom", "DICOM is written", "imaging")
     uid = third_party("pydicom.uid", "DICOM is written", "imaging")
     found = {}

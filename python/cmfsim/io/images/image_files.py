@@ -105,11 +105,7 @@ FIRST_BYTES = 1024
 
 @dataclass(frozen=True, eq=False)
 class ImageFile:
-    """An image with what was found on its file.
-
-    image: On an axis-aligned grid, LPS, mm.
-    modality: "CT", "MR", … of DICOM; empty where the file does not say it.
-    """
+    """An image in LPS, what was found on its file, and its modality, where DICOM states one."""
 
     image: ImageData
     modality: str = ""
@@ -151,11 +147,7 @@ def logged(read: ImageFile) -> ImageData:
 
 
 def read_image_file(path: AnyPath, *, series: str | None = None) -> ImageFile:
-    """The image of a file or a DICOM folder, with its modality and findings.
-
-    Raises `ImageError`: As `read_image`.
-    Raises `FileNotFoundError`.
-    """
+    """The image of a file or a DICOM folder, with its modality and findings."""
     path = Path(path)
     if not is_there(path, ImageInputError):
         raise FileNotFoundError(f"{path}: no such file or folder")

@@ -53,11 +53,9 @@ def on_axes(
 
 
 def aligned(values: NDArray[Any], affine: NDArray[np.float64]) -> ImageData | None:
-    """Voxels whose axes run along the patient's, in the order and direction of these.
+    """Voxels whose axes run along the patient's, in their order and direction; None if obliquely.
 
-    values: (n, m, k) array. values[i, j, k] lies at affine · (i, j, k, 1).
-    affine: (3, 4), mm.
-    Returns: None where an axis runs obliquely.
+    values: (n, m, k) array. values[i, j, k] lies at affine · (i, j, k, 1), (3, 4) mm.
     """
     directions = affine[:, :3] / np.linalg.norm(affine[:, :3], axis=0)
     order = np.argmax(np.abs(directions), axis=1)
@@ -104,10 +102,7 @@ def shear_of(affine: NDArray[np.float64]) -> float:
 
 
 def upright(values: NDArray[Any], affine: NDArray[np.float64], name: str) -> ImageData:
-    """Voxels on oblique or sheared axes, linearly on the least grid in LPS that holds them.
-
-    Raises `ImageError`: The grid would have too many voxels.
-    """
+    """Voxels on oblique or sheared axes, linearly on the least grid in LPS that holds them."""
     itk = third_party("SimpleITK", "oblique images are resampled", "imaging", ImageError)
     image = itk.GetImageFromArray(values.T)
     last = np.array(values.shape) - 1.0
@@ -154,11 +149,9 @@ def of_slices(
     pixels, so that nothing rings at bone, metal and air. Next to the first and the last slice, and
     where one of the four does not hold the place, it is linear between slices.
 
-    positions: (slices, 3), mm, of the first pixel of each slice, in ascending order along the
-        normal.
+    positions: (slices, 3), mm, of the first pixel of each slice, ascending along the normal.
     axes: (2, 3). Unit vectors along a row (from column to column) and along a column.
     spacing: mm, between columns and between rows.
-    Raises `ImageError`: The grid would have too many voxels.
     """
     values, positions, axes = _rows_to_left(values, positions, axes, spacing[0])
     along_row, along_column = axes

@@ -47,10 +47,7 @@ KNOWN = "NRRD, NIfTI, MetaImage or DICOM is needed"
 
 
 def check_shape(name: str, size: list[int], components: int = 1) -> None:
-    """Refuses what is no volume of one number per voxel.
-
-    Raises `ImageError`.
-    """
+    """Refuses what is no volume of one number per voxel."""
     text = " × ".join(map(str, size))
     if components != 1:
         raise ImageInputError(
@@ -78,7 +75,6 @@ def check_memory(name: str, needed: int) -> None:
     A few MB may unpack to more than that, and the system would end the process.
 
     needed: Bytes.
-    Raises `ImageError`: With both numbers.
     """
     try:
         there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -98,8 +94,6 @@ def stored_voxels(
 
     start: Where the voxels begin; -1 where they end with the file.
     packing: "zlib" (gzip too), "bzip2", "hex" or "text"; empty where they are not packed.
-    Raises `ImageError`: With both lengths where they are fewer, or so many more that they may be a
-        slice that the header misses; damaged.
     """
     needed, layer = (math.prod(n) * dtype.itemsize for n in (sizes, sizes[:2]))
     there, left = data.stat().st_size, 0
@@ -167,11 +161,7 @@ def _unpacked(name: str, file: BinaryIO, most: int, packing: str) -> tuple[bytea
 
 
 def data_file(path: Path, name: str) -> Path:
-    """The file beside a header that holds its voxels.
-
-    Raises `ImageError`: It would lead out of the header's folder, it is a list or a pattern of
-        names, or there is none.
-    """
+    """The file beside a header that holds its voxels."""
     how = (
         "a header may refer to one file next to it or below; save the image as one file (.nrrd, "
         ".mha, .nii.gz)"
@@ -220,20 +210,14 @@ def apart(a: NDArray[np.float64], b: NDArray[np.float64], size: tuple[int, int, 
 
 
 def whole(path: Path, key: str, text: str) -> int:
-    """A whole number of a header, not below 0.
-
-    Raises `ImageError`.
-    """
+    """A whole number of a header, not below 0."""
     if not _WHOLE.fullmatch(text.strip()):
         raise ImageInputError(f"{path.name}: {key} is {text[:MOST_DIGITS]!r}: not a whole number")
     return int(text)
 
 
 def number(path: Path, key: str, text: str) -> float:
-    """A finite number of a header.
-
-    Raises `ImageError`: None, not finite, longer than any that is meant, or farther than a head.
-    """
+    """A finite number of a header."""
     text = text.strip()
     if len(text) > MOST_DIGITS or not _NUMBER.fullmatch(text):
         raise ImageInputError(f"{path.name}: {key} has {text[:MOST_DIGITS]!r}: not a finite number")
@@ -244,10 +228,7 @@ def number(path: Path, key: str, text: str) -> float:
 
 
 def check_affine(name: str, affine: NDArray[np.float64], size: tuple[int, int, int]) -> None:
-    """Refuses a map from index to place whose axes span no space, or that leads too far.
-
-    Raises `ImageError`.
-    """
+    """Refuses a map from index to place whose axes span no space, or that leads too far."""
     lengths = np.linalg.norm(affine[:, :3], axis=0)
     if not (lengths > 0.0).all():
         raise ImageInputError(f"{name}: spacing is {lengths.tolist()} mm: must be above 0")

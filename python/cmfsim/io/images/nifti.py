@@ -75,11 +75,7 @@ def is_nifti(begin: bytes) -> bool:
 
 
 def read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], tuple[Finding, ...]]:
-    """The voxels of a NIfTI file, axes x, y, z, the map from index to LPS (3, 4), and findings.
-
-    Raises `ImageError`: Damaged, cut short, no volume of one number per voxel, numbers that are not
-        finite, or two statements of its place that disagree.
-    """
+    """The voxels of a NIfTI file, axes x, y, z, the map from index to LPS (3, 4), and findings."""
     with path.open("rb") as file:
         packed = file.read(2) == GZIP
     try:

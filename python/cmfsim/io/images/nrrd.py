@@ -41,10 +41,7 @@ def is_meta(begin: bytes) -> bool:
 
 
 def read_meta(path: Path) -> Read:
-    """The image of a MetaImage file.
-
-    Raises `ImageError`: Something impossible is stated, or a data file elsewhere; cut short.
-    """
+    """The image of a MetaImage file."""
     fields, begin = _fields(path)
     axes = whole(path, "NDims", fields.get("NDims", ""))
     sizes = [whole(path, "DimSize", text) for text in fields.get("DimSize", "").split()]
@@ -156,10 +153,7 @@ TEXTS = frozenset({"content", "data file", "datafile", "labels", "units", "sampl
 
 
 def read_nrrd(path: Path) -> Read:
-    """The image of a NRRD file.
-
-    Raises `ImageError`: Something impossible is stated, or a data file elsewhere; cut short.
-    """
+    """The image of a NRRD file."""
     fields, begin = nrrd_fields(path)
     kind = fields.get("type", "").lower()
     if kind not in TYPES:

@@ -50,10 +50,7 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """The segments of a file.
-
-    affine: (3, 4), mm. The map from index (i, j, k, 1) to LPS.
-    """
+    """The segments of a file; the affine (3, 4) leads from index (i, j, k, 1) to LPS, mm."""
 
     labels: NDArray[Any]
     affine: NDArray[np.float64]
@@ -67,11 +64,7 @@ class Segmentation:
 
 
 def read_segmentation(path: Path) -> Segmentation:
-    """The segments of a `.seg.nrrd` file, or the labels of a label image as segments.
-
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `ImageError`: Not NRRD, detached, cut short, real numbers; a layer that is not there.
-    """
+    """The segments of a `.seg.nrrd` file, or the labels of a label image as segments."""
     check_readable(path, ImageInputError)
     with path.open("rb") as file:
         if not file.read(7).startswith(b"NRRD000"):
@@ -124,9 +117,7 @@ def are_labels(values: NDArray[Any]) -> bool:
 def read_labels(path: Path) -> Segmentation:
     """The labels of an image as segments; their names where the file, or nnU-Net, states them.
 
-    path: NRRD, NIfTI or MetaImage. One label alone is a mask, named after its file.
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `ImageError`: As `read_segmentation`; no labels.
+    One label alone is a mask, named after its file.
     """
     check_readable(path, ImageInputError)
     name = path.name.lower()

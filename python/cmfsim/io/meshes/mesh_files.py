@@ -74,9 +74,6 @@ def read_mesh(path: Path) -> PlainMesh:
 
     path: STL, PLY, OBJ, VTP, VTU, legacy VTK, Gmsh; or another format of one file that meshio
         reads, in the child process.
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `CaseError`: Not such a file, cut short, damaged, an index that is not there, a
-        coordinate that is not finite, more memory or time than a file of this size needs.
     """
     check_readable(path)
     suffix = path.suffix.lower()
@@ -199,10 +196,7 @@ def read_tet_mesh(path: AnyPath) -> tuple[NDArray[np.float64], NDArray[np.uint32
 
 
 def read_tets(mesh: PlainMesh, path: Path) -> tuple[NDArray[np.int64], dict[str, NDArray[Any]]]:
-    """The linear tets of a mesh and their cell data.
-
-    Raises `CaseError`: No tets, or other volume elements: leaving them out would leave holes.
-    """
+    """The linear tets of a mesh and their cell data."""
     blocks = [i for i, b in enumerate(mesh.cells) if b.type == "tetra" and len(b.data)]
     others = {b.type for b in mesh.cells if len(b.data)} - PASSED_OVER
     if not blocks or others:

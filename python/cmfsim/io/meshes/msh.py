@@ -30,9 +30,8 @@ WHOLE = re.compile(r"-?[0-9]{1,18}")
 
 
 class Cursor:
-    """A place in a file, which moves on with what is read.
+    """A place in a file, where the next line or block begins; it moves on with what is read.
 
-    at: Where the next line or block begins.
     order: "<" or ">" where numbers are bytes, empty where they are words.
     """
 
@@ -58,11 +57,9 @@ class Cursor:
         return text
 
     def numbers(self, kind: str, count: int, what: str) -> NDArray[Any]:
-        """The next numbers: float64 for a kind of float, else int64.
+        """The next numbers: float64 for a kind of float, else int64; `what` they are, for errors.
 
         kind: numpy's name of the type that the file holds: "f4", "i8".
-        what: What they are, for errors.
-        Raises `CaseError`: Fewer than that many are left, or one is none.
         """
         wide = np.float64 if kind[0] == "f" else np.int64
         if self.order:

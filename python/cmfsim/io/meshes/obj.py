@@ -43,9 +43,6 @@ def read_obj(data: bytes) -> tuple[Floats, Integers]:
     """The vertices (n, 3) and triangles (t, 3), from 0 on, of a file.
 
     Negative indices count back from the vertices defined so far. Polygons become triangles.
-
-    Raises `CaseError`: A line that is none of OBJ, with its number; vertex 0 or one that is not
-        there; a coordinate that is not finite; other counts than a comment states.
     """
     data = data.removeprefix(UTF8).rstrip(ENDS)
     if b"\0" in data:

@@ -49,11 +49,7 @@ class Photo(NamedTuple):
 
 
 def photo_files(path: Path) -> list[Path]:
-    """The files of a photo: itself, and of an OBJ its materials and their textures.
-
-    Raises `FileNotFoundError`: One is missing.
-    Raises `CaseError`: One that an OBJ names lies elsewhere.
-    """
+    """The files of a photo: itself, and beside it an OBJ's materials and their textures."""
     found = [path]
     for file in found:
         check_readable(file)
@@ -65,11 +61,7 @@ def photo_files(path: Path) -> list[Path]:
 
 
 def read_photo(path: Path) -> Photo:
-    """The photo in a file.
-
-    Raises `FileNotFoundError`: It, its material or its texture is missing.
-    Raises `CaseError`: Another format, no colours, whatever VTK complains of; VTK is missing.
-    """
+    """The photo in a file."""
     third_party("vtkmodules", "3D photos are read", "mesh")
     suffix, files = path.suffix.lower(), photo_files(path)
     materials = [str(file.absolute()) for file in files if file.suffix.lower() == ".mtl"]

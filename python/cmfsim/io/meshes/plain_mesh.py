@@ -108,11 +108,7 @@ def oriented(nodes: Floats, tets: Indices) -> tuple[Indices, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of one type.
-
-    type: "triangle", "tetra", ….
-    data: (m, k) int64. Indices of points, from 0 on.
-    """
+    """Cells of one type, "triangle", "tetra", …: indices of points (m, k) int64, from 0 on."""
 
     type: str
     data: Integers
@@ -120,15 +116,11 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class PlainMesh:
-    """Points and cells of a file.
+    """Points (n, 3) and cells of a file, checked: finite, and no index beyond the points.
 
-    points: (n, 3).
-    point_data: mapping of str to (n, …) array.
-    cell_data: mapping of str to tuple of (m, …) array. One array for each entry of `cells`.
+    point_data, cell_data: (n, …), and (m, …) for each entry of `cells`.
     frame: "LPS" or "RAS" where the file's header states it.
     findings: What was ignored on reading, although the file states it.
-    Raises `CaseError`: A point that is not finite, a cell that names a point that is not there, an
-        array of another length.
     """
 
     points: Floats
@@ -206,10 +198,8 @@ def cells_by_type(
 ) -> tuple[tuple[Cells, ...], tuple[Integers, ...]]:
     """Cells grouped by type, and the number of each in the file.
 
-    types: (m,) int64.
-    counts: (m,) int64. Number of corners of each cell.
+    types, counts: (m,) int64, with the number of corners of each cell.
     corners: (sum of counts,) int64.
-    Raises `CaseError`: A cell with another number of corners than its type has.
     """
     starts = np.cumsum(counts) - counts
     blocks, rows = list[Cells](), list[Integers]()
@@ -238,11 +228,9 @@ STL_HEADER = 80
 
 
 def stated_frame(data: bytes, suffix: str) -> str | None:
-    """The frame in the header of an STL, PLY, OBJ or legacy VTK file; None where it states none.
+    """The frame in the header of a whole STL, PLY, OBJ or legacy VTK file; None if it states none.
 
-    data: The whole file.
-    suffix: Its ending in lower case, such as ".stl".
-    Raises `CaseError`: Two frames, or one that is neither LPS nor RAS.
+    The suffix is its ending in lower case, such as ".stl".
     """
     head = _header(data[:MOST_HEADER], suffix)
     found = {match.upper() for match in SLICER.findall(head)}
@@ -296,13 +284,9 @@ FLAT_SHARE = 1e-9
 def checked_indices(
     indices: Integers, count: int, *, of: str = "triangle", first: int = 0
 ) -> Integers:
-    """The indices (m, k), if each names one of `count` vertices.
+    """The indices (m, k), from 0 on, if each names one of `count` vertices.
 
-    indices: (m, k) int64, from 0 on.
-    count: Number of vertices.
-    of: What a row is, for the error.
-    first: Number of the first vertex in the file's own count: 1 in OBJ, 0 elsewhere.
-    Raises `CaseError`: An index below 0 or beyond the last.
+    of, first: What a row is, and how the file numbers the first vertex (1 in OBJ), for the error.
     """
     if indices.size and (int(indices.min()) < 0 or int(indices.max()) >= count):
         row, column = np.argwhere((indices < 0) | (indices >= count))[0]
@@ -332,12 +316,8 @@ def triangles_of(
     A polygon becomes a fan of triangles about its first corner from which all of them face the same
     way; one that no fan fills, such as a star or a bow, is refused.
 
-    points: (n, 3).
-    counts: (f,) int64. Number of corners of each face.
-    corners: (sum of counts,) int64, from 0 on.
+    counts, corners: (f,), number of corners of each face, and (sum of counts,), from 0 on.
     first: Number of the first vertex in the file's own count.
-    Raises `CaseError`: A face of fewer than three corners, an index that is not there, a polygon
-        that no fan fills.
     """
     _check_corners("face", counts)
     if not (counts > 3).any():
@@ -368,10 +348,7 @@ def triangles_of_strips(points: Floats, counts: Integers, corners: Integers) -> 
     Every other triangle of a strip runs the other way round, so that all face the same way. One
     that names a corner twice joins two parts of a strip and is none.
 
-    points: (n, 3).
-    counts: (s,) int64. Number of corners of each strip.
-    corners: (sum of counts,) int64, from 0 on.
-    Raises `CaseError`: A strip of fewer than three corners, an index that is not there.
+    counts, corners: (s,), number of corners of each strip, and (sum of counts,), from 0 on.
     """
     _check_corners("strip", counts)
     begins = np.cumsum(counts) - counts

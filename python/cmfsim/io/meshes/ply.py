@@ -67,12 +67,7 @@ class _Rows:
 
 
 def read_ply(data: bytes) -> tuple[Floats, Integers, tuple[Finding, ...]]:
-    """The vertices (n, 3), triangles (t, 3) and findings of a file. Polygons become triangles.
-
-    Raises `CaseError`: Not PLY; a header that does not end; fewer bytes than the header states, or
-        more that may be another row; indices that are no whole numbers or name no vertex; a
-        coordinate that is not finite.
-    """
+    """The vertices (n, 3), triangles (t, 3) and findings of a file. Polygons become triangles."""
     elements, order, start = _header(data)
     names = [element.name for element in elements]
     # Scans have one list of strips in place of faces.

@@ -33,9 +33,6 @@ def read_stl(data: bytes) -> tuple[Floats, tuple[Finding, ...]]:
     """The corners (t, 3, 3) of the triangles of a file, and findings.
 
     Whether it is text goes by its content: binary files may begin with "solid" as well.
-
-    Raises `CaseError`: Neither form; another length than the number of triangles asks for; a solid
-        that does not end; a coordinate that is not finite.
     """
     if len(data) >= HEADER + 4 and len(data) == _length(data):
         return _read_binary(data), ()

@@ -28,10 +28,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFile:
-    """A surface with what its file states and what was found on it.
-
-    frame: The frame that the header states, if it does.
-    """
+    """A surface with the frame that its file states, if it does, and what was found on it."""
 
     surface: SurfaceData
     frame: str | None = None
@@ -154,10 +151,7 @@ def read_moved_surface(
 def read_bone_pair(
     before: AnyPath, after: AnyPath, *, units: str = "mm", frame: str | None = None
 ) -> MovedSurface | tuple[SurfaceData, SurfaceData]:
-    """A bone before and after: followed by its vertices if the triangles are the same, else both.
-
-    Parameters and errors as in `read_moved_surface`, except that the triangles may differ.
-    """
+    """A bone before and after: followed by its vertices if the triangles are the same, or both."""
     try:
         return read_moved_surface(before, after, units=units, frame=frame)
     except UnpairedError:
@@ -173,10 +167,7 @@ SAME_NEEDED = (
 
 
 def surface_as_stored(path: Path, crease_angle: float = 60.0) -> SurfaceFile:
-    """A surface in the file's own numbers.
-
-    Vertices in the same place are made one: STL repeats them for each triangle.
-    """
+    """A surface in the file's own numbers; STL's copies of a vertex are made one."""
     mesh = read_mesh(path)
     surface = surface_of(mesh, path, crease_angle)
     findings = tuple(replace(finding, where=path.name) for finding in mesh.findings)
@@ -191,10 +182,7 @@ def surface_of(mesh: PlainMesh, path: Path, crease_angle: float = 60.0) -> Surfa
 
 
 def _numbered(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], str | None]:
-    """The vertices and triangles of a file as it numbers them, and the frame that it states.
-
-    STL has corners alone.
-    """
+    """The vertices and triangles of a file as it numbers them (STL: corners), and its frame."""
     mesh = read_mesh(path)
     triangles = _triangles(mesh, path)
     points = np.array(mesh.points, dtype=np.float64)

@@ -58,11 +58,7 @@ SECONDS, MEMORY = 4.0, 2**30
 
 
 def read_vtk_legacy(path: Path) -> PlainMesh:
-    """The mesh of a file; polygons and strips of a surface become triangles.
-
-    Raises `CaseError`: Not such a file, another kind of data, whatever VTK complains of, other
-        counts than stated, an index that is not there; VTK is not installed.
-    """
+    """The mesh of a file; polygons and strips of a surface become triangles."""
     third_party(LIBRARIES[0].partition(".")[0], "files of .vtk are read", "mesh")
     data = path.read_bytes()
     header = HEADER.match(data)

@@ -79,12 +79,7 @@ class _Element:
 
 
 def read_vtk_xml(data: bytes, kind: str) -> PlainMesh:
-    """The mesh of a file; polygons of a surface become triangles.
-
-    kind: "PolyData" (`.vtp`) or "UnstructuredGrid" (`.vtu`).
-    Raises `CaseError`: Not such a file; a document type or another encoding than UTF-8; an array of
-        another length than stated; an index that is not there.
-    """
+    """The mesh of a file of "PolyData" (`.vtp`), polygons cut, or "UnstructuredGrid" (`.vtu`)."""
     root, file = _parsed(data)
     if root.name != "VTKFile" or root.attributes.get("type") != kind:
         found = root.attributes.get("type", root.name)

@@ -135,9 +135,9 @@ PREDICTION = {
 
 
 def is_result_file(name: str) -> bool:
-    """Whether predictions and evaluations of a case are written as files of this name.
+    """Whether predictions and evaluations are written as a file of this name in an output folder.
 
-    name: From the case's output folder; those of several models lie in a folder for each.
+    Those of several models lie in a folder for each.
     """
     model, _, plain_name = name.rpartition("/")
     if model:
@@ -149,17 +149,12 @@ def read_prediction(folder: AnyPath) -> dict[str, Any]:
     """What `prediction.json` in a folder holds, which `write_prediction` wrote there.
 
     Raises `FileNotFoundError`: There is none: another program's folder, or a run that was stopped.
-    Raises `CaseError`: It was changed, or holds what a prediction does not.
     """
     return read_summary(Path(folder) / PREDICTION_FILE, PREDICTION, AGAIN)
 
 
 def read_prediction_picture(folder: AnyPath, summary: Mapping[str, Any], name: str) -> bytes | None:
-    """A picture of a prediction as it was written; None where it was not drawn.
-
-    Raises `FileNotFoundError`: It is missing.
-    Raises `CaseError`: It is another file than was written, or no PNG.
-    """
+    """A picture of a prediction as it was written; None where it was not drawn."""
     if name not in summary["files"]:
         return None
     return read_picture(checked_file(Path(folder), summary, name, AGAIN))
@@ -172,9 +167,6 @@ def predictions_of(folder: AnyPath) -> dict[Path, dict[str, Any]]:
 
     folder: That of the case, or of one model.
     Returns: What `read_prediction` gives, in the order of the models; each model once.
-    Raises `FileNotFoundError`: There is no prediction.
-    Raises `CaseError`: Predictions of different plans, inputs or versions lie there together, or
-        one that was changed: names them.
     """
     folder = Path(folder)
     places = [folder, *(folder / model for model in MODELS)]
@@ -204,10 +196,7 @@ def predictions_of(folder: AnyPath) -> dict[Path, dict[str, Any]]:
 
 
 def check_own(folder: Path) -> None:
-    """Finds files of another program that results would replace, or remove as those of old ones.
-
-    Raises `CaseError`: A summary or a report in the folder is not one of cmfsim.
-    """
+    """Finds files of another program that results would replace, or remove as those of old ones."""
     for path in (folder / name for name in (PREDICTION_FILE, EVALUATION_FILE, REPORT_FILE)):
         data = path.read_bytes() if path.is_file() else b""
         # An empty one is what a full disk left.
@@ -222,8 +211,7 @@ def stale_results(folder: Path, key: str) -> list[str]:
     """The names of results in a case's output folder that belong to another plan than a key.
 
     key: The "case_key" of the results that are about to be put there.
-    Returns: Files of predictions, of their comparison and their report, with the folder of the
-        model.
+    Returns: Predictions with the folder of the model, their comparison and their report.
     """
     stale: list[str] = []
     for place in ("", *MODELS):
@@ -370,15 +358,10 @@ def _write_parts(folder: Path, prediction: Prediction) -> dict[str, list[str]]:
 def read_parts(
     folder: AnyPath, kinds: Sequence[str] | None = None
 ) -> dict[str, dict[str, tuple[SurfaceData, NDArray[np.float64]]]]:
-    """The surfaces of a prediction that was written, with their vertices after the operation.
+    """The surfaces of a prediction and their vertices after the operation, by kind and name.
 
-    folder: That `write_prediction` filled.
-    kinds: Of "bones" and "muscles", those to read; all if omitted.
-    Returns: dict of str to dict of str to (SurfaceData, (v, 3)). "skin", "bones" and, in models
-        with muscles, "muscles"; then by name. Muscles stay.
+    Kinds are "skin" and, of these the ones that are asked for, "bones" and "muscles", which stay.
     Raises `FileNotFoundError`: A file is missing: another program's folder, or an older version's.
-    Raises `CaseError`: A file that cannot be read, or is not the one that was written with the
-        others; PyVista is missing.
     """
     folder = Path(folder)
     summary = read_prediction(folder)

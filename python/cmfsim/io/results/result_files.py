@@ -251,11 +251,10 @@ _EVALUATION = {
 
 @dataclass(frozen=True, eq=False)
 class SkinErrors:
-    """A predicted skin with its distances from the skin after the operation.
+    """A predicted skin with its distances from the skin after the operation, (v,).
 
-    skin: As predicted.
-    signed: (v,), mm. Negative where the prediction lies behind; 0 where nothing was evaluated.
-    evaluated: (v,) bool. The vertices that the tables count: those evaluated in every model.
+    signed: mm. Negative where the prediction lies behind; 0 where nothing was evaluated.
+    evaluated: The vertices that the tables count: those evaluated in every model.
     """
 
     skin: SurfaceData
@@ -291,12 +290,7 @@ def skin_errors_file(model: str) -> str:
 def write_skin_errors(
     path: AnyPath, skin: SurfaceData, vertices: NDArray[Any], signed: Floats
 ) -> None:
-    """Writes a predicted skin with its distances; an old file goes in one step.
-
-    skin: As predicted.
-    vertices: (k,) indices. The vertices that were evaluated.
-    signed: (k,), mm. Their distances.
-    """
+    """Writes a predicted skin with the distances (k,), mm, of the vertices that were evaluated."""
     count = len(skin.vertices)
     values, evaluated = np.zeros(count), np.zeros(count, dtype=np.uint8)
     values[vertices], evaluated[vertices] = signed, 1
@@ -306,13 +300,7 @@ def write_skin_errors(
 
 
 def read_skin_errors(folder: AnyPath, evaluation: Mapping[str, Any], model: str) -> SkinErrors:
-    """The errors of a model that an evaluation lists, as they were written.
-
-    folder: With the files of the evaluation.
-    evaluation: `read_evaluation` of the same folder.
-    Raises `FileNotFoundError`: The file is missing.
-    Raises `CaseError`: It is none of that evaluation, was changed, or holds no distances.
-    """
+    """The errors of a model as `read_evaluation` of the same folder lists them."""
     path = summaries.checked_file(Path(folder), evaluation, skin_errors_file(model), AGAIN)
     mesh = read_mesh(path)
     missing = [name for name in (DISTANCE, EVALUATED) if name not in mesh.point_data]
@@ -336,20 +324,12 @@ def is_evaluation_file(name: str) -> bool:
 
 
 def read_evaluation(folder: AnyPath) -> dict[str, Any]:
-    """What `metrics.json` in a folder holds, which `cmfsim evaluate` wrote there.
-
-    Raises `FileNotFoundError`: There is none.
-    Raises `CaseError`: It was changed, or holds what an evaluation does not.
-    """
+    """What `metrics.json` in a folder holds, which `cmfsim evaluate` wrote there."""
     return summaries.read_summary(Path(folder) / EVALUATION_FILE, _EVALUATION, AGAIN)
 
 
 def read_evaluation_picture(folder: AnyPath, evaluation: Mapping[str, Any], name: str) -> bytes:
-    """A picture that an evaluation lists, as it was written.
-
-    Raises `FileNotFoundError`: It is missing.
-    Raises `CaseError`: It is none of that evaluation, or no PNG.
-    """
+    """A picture that an evaluation lists, as it was written."""
     summaries.check("files", name, EVALUATION_FILES)
     return read_picture(summaries.checked_file(Path(folder), evaluation, name, AGAIN))
 

@@ -33,10 +33,8 @@ UNKNOWN_KIND = re.compile(r"create an instance of \W*(\w+)")
 def read_itk_hdf5(path: Path) -> list[tuple[str, Floats, Floats]]:
     """Kind, parameters and fixed parameters of each transform in a file, composites first.
 
-    Kinds are ITK's class names without precision and dimension, such as "Euler3DTransform".
-
-    Raises `CaseError`: Not HDF5, too large, damaged, not a transform of 3-D space; SimpleITK (extra
-        `imaging`) is missing. The text is without the file's name.
+    Kinds are ITK's class names without precision and dimension, such as "Euler3DTransform". Errors
+    are without the file's name.
     """
     size = path.stat().st_size
     if size > MAX_FILE:

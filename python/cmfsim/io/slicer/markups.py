@@ -52,11 +52,7 @@ class Markup:
 
 
 def markup_text(path: Path) -> str:
-    """The text of a file of landmarks.
-
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `LandmarkError`: A folder, too large, not UTF-8.
-    """
+    """The text of a file of landmarks."""
     check_readable(path, LandmarkInputError)
     size = path.stat().st_size
     if size > MAX_LANDMARK_TEXT:
@@ -177,10 +173,6 @@ def read_curves(path: AnyPath) -> tuple[Floats, ...]:
 
     A closed curve ends where it starts. A file that states no frame is read as LPS, as Slicer's
     schema says.
-
-    Returns: tuple of (n, 3), mm.
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `LandmarkError`: Not such a file, another markup, a curve of one point.
     """
     path = Path(path)
     text = markup_text(path)

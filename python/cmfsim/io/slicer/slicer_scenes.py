@@ -73,10 +73,7 @@ class SceneNode:
 
 @dataclass(frozen=True, eq=False)
 class SlicerScene:
-    """A scene, and where each of its nodes lies in the world.
-
-    nodes: By id, in the order of the scene.
-    """
+    """A scene, and where each of its nodes, by id in its order, lies in the world."""
 
     file: Path
     nodes: Mapping[str, SceneNode]
@@ -86,10 +83,7 @@ class SlicerScene:
         return [node for node in self.nodes.values() if node.kind in kinds]
 
     def chain(self, node: SceneNode) -> list[SceneNode]:
-        """The transforms that are applied to a node, the nearest first.
-
-        Raises `CaseError`: A transform that is not there, or that is its own parent.
-        """
+        """The transforms that are applied to a node, the nearest first."""
         found: list[SceneNode] = []
         parent = node.parent
         while parent is not None:
@@ -108,20 +102,14 @@ class SlicerScene:
         return found
 
     def to_world(self, node: SceneNode) -> Floats:
-        """What carries a node's own coordinates to where Slicer shows it, (4, 4), LPS mm.
-
-        Raises `CaseError`: As `chain` and `to_parent`.
-        """
+        """What carries a node's own coordinates to where Slicer shows it, (4, 4), LPS mm."""
         matrix = np.eye(4)
         for above in self.chain(node):
             matrix = self.to_parent(above) @ matrix
         return matrix
 
     def to_parent(self, node: SceneNode) -> Floats:
-        """The motion that a transform applies to what lies under it, (4, 4), LPS mm.
-
-        Raises `CaseError`: Scale, shear or bending; a file that is missing or damaged.
-        """
+        """The motion that a transform applies to what lies under it, (4, 4), LPS mm."""
         with named(self.file):
             try:
                 return self._to_parent(node)
@@ -152,12 +140,7 @@ class SlicerScene:
 
 
 def read_slicer_scene(path: AnyPath) -> SlicerScene:
-    """The nodes of a scene file that a case may use.
-
-    path: `.mrml`. Files that it names are looked for, and not read.
-    Raises `FileNotFoundError`: The file does not exist.
-    Raises `CaseError`: Not a scene, too large, a document type, two nodes of one id.
-    """
+    """The nodes of a `.mrml` that a case may use; files that it names are not read."""
     path = Path(path)
     check_readable(path)
     with named(path):
@@ -237,14 +220,7 @@ def _file(name: str, folder: Path) -> tuple[Path | None, str]:
 
 
 def unpack_bundle(path: Path, folder: Path) -> Path:
-    """The scene file of a bundle that was unpacked into a folder.
-
-    path: `.mrb`.
-    folder: Empty, and the caller's to remove.
-    Raises `FileNotFoundError`: The bundle does not exist.
-    Raises `CaseError`: Not a zip archive, damaged, encrypted; a name that leads out of the folder,
-        a link; more or larger files than a scene has; no scene, or several.
-    """
+    """The scene file of a bundle (`.mrb`), unpacked into the caller's own empty folder."""
     check_readable(path)
     with named(path):
         try:

@@ -45,9 +45,8 @@ class TransformFile:
     """The motion in a transform file, and how the file was interpreted.
 
     matrix: (4, 4), mm. The motion of the bone: x ↦ R x + t on LPS points.
-    direction: "to-parent" or "from-parent": how the numbers of the file were interpreted.
-    frame: "LPS" or "RAS".
-    assumed: Which of "direction" and "frame" neither the caller nor the file stated.
+    direction, frame: "to-parent" or "from-parent", and "LPS" or "RAS".
+    assumed: Which of both neither the caller nor the file stated.
     """
 
     matrix: Floats

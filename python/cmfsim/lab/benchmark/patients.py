@@ -291,7 +291,7 @@ class BenchmarkPatient:
         return np.eye(4)
 
     def planned_moves(self, carriers: Mapping[str, Sequence[str]]) -> Floats:
-        """How far the plan moves skull landmarks, (3 k,) mm: with the first moved carrier of each."""
+        """How far the plan moves skull landmarks, (3 k,) mm: each with its first moved carrier."""
         moves = []
         for name, segments in carriers.items():
             place, matrix = self.skull_landmarks[name], self.planned_motion(*segments)
