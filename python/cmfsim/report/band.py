@@ -73,7 +73,7 @@ def summary_blocks(evaluation: Values) -> list[Note | Table]:
 
 
 def statistics_table(regions: Mapping[str, Values], caption: str, of: str = "region") -> Table:
-    """Statistics of signed distances, `DistanceStatistics.as_dict()`, by region or by what `of` says."""
+    """Statistics of signed distances (`DistanceStatistics.as_dict()`) by what `of` says."""
     columns = (of, "mean", "SD", "median", "RMS", "90 %", "95 %", "max", "signed", "< 2 mm")
     keys = ("mean_mm", "std_mm", "median_mm", "rms_mm", "p90_mm", "p95_mm", "max_mm")
     rows = tuple(
