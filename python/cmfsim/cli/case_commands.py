@@ -147,13 +147,11 @@ def build(options: argparse.Namespace) -> int:
     case = case_of(options)
     prepare(case, is_model_file)
     begun = time.perf_counter()
-    notices, findings = checked(options, case)
+    notices, asked = checked(options, case)
     seconds = time.perf_counter() - begun
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         build_case = import_module("cmfsim.pipeline.outputs.model").build_case
-        built = build_case(
-            case, progress=progress.stage, check=False, findings=findings, observer=notices
-        )
+        built = build_case(case, progress=progress.stage, **asked)
     summary = dict(built.summary)
     # Those of muscles are noticed after the last stage.
     notices.found(Finding.from_values(entry) for entry in summary["findings"])
@@ -209,15 +207,15 @@ def band_options(options: argparse.Namespace, case: Case) -> BandOptions | None:
 
 def checked(
     options: argparse.Namespace, case: Case, models: Sequence[str] | None = None
-) -> tuple[Notices, tuple[Finding, ...]]:
-    """The notices of a command, and the doctor's findings for a case unless it is not asked."""
+) -> tuple[Notices, dict[str, Any]]:
+    """The notices of a command, and how a case is built that the doctor has checked, if asked."""
     notices = Notices(quiet=options.quiet)
+    asked: dict[str, Any] = {"check": False, "findings": (), "observer": notices}
     if options.no_doctor:
-        return notices, ()
+        return notices, asked
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         progress.stage("checking the case")
-        asked = case if models is None else case_for_models(case, models)
-        found = examine(asked, models=models)
+        found = examine(case if models is None else case_for_models(case, models), models=models)
     if not options.quiet:
         # Before the work: a reversed plan is seen here, not in the face.
         for line in plan_lines(_plan_values(found)):
@@ -225,7 +223,7 @@ def checked(
     if _has_errors(found.findings):
         raise FindingsError(found.findings)
     notices.found(found.findings)
-    return notices, found.findings
+    return notices, {**asked, "findings": found.findings}
 
 
 def _plan_values(found: Examination) -> dict[str, Any]:

@@ -31,7 +31,7 @@ def plan(options: argparse.Namespace) -> int:
     # Before the work: a port that is taken is not reported a minute later.
     listener = open_port(options.port) if options.serve else None
     begun = time.perf_counter()
-    notices, findings = checked(options, case, (options.model,))
+    notices, asked = checked(options, case, (options.model,))
     expected = {**BUILDING, **PLANNING}
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         made = make_planning_page(
@@ -42,10 +42,8 @@ def plan(options: argparse.Namespace) -> int:
             towards=options.towards or (),
             keep_bite=options.keep_bite,
             band=band,
-            check=False,
-            findings=findings,
-            observer=notices,
             progress=progress.stage,
+            **asked,
         )
     seconds = time.perf_counter() - begun
     if listener is not None:
@@ -161,7 +159,7 @@ def splint_case(options: argparse.Namespace) -> int:
     kind = "intermediate" if options.intermediate else "final"
     # The whole name is known when the plan is.
     _free_path(case, options.out, f"splint-{kind}.stl")
-    notices, findings = checked(options, case)
+    _, asked = checked(options, case)
     more = {} if options.thickness is None else {"thickness": options.thickness}
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         made = import_module("cmfsim.pipeline.planning").make_splint(
@@ -170,9 +168,7 @@ def splint_case(options: argparse.Namespace) -> int:
             opening=options.open,
             label=options.label,
             progress=progress.stage,
-            check=False,
-            findings=findings,
-            observer=notices,
+            **asked,
             **more,
         )
         which = "-".join(filter(None, (kind, made.first, made.plan_digits)))
@@ -215,10 +211,10 @@ def bite_case(options: argparse.Namespace) -> int:
             "the case file"
         )
     scans = read_surface(given.upper), read_surface(given.lower)
-    notices, findings = checked(options, case)
+    _, asked = checked(options, case)
     with StageProgress(sys.stderr, quiet=options.quiet) as progress:
         bite, plan = import_module("cmfsim.pipeline.planning").plan_for_bite(
-            case, *scans, progress=progress.stage, check=False, findings=findings, observer=notices
+            case, *scans, progress=progress.stage, **asked
         )
         path.parent.mkdir(parents=True, exist_ok=True)
         write_plan(path, plan, made_for=plan_key(case))

@@ -52,20 +52,13 @@ def predict(options: argparse.Namespace) -> int:
         band.check(models)
     prepare(case, report=not options.no_report)
     begun = time.perf_counter()
-    notices, findings = checked(options, case, models)
+    notices, asked = checked(options, case, models)
     before = {} if options.no_doctor else {"checking the case": time.perf_counter() - begun}
     each = (f"{work} {model}" for model in models for work in ("solving", "writing"))
     expected = expected_stages(*each, results.REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
         predicted = partial(
-            predict_models,
-            case,
-            models,
-            progress=progress.stage,
-            check=False,
-            findings=findings,
-            observer=notices,
-            band=band,
+            predict_models, case, models, progress=progress.stage, band=band, **asked
         )
         written = results.write_results(
             case.output,
@@ -118,19 +111,12 @@ def evaluate(options: argparse.Namespace) -> int:
         case = replace(case, postoperative=replace(case.postoperative, verified=True))
     models = models_of(options.model, MODELS)
     prepare(case, report=not options.no_report, evaluation=True)
-    notices, findings = checked(options, case, models)
+    notices, asked = checked(options, case, models)
     each = (f"{work} {model}" for work in ("solving", "writing") for model in models)
     expected = expected_stages(*each, "writing the comparison", results.REPORT_STAGE)
     with StageProgress(sys.stderr, quiet=options.quiet, expected=expected) as progress:
-        found = evaluate_case(
-            case,
-            models,
-            progress=progress.stage,
-            check=False,
-            findings=findings,
-            observer=notices,
-            fit_thickness=options.fit_thickness,
-        )
+        fit = options.fit_thickness
+        found = evaluate_case(case, models, progress=progress.stage, fit_thickness=fit, **asked)
         written = results.write_results(
             case.output,
             found.predictions,
@@ -167,7 +153,7 @@ def sensitivity(options: argparse.Namespace) -> int:
     """Reports the effect of errors of skull landmarks on muscles and face."""
     case = case_of(options)
     prepare(case)
-    notices, findings = checked(options, case, (options.model,))
+    notices, asked = checked(options, case, (options.model,))
     trials: Any = options.trials
     if options.landmarks:
         trials = [read_landmark_file(path).points for path in options.landmarks]
@@ -179,9 +165,7 @@ def sensitivity(options: argparse.Namespace) -> int:
             seed=options.seed,
             model=options.model,
             progress=progress.stage,
-            check=False,
-            findings=findings,
-            observer=notices,
+            **asked,
         )
     values = {**found.as_dict(), "findings": notices.as_dicts()}
     case.output.mkdir(parents=True, exist_ok=True)
