@@ -76,23 +76,13 @@ def draw(
     corners: Floats,
     size: tuple[int, int],
     paint: Callable[[Any, View], None],
-    *,
-    legend: Sequence[tuple[str, str]] = (),
-    columns: int | None = None,
-    words: Sequence[str] = (),
+    **below: Any,
 ) -> None:
-    """Writes the views side by side, in rows of `columns`, under a temporary name first.
-
-    Below them stand the legend and the words, a paragraph each; the views shrink for them, by half
-    at most.
-    """
+    """Writes the views as `drawn` makes them, under a temporary name first."""
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise CaseInputError(f"{path.name}: a picture is written as .png, not {path.suffix!r}")
-    image = drawn(
-        path.name, views, corners, size, paint, legend=legend, columns=columns, words=words
-    )
-    write_picture(path, image)
+    write_picture(path, drawn(path.name, views, corners, size, paint, **below))
 
 
 def drawn(
@@ -106,7 +96,11 @@ def drawn(
     columns: int | None = None,
     words: Sequence[str] = (),
 ) -> NDArray[np.uint8]:
-    """The views as `draw` writes them, (h, w, 3); `name` is that of the file, for messages."""
+    """The views side by side, in rows of `columns`, (h, w, 3); `name` is the file's, for messages.
+
+    Below them stand the legend and the words, a paragraph each; the views shrink for them, by half
+    at most.
+    """
     width, height = (int(as_positive("picture size", n)) for n in size)
     pv = pyvista_module()
     check_can_draw(name)
