@@ -20,7 +20,7 @@ from cmfsim.phantom.shapes import (
     Table,
     Tube,
     smooth_curve,
-    turn_about,
+    turn_about_z,
 )
 from cmfsim.values.checks import Floats, frozen
 
@@ -106,7 +106,7 @@ def _neck(fat: float) -> Tube:
 def _eyes() -> list[Step | Engraving]:
     """Hollows of the eyes, eyeballs under closed lids, the slit and the lid crease."""
     return [
-        Step("cut", Egg((32, -98, 19), (19, 13, 12), turn=turn_about("z", 18)), 9.0),
+        Step("cut", Egg((32, -98, 19), (19, 13, 12), turn=turn_about_z(18)), 9.0),
         Step("join", Egg((31.5, -75.5, 18.5), (15, 12.4, 12.6)), 6.0),
         # Slit between the lids, the lower rim of the lower lid, the crease above.
         _engrave([[16.5, 17.5, 0.5], [23, 14.6, 1.2], [31, 13.2, 1.3], [39, 14.6, 1.2],
@@ -132,12 +132,12 @@ def _nose(p: HeadParameters) -> list[Step | Engraving]:
         Step("join", Egg((7.5, -103 + 0.7 * out, -6.5 + down), (7.0, 9.5, 8)), 6.0),
         # Wings.
         Step("join", Egg((12.2, -102.0 + 0.6 * out, -12.0 + down), (5.2, 8.5, 7.2),
-                         turn=turn_about("z", 14)), 3.5),
+                         turn=turn_about_z(14)), 3.5),
         # Column.
         Step("join", _tube([[0, tip_y - 2, tip_z - 6, 3.4], [0, -103, -17.5 + down, 4.2]]), 4.0),
         # Nostrils.
         Step("cut", Egg((6.6, -107 + 0.7 * out, -20.0 + down), (2.8, 5.8, 5.0),
-                        turn=turn_about("z", 24)), 2.0),
+                        turn=turn_about_z(24)), 2.0),
         # Fold behind the wing.
         _engrave([[9, -2 + down, 0.1], [13.5, -3 + down, 0.8], [17.4, -8 + down, 1.2],
                   [18.2, -14 + down, 1.2], [15, -20 + down, 0.6]], 3.0, -85.0),
@@ -186,7 +186,7 @@ def _mouth(p: HeadParameters) -> list[Step | Engraving]:
 
 def _ear() -> list[Step | Engraving]:
     """An auricle with helix, concha, tragus and lobule."""
-    turn = turn_about("z", -20)
+    turn = turn_about_z(-20)
     helix = [
         [72, -6, 4, 2.2],
         [75, -9, 16, 2.4],

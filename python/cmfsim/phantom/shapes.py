@@ -79,15 +79,10 @@ def smooth_curve(points: ArrayLike, steps: int = 4, *, closed: bool = False) -> 
     return np.vstack([curve.transpose(1, 0, 2).reshape(-1, rows.shape[1]), end[-1:]])
 
 
-def turn_about(axis: str, degrees: float) -> Floats:
-    """Rows are the axes of something turned about a coordinate axis by the right-hand rule."""
+def turn_about_z(degrees: float) -> Floats:
+    """Rows are the axes of something turned about the z axis by the right-hand rule."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    rows = {
-        "x": [[1, 0, 0], [0, c, s], [0, -s, c]],
-        "y": [[c, 0, -s], [0, 1, 0], [s, 0, c]],
-        "z": [[c, s, 0], [-s, c, 0], [0, 0, 1]],
-    }
-    return np.array(rows[axis], dtype=np.float64)
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ encloses count as bone, as `Anatomy.bones` wants it; `brain_shape` and the like 
 import numpy as np
 
 from cmfsim.phantom.parameters import HeadParameters
-from cmfsim.phantom.shapes import Blend, Box, Egg, Step, Tube, smooth_curve, turn_about
+from cmfsim.phantom.shapes import Blend, Box, Egg, Step, Tube, smooth_curve, turn_about_z
 
 # Centre of the left condyle, mm: the mandible opens about the axis through both.
 CONDYLE = (50.0, -13.0, -5.0)
@@ -84,7 +84,7 @@ def _midface() -> tuple[Step, ...]:
         # Midface: body of the maxilla, cheekbone, floor of the orbit.
         Step("join", Egg((0, -58, -4), (33, 31, 22), power=2.6), 8.0),
         Step("join", Egg((18, -62, -14), (17, 21, 18), power=2.3), 8.0),
-        Step("join", Egg((46, -62, -4), (12, 10, 11), turn=turn_about("z", 35)), 9.0),
+        Step("join", Egg((46, -62, -4), (12, 10, 11), turn=turn_about_z(35)), 9.0),
         Step("join", _tube([[40, -69, -1, 6], [30, -75, 0, 5], [20, -80, 5, 5], [14, -84, 16, 5],
                             [11, -84, 30, 6]]), 6.0),
         Step("join", _tube([[48, -66, 0, 6], [52, -63, 10, 5], [51.5, -63, 20, 5],
@@ -97,7 +97,7 @@ def _orbits_and_arches() -> tuple[Step, ...]:
     """The orbits with their lateral walls, and the zygomatic arches."""
     return (
         # Orbits: open cones towards the optic canal.
-        Step("cut", Egg((32, -74, 18.5), (18.5, 20, 16.5), power=2.3, turn=turn_about("z", 14)),
+        Step("cut", Egg((32, -74, 18.5), (18.5, 20, 16.5), power=2.3, turn=turn_about_z(14)),
              3.0),
         Step("cut", _tube([[32, -76, 18.5, 15.5], [24, -54, 19, 11], [17, -38, 20, 3]], 10), 3.0),
         # Lateral wall of the orbit, between it and the temple.
@@ -183,7 +183,7 @@ def mandible_shape(p: HeadParameters) -> Blend:
         Step("join", _plate([[47.5, -36, -22, 3.0, 7], [47.8, -36.5, -11, 2.4, 5],
                              [48, -36, -5, 1.8, 3]], (1, 0, 0)), 4.0),
         Step("join", _tube([[48, -17, -26, 4.0], [49, -14.5, -14, 4.0], [50, -13, -7, 4.5]]), 4.0),
-        Step("join", Egg(CONDYLE, (9.0, 4.6, 4.4), turn=turn_about("z", -14)), 3.0),
+        Step("join", Egg(CONDYLE, (9.0, 4.6, 4.4), turn=turn_about_z(-14)), 3.0),
         # Notch between the two.
         Step("cut", Egg((48, -25.5, -6), (12, 7.0, 11)), 3.0),
     )  # fmt: skip
@@ -216,7 +216,7 @@ def teeth_shape(*, upper: bool) -> Blend:
         ahead = [float(np.interp(centre + 1.0, length, curve[:, a])) for a in (0, 1)]
         angle = float(np.degrees(np.arctan2(ahead[1] - y, ahead[0] - x)))
         y -= 2.2 if upper else 0.0
-        turn = turn_about("z", angle)
+        turn = turn_about_z(angle)
         root = UPPER_NECK + ROOT if upper else LOWER_NECK - ROOT
         middle, half = 0.5 * (edge + root), 0.5 * abs(edge - root)
         tooth = Egg((x, y, middle), (0.5 * width - 0.05, depth, half), power=2.8, turn=turn)
