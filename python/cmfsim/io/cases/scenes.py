@@ -174,6 +174,7 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
         segments[name] = _stored_segment(entry, key, members)
         plan[name] = _stored_motion(entry, key, members)
     touching, obstacles = _one_sided(header, members)
+    solver = table_of(header, "solver", optional=True)
     known = {
         "scene",
         *(f"touching.{i}.{name}" for i in range(len(touching)) for name in TOUCHING_ARRAYS),
@@ -193,7 +194,7 @@ def _scene_from_members(header: Mapping[str, Any], members: Mapping[str, NDArray
         plan=plan,
         fixed=member_of(members, "fixed"),
         loads=members.get("loads"),
-        options=_options(header),
+        options=SolverOptions(**known_keys("solver", solver, tuple(SolverOptions().as_dict()))),
         conflicts=header.get("conflicts", "error"),
         touching=touching,
         obstacles=obstacles,
@@ -261,11 +262,6 @@ def _tissue_kind(table: Mapping[str, Any]) -> str:
     return kind
 
 
-def _options(header: Mapping[str, Any]) -> SolverOptions:
-    table = table_of(header, "solver", optional=True)
-    return SolverOptions(**known_keys("solver", table, tuple(SolverOptions().as_dict())))
-
-
 def _read_toml_scene(path: Path) -> Scene:
     document = read_tables(path, "scene")
     document.check_format(SCENE_FORMAT)
@@ -276,10 +272,8 @@ def _read_toml_scene(path: Path) -> Scene:
         mesh = read_mesh(mesh_path)
         tets, tet_data = read_tets(mesh, mesh_path)
         tables, plan = document.table("segments"), document.table("plan")
-        kinds = _node_integers(mesh, "kind", len(mesh.points), mesh_path)
-        owners = kinds
-        if list(tables):
-            owners = _node_integers(mesh, "segment", len(mesh.points), mesh_path)
+        kinds = _node_integers(mesh, "kind", mesh_path)
+        owners = _node_integers(mesh, "segment", mesh_path) if list(tables) else kinds
         segments = {
             name: _segment(tables.table(name), kinds, owners == number, folder)
             for number, name in enumerate(tables)
@@ -344,11 +338,12 @@ def _motion(table: Table, folder: Path) -> NDArray[Any] | MovedSurface:
     return matrix
 
 
-def _node_integers(mesh: Any, name: str, count: int, path: Path) -> NDArray[np.int64]:
+def _node_integers(mesh: Any, name: str, path: Path) -> NDArray[np.int64]:
     if name not in mesh.point_data:
         raise CaseInputError(f"{path.name}: lacks the point data {name!r}")
     values = np.asarray(mesh.point_data[name]).reshape(-1)
-    if values.shape != (count,) or not np.isfinite(values).all() or (values % 1 != 0).any():
+    is_one_each = values.shape == (len(mesh.points),)
+    if not is_one_each or not np.isfinite(values).all() or (values % 1 != 0).any():
         raise CaseInputError(f"{path.name}: point data {name!r} is not one whole number per node")
     return values.astype(np.int64)
 
