@@ -13,5 +13,4 @@ from cmfsim.lab.frontier.rows import WHOLE as WHOLE
 from cmfsim.lab.frontier.rows import Frontier as Frontier
 from cmfsim.lab.frontier.rows import FrontierRow as FrontierRow
 from cmfsim.lab.frontier.rows import Spread as Spread
-from cmfsim.lab.frontier.rows import pareto_front as pareto_front
 from cmfsim.lab.frontier.rows import skin_errors as skin_errors

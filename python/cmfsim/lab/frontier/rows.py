@@ -228,11 +228,6 @@ def with_front(rows: Sequence[FrontierRow]) -> tuple[FrontierRow, ...]:
     return tuple(replace(row, on_front=i in marked) for i, row in enumerate(rows))
 
 
-def unbeaten(seconds: Sequence[float], errors: Sequence[float]) -> list[bool]:
-    """Which rows no other one beats in time and in error, as far as errors are worth telling."""
-    return [bool(on) for on in pareto_front(seconds, np.round(np.array(errors) / ERROR_STEP))]
-
-
 def _csv_row(row: FrontierRow, regions: Sequence[str]) -> dict[str, Any]:
     """The choice, errors and cost of a row of the CSV file, by column."""
     whole = row.error.get(WHOLE)
@@ -265,18 +260,17 @@ def _spread_columns(name: str, unit: str, spread: Spread | None) -> dict[str, fl
     return dict(zip(titles, found, strict=True))
 
 
-def pareto_front(first: ArrayLike, second: ArrayLike) -> NDArray[np.bool_]:
-    """Which rows no other row beats, (k,) bool: as low in both costs (k,), and lower in one.
+def unbeaten(seconds: Sequence[float], errors: Sequence[float]) -> list[bool]:
+    """Which rows no other row beats: as low in both costs, and lower in one.
 
-    Rows that are equal in both do not beat each other.
+    Errors count as far as they are worth telling; rows that are equal do not beat each other.
     """
-    x, y = np.asarray(first), np.asarray(second)
-    # By the first cost, then by the second: what comes before a row costs no more in the first.
-    order = np.lexsort((y, x))
+    x, y = np.asarray(seconds), np.round(np.array(errors) / ERROR_STEP)
     on_front = np.zeros(len(x), dtype=bool)
     best, best_at = np.inf, np.nan
-    for row in order:
+    # By time, then by error: what comes before a row takes no longer.
+    for row in np.lexsort((y, x)):
         if y[row] < best or (y[row] == best and x[row] == best_at):
             on_front[row] = True
             best, best_at = y[row], x[row]
-    return on_front
+    return [bool(on) for on in on_front]

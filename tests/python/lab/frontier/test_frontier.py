@@ -21,7 +21,6 @@ from cmfsim.lab.frontier import (
     WHOLE,
     Spread,
     frontier_page,
-    pareto_front,
     reference_choice,
     skin_errors,
     sweep_choices,
@@ -29,7 +28,7 @@ from cmfsim.lab.frontier import (
 from cmfsim.lab.frontier import frontier as bench_frontier
 from cmfsim.lab.frontier import frontier_run as bench
 from cmfsim.lab.frontier.choice import EARLY
-from cmfsim.lab.frontier.rows import FrontierRow, with_front
+from cmfsim.lab.frontier.rows import FrontierRow, unbeaten, with_front
 from cmfsim.lab.frontier.timing import machine, run_job
 from cmfsim.values.skin_motion import carried_points
 from head_case import HeadCase
@@ -45,7 +44,7 @@ def test_the_front_is_what_brute_force_finds(pairs):
     """Small whole numbers, so that there are ties in one cost and in both."""
     brute = [not any(x <= a and y <= b and (x, y) != (a, b) for x, y in pairs) for a, b in pairs]
     first, second = [float(a) for a, _ in pairs], [float(b) for _, b in pairs]
-    assert pareto_front(first, second).tolist() == brute
+    assert unbeaten(first, second) == brute
 
 
 def test_errors_are_those_of_a_known_difference():
