@@ -1,13 +1,11 @@
 """A virtual patient on disk: the case before the operation, and the truth after it."""
 
-import json
 import logging
 import os
 import platform
 import shutil
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +27,7 @@ from cmfsim.lab.virtual.population import (
 )
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth, scanned
 from cmfsim.phantom import PhantomHead, make_head
-from cmfsim.values.checks import Floats, as_positive, as_whole
+from cmfsim.values.checks import Floats, as_positive, as_whole, plain
 from cmfsim.values.motion import carried
 from cmfsim.values.progress import Progress, no_progress
 from cmfsim.values.surface_data import SurfaceData
@@ -333,11 +331,8 @@ def patient_settings(
 ) -> dict[str, Any]:
     """The settings that determine a patient's files; `truth.json` stores them for comparison."""
     # A drawn patient depends on the distributions of this version.
-    # Through JSON, so that tuples equal the lists that are read back.
-    drawn = patient.number > DRAWN
-    person = {"person": json.loads(json.dumps(_described(patient)))} if drawn else {}
     return {
-        **person,
+        **({"person": _described(patient)} if patient.number > DRAWN else {}),
         "version": __version__,
         "patient": patient.number,
         "seed": int(seed),
@@ -347,18 +342,7 @@ def patient_settings(
 
 
 def _described(patient: VirtualPatient) -> dict[str, Any]:
-    return {
-        "name": patient.name,
-        "label": patient.label,
-        "head": asdict(patient.parameters),
-        "muscle_thickness": patient.muscle_thickness,
-        "muscle_stiffness": patient.muscle_stiffness,
-        "osteotomies": list(patient.osteotomies),
-        "plan": {name: asdict(move) for name, move in patient.plan.items()},
-        "departures": {name: asdict(move) for name, move in patient.departures.items()},
-        "thickness_change": patient.thickness_change,
-        "tissue": {**vars(patient.tissue), "offsets": dict(patient.tissue.offsets)},
-    }
+    return {"name": patient.name, **plain(patient)}
 
 
 def _measured(truth: PostoperativeTruth) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.phantom import HeadParameters
 from cmfsim.phantom.muscles import COURSES
 from cmfsim.values.calibration import ADDED, PLAN
-from cmfsim.values.checks import as_whole, check_one_of, keep
+from cmfsim.values.checks import as_whole, check_one_of, in_files, keep
 
 Triple = tuple[float, float, float]
 # Numbers above this belong to patients drawn at random.
@@ -147,14 +147,14 @@ class VirtualPatient:
     thickness_change: Swelling of the soft tissue after the operation, as a share of its depth.
     """
 
-    number: int
+    number: int = field(metadata=in_files(None))
     label: str
-    parameters: HeadParameters
+    parameters: HeadParameters = field(metadata=in_files("head"))
     muscle_thickness: float
     muscle_stiffness: float
     osteotomies: tuple[str, ...]
     plan: Mapping[str, Relocation] = field(default_factory=dict)
-    separate_lips: bool = False
+    separate_lips: bool = field(default=False, metadata=in_files(None))
     departures: Mapping[str, Relocation] = field(default_factory=dict)
     thickness_change: float = 0.0
     tissue: TrueTissue = field(default_factory=TrueTissue)
