@@ -98,17 +98,20 @@ def _tests(table: ErrorTable, models: tuple[str, ...]) -> list[str]:
 
 
 def _alerts(cases: Sequence[Values]) -> list[Alert]:
-    """What is doubtful about the figures of each case; cases that failed first."""
+    return case_alerts([(c["name"], c, c["evaluation"].get("warnings", ())) for c in cases])
+
+
+def case_alerts(cases: Sequence[tuple[str, Values, Sequence[str]]]) -> list[Alert]:
+    """What is doubtful about each named case, with its warnings; cases that failed first."""
     alerts = [
-        Alert("error", f"{case['name']} failed", tuple(case["error"].splitlines()))
-        for case in cases
+        Alert("error", f"{name} failed", tuple(case["error"].splitlines()))
+        for name, case, _ in cases
         if case["status"] == "failed"
     ]
-    for case in cases:
-        lines = tuple(case["evaluation"].get("warnings", ()))
+    for name, _, lines in cases:
         if lines:
             several = "s" if len(lines) > 1 else ""
-            alerts.append(Alert("warning", f"{case['name']}: {len(lines)} warning{several}", lines))
+            alerts.append(Alert("warning", f"{name}: {len(lines)} warning{several}", tuple(lines)))
     return alerts
 
 

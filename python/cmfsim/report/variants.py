@@ -6,7 +6,8 @@ from typing import Any
 from cmfsim.evaluation.models import NO_CHANGE, WHOLE
 from cmfsim.evaluation.regions import REGIONS
 from cmfsim.evaluation.statistics import LEAST_PAIRS
-from cmfsim.report.document import Alert, Document, Note, Section
+from cmfsim.report.document import Document, Note, Section
+from cmfsim.report.study import case_alerts
 from cmfsim.values.table import NOTHING, Table, plain_line
 
 Values = Mapping[str, Any]
@@ -124,29 +125,17 @@ def _change_cells(entry: Values | None) -> tuple[str, ...]:
     return (f"{entry['change_mm']:+.2f}", interval, str(entry["n"]), str(entry["n_better"]), p)
 
 
-def _failures(values: Values) -> list[tuple[str, str]]:
-    """Each case that failed in a variant, and why."""
+def _named_cases(values: Values) -> list[tuple[str, Values, Sequence[str]]]:
+    """Each case of each variant, with its warnings."""
     return [
-        (f"{variant['name']}, {case['name']}", case["error"])
+        (f"{variant['name']}, {case['name']}", case, case["warnings"])
         for variant in values["variants"]
         for case in variant["cases"]
-        if case["status"] == "failed"
     ]
 
 
 def variants_document(values: Values) -> Document:
     """The report of a study of variants, `VariantsReport.as_dict()`."""
-    alerts = [
-        Alert("error", f"{where} failed", tuple(error.splitlines()))
-        for where, error in _failures(values)
-    ]
-    for variant in values["variants"]:
-        for case in variant["cases"]:
-            lines = tuple(case["warnings"])
-            if lines:
-                several = "s" if len(lines) > 1 else ""
-                where = f"{variant['name']}, {case['name']}"
-                alerts.append(Alert("warning", f"{where}: {len(lines)} warning{several}", lines))
     regions, patients = _tables(values)
     notes = [Note(note, "warning") for note in (values["note"], values["description"]) if note]
     sections = [
@@ -161,6 +150,7 @@ def variants_document(values: Values) -> Document:
         "time": f"{values['seconds']:.0f} s",
     }
     subtitle = "Errors are distances of the predicted skin from the post-operative skin, mm."
+    alerts = case_alerts(_named_cases(values))
     return Document(f"{values['cohort']}: variants", subtitle, facts, sections, alerts=alerts)
 
 
@@ -186,5 +176,9 @@ def variants_markdown(values: Values) -> str:
     for table in (*regions, *patients):
         blocks += [f"{plain_line(table.caption)}:", table.markdown]
     blocks.append(METHOD)
-    blocks += [f"{plain_line(where)} failed: {plain_line(e)}" for where, e in _failures(values)]
+    blocks += [
+        f"{plain_line(name)} failed: {plain_line(case['error'])}"
+        for name, case, _ in _named_cases(values)
+        if case["status"] == "failed"
+    ]
     return "\n\n".join(blocks) + "\n"
