@@ -372,10 +372,12 @@ def desk_text(session: Session, bones: Sequence[str]) -> str:
             values |= _chosen(session.case())
         except (CmfsimError, OSError) as error:
             values["error"] = str(error)
+    arrays: dict[str, Any] = {}
     if head is not None:
         page = head.values["page"]
         values |= {key: page[key] for key in ("surfaces", "target", "span", "sites")}
         values["sites"] = _with_placed(session, page["sites"])
+        arrays = {n: array for n, array in head.arrays.items() if n.startswith("surface_")}
     name = session.case_file.parent.name
     return document_text(
         Document(
@@ -389,16 +391,12 @@ def desk_text(session: Session, bones: Sequence[str]) -> str:
             "1 to 6 choose a view.",
             made_for="",
             values=values,
-            arrays={} if head is None else _surfaces(head.arrays),
+            arrays=arrays,
             package="cmfsim.desk",
             main="desk_main.js",
             is_served=True,
         )
     )
-
-
-def _surfaces(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: array for name, array in arrays.items() if name.startswith("surface_")}
 
 
 def _chosen(case: Case) -> dict[str, Any]:

@@ -9,9 +9,8 @@ from importlib import import_module
 from importlib.resources import files
 
 from cmfsim.errors import third_party
-from cmfsim.report.document import Document, Figure, Note, View
+from cmfsim.report.document import Document, Figure, View
 from cmfsim.values.language import language, translated
-from cmfsim.values.table import Table
 
 # How a distance between skins was measured, by the method of `compare_skins`.
 MEASURES: Mapping[str, str] = {
@@ -74,7 +73,9 @@ def render_page(document: Document) -> str:
     # Two pictures at a time: to make them small takes longer than the page.
     with ThreadPoolExecutor(2) as pool:
         addresses = dict(zip(map(id, figures), pool.map(_address, figures), strict=True))
-    environment.globals.update(kind_of=_kind, address=lambda figure: addresses[id(figure)])
+    environment.globals.update(
+        kind_of=lambda block: type(block).__name__, address=lambda figure: addresses[id(figure)]
+    )
     page: str = environment.from_string(text).render(
         document=document,
         disclaimer=DISCLAIMER,
@@ -82,10 +83,6 @@ def render_page(document: Document) -> str:
         scripts=[block.script for block in blocks if isinstance(block, View)],
     )
     return page
-
-
-def _kind(block: Note | Table | Figure | View) -> str:
-    return type(block).__name__
 
 
 def _address(figure: Figure) -> str:
