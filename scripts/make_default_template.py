@@ -12,7 +12,8 @@ import numpy as np
 from cmfsim.io.cases.template_archives import mirrored_muscle
 from cmfsim.muscles.template.checking import template_path
 from cmfsim.muscles.template.muscle_template import MuscleTemplate
-from cmfsim.phantom import Muscle, PhantomHead, make_head
+from cmfsim.phantom.model import PhantomHead, make_head
+from cmfsim.phantom.muscles import Muscle
 from cmfsim.surfaces.repair import RepairOptions, repair_surface
 from cmfsim.values.checks import Floats
 from cmfsim.values.landmark_sites import SKULL_LANDMARKS

@@ -25,7 +25,7 @@ from cmfsim.io.files.reading_writing import replacing
 from cmfsim.lab.virtual.patient_folder import case_text
 from cmfsim.lab.virtual.population import PATIENTS
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth
-from cmfsim.phantom import PhantomHead
+from cmfsim.phantom.model import PhantomHead
 
 PATIENT = PATIENTS[1]
 EDGE_LENGTH = 6.0

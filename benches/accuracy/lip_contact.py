@@ -19,7 +19,7 @@ import cmfsim
 from benches.scenes.marked import publish
 from cmfsim.errors import CmfsimError
 from cmfsim.evaluation.models import NO_CHANGE
-from cmfsim.lab.virtual import PATIENTS
+from cmfsim.lab.virtual.population import PATIENTS
 
 REGIONS = ("upper lip", "lower lip", "face")
 HEAD = "| patient | lips in contact | region |"

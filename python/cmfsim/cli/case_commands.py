@@ -37,7 +37,6 @@ from cmfsim.io.results.result_files import is_model_file
 from cmfsim.pictures import KIND_COLOURS, SKIN_COLOUR, ViewPart, view_parts
 from cmfsim.pictures.window import OVER_BONES, prediction_parts
 from cmfsim.pipeline.predicting import case_for_models, prepare
-from cmfsim.report import Table
 from cmfsim.values.anatomy import segment_colours
 from cmfsim.values.case_parts import EDGE_LENGTHS
 from cmfsim.values.clinical_motion import plan_lines
@@ -45,6 +44,7 @@ from cmfsim.values.finding import SEVERITIES, Finding
 from cmfsim.values.mesh_report import MeshReport
 from cmfsim.values.skin_band import BandOptions
 from cmfsim.values.surface_data import SurfaceData
+from cmfsim.values.table import Table
 
 # Columns of the text in a pipe, and at most on a terminal.
 WIDTH = 100

@@ -9,23 +9,18 @@ from cmfsim.cli.terminal import StageProgress, argument, escaped, print_json, pr
 from cmfsim.errors import CaseInputError
 from cmfsim.io import Case
 from cmfsim.io.results.populations import FAILED, MADE, PARTS, PENDING
-from cmfsim.lab.benchmark import run_benchmark
-from cmfsim.lab.frontier import (
-    FACTORS,
-    WHOLE,
-    Frontier,
-    case_choice,
-    reference_choice,
-    sweep_choices,
-)
-from cmfsim.lab.frontier import frontier as run_frontier
+from cmfsim.lab.benchmark.running import run_benchmark
+from cmfsim.lab.frontier.choice import FACTORS, case_choice, reference_choice, sweep_choices
 from cmfsim.lab.frontier.files import GRID, base_verdict, write_frontier
-from cmfsim.lab.virtual import PatientOutcome, virtual_population
-from cmfsim.lab.virtual import virtual_patients as write_patients
+from cmfsim.lab.frontier.frontier_run import frontier as run_frontier
+from cmfsim.lab.frontier.rows import WHOLE, Frontier
 from cmfsim.lab.virtual.demo import write_phantom_case
 from cmfsim.lab.virtual.patient_folder import PATIENTS_WITH_JOINED_LIPS
+from cmfsim.lab.virtual.patient_folder import virtual_patients as write_patients
 from cmfsim.lab.virtual.population import OWN
-from cmfsim.phantom import HeadParameters, make_head
+from cmfsim.lab.virtual.population_folder import PatientOutcome, virtual_population
+from cmfsim.phantom.model import make_head
+from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.values.checks import as_positive
 
 # Voxel size of the synthetic head's CT, mm.

@@ -12,7 +12,7 @@ from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
 from cmfsim.io import result_suffixes
 from cmfsim.io.results.populations import PARTS, TEST
 from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST
-from cmfsim.lab.frontier import EDGES, FACTORS
+from cmfsim.lab.frontier.choice import EDGES, FACTORS
 from cmfsim.lab.virtual.population import TRUTHS
 from cmfsim.muscles.template.bodyparts3d import WHERE
 from cmfsim.planning.replanning.corrected import CORRECTIONS

@@ -20,9 +20,9 @@ from cmfsim.io.results.predictions import predictions_of
 from cmfsim.pipeline.evaluating import evaluate as evaluate_case
 from cmfsim.pipeline.outputs import results
 from cmfsim.pipeline.predicting import predict_models, prepare
-from cmfsim.report import Note, Table
 from cmfsim.report.band import band_blocks, summary_blocks
 from cmfsim.report.case import motion_blocks
+from cmfsim.report.document import Note
 from cmfsim.report.study import study_text
 from cmfsim.study.cohort import CaseOutcome, StudyOptions, run_study, write_study_report
 from cmfsim.study.trials import sensitivity as landmark_sensitivity
@@ -30,6 +30,7 @@ from cmfsim.study.variants import run_variants, write_variants_report
 from cmfsim.values.clinical_motion import plan_lines
 from cmfsim.values.prediction import MODELS, Prediction
 from cmfsim.values.progress import expected_stages
+from cmfsim.values.table import Table
 
 # What is printed of a solution.
 SOLVED = ("n_tets", "residual", "contact_iterations", "contact_gap")

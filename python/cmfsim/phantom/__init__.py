@@ -4,11 +4,3 @@
 as level functions, label images, CT-like images and closed surfaces; `HeadParameters` give other
 people.
 """
-
-from cmfsim.phantom.model import BONES as BONES
-from cmfsim.phantom.model import LABELS as LABELS
-from cmfsim.phantom.model import PhantomHead as PhantomHead
-from cmfsim.phantom.model import make_head as make_head
-from cmfsim.phantom.muscles import Muscle as Muscle
-from cmfsim.phantom.parameters import PARAMETER_RANGES as PARAMETER_RANGES
-from cmfsim.phantom.parameters import HeadParameters as HeadParameters

@@ -31,8 +31,8 @@ from cmfsim.pipeline.outputs.results import optional_pictures, write_report_page
 from cmfsim.pipeline.predicting import case_for_models, prepare
 from cmfsim.processes.parallel import as_they_end, on_cluster
 from cmfsim.processes.worker import Worker, WorkerEndedError, WorkerFailedError
-from cmfsim.report import Figure, study_document
-from cmfsim.report.study import table3_text
+from cmfsim.report.document import Figure
+from cmfsim.report.study import study_document, table3_text
 from cmfsim.values.checks import as_whole
 from cmfsim.values.finding import findings_text
 

@@ -9,7 +9,8 @@ import cmfsim
 import cmfsim.pipeline.predicting
 from cmfsim.cli import main
 from cmfsim.cli.terminal import Notices
-from cmfsim.report import case_document, render_page
+from cmfsim.report.case import case_document
+from cmfsim.report.page import render_page
 from cmfsim.values.finding import Finding, counted, grouped
 from head_case import HeadCase
 from shared_values import without_drawings
@@ -173,7 +174,7 @@ def test_a_study_states_what_is_doubtful_of_each_case_at_the_top():
         {"name": "two", "status": "failed", "seconds": 1.0, "error": "killed", "evaluation": {}},
     ]
     study = {"cohort": "all", "note": "", "models": ["H"], "seconds": 2.0, "cases": cases}
-    top = render_page(cmfsim.report.study_document(study)).partition("<main>")[0]
+    top = render_page(cmfsim.report.study.study_document(study)).partition("<main>")[0]
     assert "one: 1 warning" in top
     assert "the case is &lt;doubtful&gt;" in top
     assert top.index("two failed") < top.index("one: 1 warning")

@@ -19,7 +19,7 @@ from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.planning.face_measures.definitions import MEASURES
 from cmfsim.planning.page.content import PageContent
 from cmfsim.planning.page.document import page_text
-from cmfsim.report import findings_of
+from cmfsim.report.case import findings_of
 from cmfsim.report.chart_page import A4, draw_chart_page
 from cmfsim.values import language
 from cmfsim.values.landmark_sites import SKIN_LANDMARKS, SKULL_LANDMARKS

@@ -9,9 +9,10 @@ import pytest
 import cmfsim
 from benches.scenes.angles import angle_between
 from cmfsim import HeadParameters, PhantomHead, make_head
-from cmfsim.phantom import BONES, LABELS, PARAMETER_RANGES
 from cmfsim.phantom.grid import HOUNSFIELD, gradient_at, level_grid
+from cmfsim.phantom.model import BONES, LABELS
 from cmfsim.phantom.muscles import COURSES
+from cmfsim.phantom.parameters import PARAMETER_RANGES
 
 pytest.importorskip("skimage")
 

@@ -16,7 +16,8 @@ import cmfsim
 import phantom_case
 from cmfsim.cli import main
 from cmfsim.pipeline.evaluating import check_face_after, evaluation_key
-from cmfsim.report import case_document, render_page
+from cmfsim.report.case import case_document
+from cmfsim.report.page import render_page
 from cmfsim.study.cohort import _compared
 from shared_values import drawn_levels, without_drawings, without_processes
 

@@ -7,7 +7,8 @@ import cmfsim
 from benches.scenes import meshes
 from browser_page import open_page, serious_faults, until
 from cmfsim.planning.face_view import FACE_TRIANGLES, face_view
-from cmfsim.report import Document, Section, View, render_page
+from cmfsim.report.document import Document, Section, View
+from cmfsim.report.page import render_page
 
 pytest.importorskip("jinja2")
 

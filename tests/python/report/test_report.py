@@ -6,10 +6,10 @@ import pytest
 
 import cmfsim
 from benches.scenes import meshes
-from cmfsim.report import Document, Figure, Note, Section, Table, render_page
 from cmfsim.report.clinical import clinical_sections
-from cmfsim.report.page import MESH, MUSCLES, labelled
-from cmfsim.values.table import number
+from cmfsim.report.document import Document, Figure, Note, Section
+from cmfsim.report.page import MESH, MUSCLES, labelled, render_page
+from cmfsim.values.table import Table, number
 
 pytest.importorskip("jinja2")
 

@@ -12,8 +12,8 @@ import pytest
 import cmfsim
 import phantom_case
 from cmfsim.cli import main
-from cmfsim.report import render_page, study_document
-from cmfsim.report.study import table3_text
+from cmfsim.report.page import render_page
+from cmfsim.report.study import study_document, table3_text
 from shared_values import drawn_levels, without_drawings, without_processes
 
 pytest.importorskip("skimage")

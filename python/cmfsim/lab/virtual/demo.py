@@ -17,7 +17,7 @@ from cmfsim.errors import CaseInputError
 from cmfsim.io import Case, write_image, write_landmarks, write_surface
 from cmfsim.io.files.reading_writing import replace_text
 from cmfsim.lab.virtual.population import PATIENTS, template_text
-from cmfsim.phantom import PhantomHead, make_head
+from cmfsim.phantom.model import PhantomHead, make_head
 from cmfsim.surfaces.levels import SurfaceOptions, surface_of_level
 from cmfsim.values.anatomy import Anatomy
 from cmfsim.values.checks import as_positive

@@ -26,7 +26,7 @@ from cmfsim.lab.virtual.population import (
     template_text,
 )
 from cmfsim.lab.virtual.truth import PostoperativeTruth, postoperative_truth, scanned
-from cmfsim.phantom import PhantomHead, make_head
+from cmfsim.phantom.model import PhantomHead, make_head
 from cmfsim.values.checks import Floats, as_positive, as_whole, plain
 from cmfsim.values.motion import carried
 from cmfsim.values.progress import Progress, no_progress

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from cmfsim.errors import CaseInputError
-from cmfsim.phantom import HeadParameters
 from cmfsim.phantom.muscles import COURSES
+from cmfsim.phantom.parameters import HeadParameters
 from cmfsim.values.calibration import ADDED, PLAN
 from cmfsim.values.checks import as_whole, check_one_of, in_files, keep
 

@@ -35,7 +35,7 @@ from cmfsim.lab.virtual.operation import (
     without_gaps,
 )
 from cmfsim.lab.virtual.population import TrueTissue, VirtualPatient
-from cmfsim.phantom import PhantomHead
+from cmfsim.phantom.model import PhantomHead
 from cmfsim.pipeline.building.case_model import build_model, kind_options_of
 from cmfsim.surfaces.depth import moved_outward, tissue_depth
 from cmfsim.surfaces.topology import tet_bodies

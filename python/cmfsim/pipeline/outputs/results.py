@@ -70,8 +70,10 @@ from cmfsim.planning.face_measures.clinical_figures import clinical_figures, lat
 from cmfsim.planning.face_measures.occlusion import poor_bite
 from cmfsim.planning.face_view import face_view
 from cmfsim.planning.occlusion.contacts import ContactMap, planned_contacts
-from cmfsim.report import Document, Figure, case_document, findings_of, render_page
+from cmfsim.report.case import case_document, findings_of
 from cmfsim.report.chart_page import A4, draw_chart_page
+from cmfsim.report.document import Document, Figure
+from cmfsim.report.page import render_page
 from cmfsim.solving.models import planned_motions
 from cmfsim.values.anatomy import BoneSegment
 from cmfsim.values.finding import Finding

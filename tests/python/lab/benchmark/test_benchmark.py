@@ -23,8 +23,8 @@ from cmfsim.lab.benchmark.entries import (
     predict_by_ratios,
 )
 from cmfsim.lab.benchmark.patients import BenchmarkPatient, patients_of
-from cmfsim.lab.virtual import Relocation, VirtualPatient
 from cmfsim.lab.virtual.patient_folder import case_text
+from cmfsim.lab.virtual.population import Relocation, VirtualPatient
 
 PAGE = Path(__file__).parents[4] / "docs" / "benchmark.md"
 COUNT = 18

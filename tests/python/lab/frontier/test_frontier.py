@@ -15,20 +15,19 @@ from hypothesis import strategies as st
 import cmfsim
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError
-from cmfsim.lab.frontier import (
-    FACTORS,
+from cmfsim.lab.frontier import frontier_run as bench
+from cmfsim.lab.frontier.choice import EARLY, FACTORS, reference_choice, sweep_choices
+from cmfsim.lab.frontier.files import frontier_page
+from cmfsim.lab.frontier.frontier_run import frontier as bench_frontier
+from cmfsim.lab.frontier.rows import (
     SKIN,
     WHOLE,
+    FrontierRow,
     Spread,
-    frontier_page,
-    reference_choice,
     skin_errors,
-    sweep_choices,
+    unbeaten,
+    with_front,
 )
-from cmfsim.lab.frontier import frontier as bench_frontier
-from cmfsim.lab.frontier import frontier_run as bench
-from cmfsim.lab.frontier.choice import EARLY
-from cmfsim.lab.frontier.rows import FrontierRow, unbeaten, with_front
 from cmfsim.lab.frontier.timing import machine, run_job
 from cmfsim.values.skin_motion import carried_points
 from head_case import HeadCase

@@ -12,7 +12,7 @@ import pytest
 import cmfsim
 from cmfsim.cli import main
 from cmfsim.lab.virtual.demo import DEMO_PARAMETERS, read_demo_truth, write_demo_case
-from cmfsim.phantom import make_head
+from cmfsim.phantom.model import make_head
 
 pytest.importorskip("skimage")
 pytest.importorskip("jinja2")

@@ -10,10 +10,11 @@ import cmfsim
 from benches.scenes import meshes
 from cmfsim.cli import main
 from cmfsim.errors import CaseInputError
-from cmfsim.lab.virtual import PATIENTS, EquilibriumOptions
+from cmfsim.lab.virtual.mechanics.equilibrium import EquilibriumOptions
 from cmfsim.lab.virtual.mechanics.muscle_field import muscle_field, skin_share, thickened
 from cmfsim.lab.virtual.operation import bone_distances, screw, without_bite, without_gaps
 from cmfsim.lab.virtual.patient_folder import virtual_patients
+from cmfsim.lab.virtual.population import PATIENTS
 from cmfsim.lab.virtual.truth import carried, largest_body, scanned
 
 # A twin that a test can afford: 8.5 mm tets (coarser ones have holes over the nasal bone).

@@ -189,7 +189,7 @@ def test_a_mixture_is_refused_by_name(tmp_path, prediction, replanned, capsys):
         assert str(tmp_path / "M" / "prediction.json") in err
         assert "different plans" in err
     with pytest.raises(cmfsim.CaseError, match="different plans"):
-        cmfsim.report.case_document([prediction.summary, replanned.summary])
+        cmfsim.report.case.case_document([prediction.summary, replanned.summary])
 
 
 def test_a_comparison_of_another_plan_is_left_out_of_a_report(
@@ -242,7 +242,7 @@ def test_tiles_pictures_and_captions_are_of_one_model(prediction, evaluation):
     pictures = {"prediction": PNG}
     for shown, models in (("M", ("H", "M")), ("H", ("H",)), (None, ("H", "M"))):
         entries = [prediction.summary, other.summary][: len(models)]
-        document = cmfsim.report.case_document(
+        document = cmfsim.report.case.case_document(
             entries, shown=shown, pictures=pictures, evaluation=evaluation.as_dict()
         )
         model = shown or models[-1]

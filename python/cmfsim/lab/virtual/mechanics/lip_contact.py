@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, signed_distance_image
 from cmfsim.errors import CaseInputError, third_party
 from cmfsim.lab.virtual.mechanics.equilibrium import penalty
-from cmfsim.phantom import PhantomHead
+from cmfsim.phantom.model import PhantomHead
 from cmfsim.phantom.parameters import JawWarp
 from cmfsim.phantom.skull import UPPER_ARCH
 from cmfsim.values.anatomy import Anatomy

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmfsim.phantom import Muscle, PhantomHead
-from cmfsim.phantom.muscles import MELT
+from cmfsim.phantom.model import PhantomHead
+from cmfsim.phantom.muscles import MELT, Muscle
 from cmfsim.phantom.shapes import Tube, smooth_max
 from cmfsim.values.checks import Floats, as_index_rows, as_positive, as_rows
 
