@@ -232,7 +232,7 @@ class _Reader:
             for kind, lines in self._element_lines(n).items():
                 table = np.array(lines, dtype=np.int64)
                 found[kind] = [(table[:, 0], table[:, 1:])]
-            return _concatenated(found)
+            return _concatenated(found, n)
         done = 0
         while done < n:
             kind, count, n_tags = self.file.numbers("i4", 3, "$Elements").tolist()
@@ -243,9 +243,7 @@ class _Reader:
             rows = self.file.numbers("i4", count * width, "$Elements").reshape(count, width)
             found.setdefault(kind, []).append((rows[:, 0], rows[:, 1 + n_tags :]))
             done += count
-        if done != n:
-            raise CaseInputError(f"$Elements states {n} elements, its blocks hold {done}")
-        return _concatenated(found)
+        return _concatenated(found, n)
 
     def _element_lines(self, n: int) -> dict[int, list[list[int]]]:
         """The number and nodes of each element of a file in words, by kind."""
@@ -268,16 +266,12 @@ class _Reader:
     def _elements_4(self) -> dict[int, tuple[Integers, Integers]]:
         n_blocks, n, *_ = self._sizes(4, "$Elements")
         found: dict[int, list[tuple[Integers, Integers]]] = {}
-        done = 0
         for _ in range(n_blocks):
             _, _, kind, count = self._block_head("$Elements")
             width = 1 + self._size(kind)
             rows = self.file.numbers("i8", count * width, "$Elements").reshape(count, width)
             found.setdefault(kind, []).append((rows[:, 0], rows[:, 1:]))
-            done += count
-        if done != n:
-            raise CaseInputError(f"$Elements states {n} elements, its blocks hold {done}")
-        return _concatenated(found)
+        return _concatenated(found, n)
 
     def _values(self, name: str) -> _Values:
         labels = [self.file.line() or "" for _ in range(self._count(name))]
@@ -358,8 +352,11 @@ class _Reader:
 
 
 def _concatenated(
-    found: dict[int, list[tuple[Integers, Integers]]],
+    found: dict[int, list[tuple[Integers, Integers]]], n: int
 ) -> dict[int, tuple[Integers, Integers]]:
+    held = sum(len(numbers) for parts in found.values() for numbers, _ in parts)
+    if held != n:
+        raise CaseInputError(f"$Elements states {n} elements, its blocks hold {held}")
     return {
         kind: (np.concatenate([t for t, _ in parts]), np.concatenate([c for _, c in parts]))
         for kind, parts in found.items()
