@@ -11,7 +11,7 @@ from typing import Any
 from cmfsim._core import ELEMENTS, KINEMATICS, METHODS, __version__
 from cmfsim.io import result_suffixes
 from cmfsim.io.results.populations import PARTS, TEST
-from cmfsim.lab.benchmark.entries import ENTRIES, ON_REQUEST
+from cmfsim.lab.benchmark.entry_names import ENTRIES, ON_REQUEST
 from cmfsim.lab.frontier.choice import EDGES, FACTORS
 from cmfsim.lab.virtual.population import TRUTHS
 from cmfsim.muscles.template.bodyparts3d import WHERE

@@ -21,6 +21,14 @@ from numpy.typing import NDArray
 from cmfsim._core import Surface, ThinPlateSpline
 from cmfsim.errors import CaseInputError, CmfsimError, third_party
 from cmfsim.io.files.summaries import kept_record, write_record
+from cmfsim.lab.benchmark.entry_names import (
+    ENTRIES,
+    HYPERELASTIC,
+    LEARNED,
+    NO_CHANGE,
+    ON_REQUEST,
+    RATIOS,
+)
 from cmfsim.lab.benchmark.patients import (
     BenchmarkPatient,
     SkinPrediction,
@@ -52,10 +60,6 @@ FEATURES = {
     "infradentale": BODY, "sub_m2_L": BODY, "sub_m2_R": BODY, "pogonion": ("chin", *BODY),
     "menton": ("chin", *BODY),
 }  # fmt: skip
-NO_CHANGE, RATIOS, LEARNED, HYPERELASTIC = "no-change", "ratios", "pls", "hyperelastic"
-ENTRIES = (NO_CHANGE, RATIOS, LEARNED, *MODELS)
-# Entries that are made only on request: they take longer.
-ON_REQUEST = (HYPERELASTIC,)
 # What the hyperelastic entry is but for its kinematics.
 HYPERELASTIC_MODEL = "M+S"
 FAILURE = ".failed.json"

@@ -18,15 +18,13 @@ from cmfsim.io.results.populations import (
     Population,
 )
 from cmfsim.lab.benchmark.entries import (
-    ENTRIES,
-    LEARNED,
-    ON_REQUEST,
     EntryFolder,
     check_own,
     learned_entries,
     patient_entries,
     times_of,
 )
+from cmfsim.lab.benchmark.entry_names import ENTRIES, LEARNED, ON_REQUEST
 from cmfsim.lab.benchmark.patients import (
     BenchmarkPatient,
     far_from_models,

@@ -12,7 +12,8 @@ import numpy as np
 from cmfsim.errors import CaseInputError
 from cmfsim.evaluation.conformal import calibrate, cases_needed, covered_interval, region_scores
 from cmfsim.io.results.populations import write_calibration
-from cmfsim.lab.benchmark.entries import NO_CHANGE, EntryFolder, check_own
+from cmfsim.lab.benchmark.entries import EntryFolder, check_own
+from cmfsim.lab.benchmark.entry_names import NO_CHANGE
 from cmfsim.lab.benchmark.patients import (
     LIPS,
     BenchmarkPatient,
