@@ -139,21 +139,13 @@ def part_jaws(
     """
     findings: list[Finding] = []
     given = dict(landmarks or {})
-    head = None
+    head: FittedHead | None = None
     if _occlusal_points(given) is None:
         if _one_row(given) is None:
-            try:
-                head = fitted_to(work, bone, skin, given)
-            except LandmarkError as error:
-                return Jaws(None, None, None, (_not_parted(str(error)),))
-            against = _against(
-                {n: p for (kind, n), p in head.sites.items() if kind == "skull"}, given
-            )
-            if against:
-                elsewhere = (
-                    f"the image seems to show the tooth rows elsewhere than {', '.join(against)}"
-                )
-                return Jaws(None, None, None, (_not_parted(elsewhere),))
+            fitted = _fitted(work, bone, skin, given)
+            if isinstance(fitted, str):
+                return Jaws(None, None, None, (_not_parted(fitted),))
+            head = fitted
         findings.append(Finding("jaws-parted-by-shape", where="bone"))
     box = _box(work, bone, given) if head is None else model_box(work, head)
     domain = np.asfortranarray(bone.mask[box])
@@ -196,6 +188,18 @@ def part_jaws(
     if rest.any():
         mandible[box] |= reached(rest & ~largest(rest), grown(mandible[box]))
     return Jaws(_side(mandible, bone.mask), mandible, height, tuple(findings))
+
+
+def _fitted(work: Working, bone: Bone, skin: Skin, given: Mapping[str, Floats]) -> FittedHead | str:
+    """The model of shape on this head, or why the jaws cannot be separated by it."""
+    try:
+        head = fitted_to(work, bone, skin, given)
+    except LandmarkError as error:
+        return str(error)
+    against = _against({n: p for (kind, n), p in head.sites.items() if kind == "skull"}, given)
+    if against:
+        return f"the image seems to show the tooth rows elsewhere than {', '.join(against)}"
+    return head
 
 
 def _side(mandible: Mask, bone: Mask) -> Volume:
