@@ -208,6 +208,10 @@ class _Drawing:
         pictures = _pictures_of(patient, self.contacts(patient), prediction)
         return {name: self._start(model, name, picture) for name, picture in pictures}
 
+    def early(self) -> BuildKeywords:
+        """What a build is to call, so that pictures begin before a model is solved."""
+        return {"on_muscles": self.begin_muscles, "on_built": self.begin_planned}
+
     def _start(self, model: str, name: str, picture: Picture) -> "Future[None]":
         if (model, name) not in self._begun:
             folder = self._fresh / self.place(model)
@@ -244,11 +248,7 @@ def write_results(
 
     def fill(fresh: Path) -> list[str]:
         drawing = _Drawing(painter, fresh, models, pictures)
-        early: BuildKeywords = {
-            "on_muscles": drawing.begin_muscles, "on_built": drawing.begin_planned
-        }  # fmt: skip
-        given = predictions(early) if callable(predictions) else predictions
-        for prediction in given:
+        for prediction in predictions(drawing.early()) if callable(predictions) else predictions:
             stage(f"writing {prediction.model}")
             written.predictions.append(
                 _fill_model(fresh, prediction, clock, drawing=drawing, slicer=slicer)

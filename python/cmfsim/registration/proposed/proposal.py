@@ -224,13 +224,7 @@ def landmarks_from(
         )
     parts = _surfaces(bones, skin)
     average = templates[0]
-    # Points on all surfaces are drawn while the pose is found.
-    with ThreadPoolExecutor(1) as beside:
-        drawn = beside.submit(parts.draw)
-        fitted = _fitted(parts, shown)
-        pose = refined_pose(fitted.pose, parts.upper, average.bones["cranium"])
-        drawn.result()
-    pose, found = _best_sites(parts, (pose, fitted.pose), average, fitted)
+    pose, found, fitted = _found(parts, average, shown)
     likeness = [_likeness(template, parts.upper, pose, templates) for template in templates]
     found = _corrected(found, templates, likeness)
     skull = {name: p for name, p in found.skull.items() if not name.startswith("_")}
@@ -249,9 +243,8 @@ def landmarks_from(
     gone = missing_sites(placed, on_skin, cuts, pose, has_jaw=parts.lower is not None, odd=odd)
     evidence = JawEvidence("", ())
     if parts.lower is not None:
-        edges = {name: place for name, place in found.skull.items() if name.startswith("_")}
         strange = {n: m / pose.size for n, m in gone.misfits.items() if n.startswith(JAW_SITES)}
-        evidence = jaw_evidence({**skull, **edges}, parts.lower, pose, strange)
+        evidence = jaw_evidence(found.skull, parts.lower, pose, strange)
     placed = {name: placed[name] for name in SKULL_LANDMARKS if name in placed.keys() - gone.skull}
     on_skin = {name: on_skin[name] for name in SKIN_LANDMARKS if name in on_skin.keys() - gone.skin}
     sites = judged(placed, pose, max(likeness))
@@ -278,6 +271,19 @@ def landmarks_from(
         evidence.reason,
         {} if evidence.is_only_open else separation_points(sites, pose, average.skull),
     )
+
+
+def _found(
+    parts: HeadSurfaces, average: TemplateHead, shown: ShownRegion | None
+) -> tuple[Pose, Detected, FittedHead]:
+    """The pose, the sites by their definitions, and the model of shape on the head."""
+    # Points on all surfaces are drawn while the pose is found.
+    with ThreadPoolExecutor(1) as beside:
+        drawn = beside.submit(parts.draw)
+        fitted = _fitted(parts, shown)
+        pose = refined_pose(fitted.pose, parts.upper, average.bones["cranium"])
+        drawn.result()
+    return *_best_sites(parts, (pose, fitted.pose), average, fitted), fitted
 
 
 def _surfaces(bones: Mapping[str, SurfaceData], skin: SurfaceData | None = None) -> HeadSurfaces:
