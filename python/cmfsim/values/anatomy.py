@@ -79,7 +79,7 @@ class Anatomy(Frozen):
     surfaces: Mapping[str, SurfaceData] = field(default_factory=dict)
     shown: ShownRegion | None = None
     attached: tuple[Floats, ...] = ()
-    vessels: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    vessels: Floats = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
 
     __repr__ = brief
 

@@ -81,7 +81,7 @@ def listing(title: str, rows: Mapping[str, str]) -> str:
 
 def brief(value: Any) -> str:
     """The representation of a value of many numbers: its fields, arrays by their shapes."""
-    shown = {f.name: _brief(getattr(value, f.name)) for f in fields(value)}
+    shown = {f.name: _brief(getattr(value, f.name)) for f in fields(value) if f.repr}
     return listing(type(value).__name__, shown)
 
 
