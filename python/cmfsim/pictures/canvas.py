@@ -42,7 +42,8 @@ DIRECTIONS: Mapping[str, tuple[float, float, float]] = MappingProxyType({
 MARGIN = 1.04
 TEXT_SIZE, DPI = 9, 72
 LEGEND_ROW = 26  # pixels
-BETWEEN = 5  # pixels of white that keep the heads of neighbouring views apart
+# White, in pixels, that keeps the heads of neighbouring views apart.
+BETWEEN = MappingProxyType({"border": True, "border_color": "white", "border_width": 5})
 # Pixels left of texts below the views, and from a swatch to its text.
 EDGE, SWATCH = 12, 26
 # Opacity of the ground of a caption, and pixels between a scale and its title.
@@ -117,12 +118,7 @@ def drawn(
         with silent_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             plotter = pv.Plotter(
-                off_screen=True,
-                shape=(rows, columns),
-                window_size=[width, height],
-                border=True,
-                border_color="white",
-                border_width=BETWEEN,
+                off_screen=True, shape=(rows, columns), window_size=[width, height], **BETWEEN
             )
             try:
                 plotter.enable_anti_aliasing("ssaa")
