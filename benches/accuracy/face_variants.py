@@ -16,7 +16,6 @@ two; with a cache, rows that were computed before by the same version are read b
 import argparse
 import hashlib
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -35,6 +34,7 @@ from benches.accuracy import scan_variants
 from benches.scenes import clinic_scans as clinic
 from benches.scenes import ct_variants as variants
 from benches.scenes.marked import publish
+from benches.scenes.real_data import data_folder
 from cmfsim import ImageData
 from cmfsim.bones.cuts.procedures import UPPER_CANINE_REACH
 
@@ -108,11 +108,6 @@ class Variant:
 def _landmarks(kind: str = "skull") -> dict[str, np.ndarray]:
     path = data_folder() / "ct_phantom" / f"{kind}_landmarks.mrk.json"
     return dict(cmfsim.read_landmarks(path))
-
-
-def data_folder() -> Path:
-    """The folder of real data."""
-    return Path(os.environ.get("CMFSIM_DATA", ROOT.parent / "shared" / "data"))
 
 
 def _turned(*angles: float) -> Variant:

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 import cmfsim
 from benches.scenes import ct_variants as variants
 from benches.scenes.marked import publish
+from benches.scenes.real_data import data_folder
 from benches.scenes.warped_heads import KnownHead, warped
 from cmfsim.imaging import segment_head
 from cmfsim.io.images.image_files import read_image_file
@@ -335,7 +336,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="file for the errors by head and site")
     parser.add_argument("--before", type=Path, help="such a file, to compare with")
     options = parser.parse_args()
-    data = Path(os.environ.get("CMFSIM_DATA", ROOT.parent / "shared" / "data"))
+    data = data_folder()
     unseen: list[Row] = []
     real: list[Row] = []
     if not options.no_real and data.is_dir():

@@ -7,7 +7,6 @@ head, the CT phantom (in the folder named by CMFSIM_DATA, else ../shared/data) a
 """
 
 import argparse
-import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 import cmfsim
 from benches.scenes.marked import publish
+from benches.scenes.real_data import data_folder
 from cmfsim.lab.virtual.demo import write_demo_case
 from cmfsim.pipeline.building.stages import BuildOptions
 from cmfsim.pipeline.predicting import build_patient
@@ -99,7 +99,7 @@ def rows(case: cmfsim.Case, model: str, advance: float) -> Iterator[str]:
 
 def cases(folder: Path, edge: float, advance: float) -> Iterator[cmfsim.Case]:
     """The two real heads and the demo's."""
-    data = Path(os.environ.get("CMFSIM_DATA", ROOT.parent / "shared" / "data"))
+    data = data_folder()
     for name, source in SOURCES.items():
         head = (data / name).as_posix()
         path = folder / f"{name}.toml"

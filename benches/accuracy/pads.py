@@ -6,7 +6,6 @@ one, as scanned, at a child's size, in 8 bit and turned.
 """
 
 import argparse
-import os
 import platform
 from collections.abc import Iterator
 from itertools import product
@@ -17,6 +16,7 @@ import numpy as np
 import cmfsim
 from benches.scenes import ct_variants as variants
 from benches.scenes.marked import publish
+from benches.scenes.real_data import data_folder
 from cmfsim.imaging import segment_head
 from cmfsim.io.images.image_files import read_image_file
 from cmfsim.values.image_data import ImageData
@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="rows whose name contains a word")
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
-    folder = Path(os.environ.get("CMFSIM_DATA", ROOT.parent / "shared" / "data"))
+    folder = data_folder()
     image = read_image_file(folder / "ct_phantom" / "ct.nii.gz").image
     table = ["| where | scans | reported | not reported |", "|---|---:|---:|---|"]
     for name, cases in rows(image):

@@ -9,7 +9,6 @@ make the placed sites of each head likeliest. Two minutes.
 
 import argparse
 import dataclasses
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import numpy as np
 
 import cmfsim
 from benches.scenes.marked import publish
+from benches.scenes.real_data import data_folder
 from cmfsim.io import read_landmark_file, read_surface
 from cmfsim.pipeline.proposing import ProposedHead, filled_landmarks
 from cmfsim.registration.closest import robust_similarity
@@ -47,7 +47,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--markdown", type=Path, help="page whose marked place is filled")
     options = parser.parse_args()
-    data = Path(os.environ["CMFSIM_DATA"])
+    data = data_folder()
     rows = [
         "| head | what is known | measured sites | mean, mm | within 4 mm | expected, mm |",
         "|---|---|---|---|---|---|",

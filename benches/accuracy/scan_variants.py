@@ -33,6 +33,7 @@ import cmfsim
 from benches.scenes import ct_variants as variants
 from benches.scenes import scanner_effects as effects
 from benches.scenes.marked import publish
+from benches.scenes.real_data import data_folder
 from cmfsim import ImageData
 
 ROOT = Path(__file__).parents[2]
@@ -376,7 +377,7 @@ def main() -> None:
     if options.measure:
         print(json.dumps(measured(options.measure)))
         return
-    data = Path(os.environ.get("CMFSIM_DATA", ROOT.parent / "shared" / "data")) / "ct_phantom"
+    data = data_folder() / "ct_phantom"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "images").mkdir()

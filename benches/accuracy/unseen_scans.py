@@ -11,7 +11,6 @@ than 0.5 mm.
 
 import argparse
 import json
-import os
 import re
 import resource
 import shutil
@@ -26,6 +25,7 @@ from scipy.spatial import cKDTree
 
 import cmfsim
 from benches.scenes.marked import publish
+from benches.scenes.real_data import data_folder
 from benches.scenes.unseen_scans import TILTS, Scanned, made, unseen
 from benches.scenes.warped_heads import KnownHead
 from cmfsim.io.landmarks import write_landmarks
@@ -249,7 +249,7 @@ def main() -> None:
     parser.add_argument("--kept", action="store_true", help="take rows that were measured before")
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
-    data = Path(os.environ.get("CMFSIM_DATA", Path(__file__).parents[3] / "shared" / "data"))
+    data = data_folder()
     lines = [HEAD]
     for kind, head, seed in unseen(data):
         name = f"{kind}, {head}, seed {seed}"

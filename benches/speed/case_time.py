@@ -29,11 +29,14 @@ import numpy as np
 
 import cmfsim
 from benches.scenes.marked import publish
+from benches.scenes.real_data import data_folder
 
 NAME = "benches/speed/case_time.py"
 SHAPE = (512, 512, 200)
 SPACING = (0.45, 0.45, 1.0)  # mm
 NOISE = 25.0  # HU
+CMFSIM = (sys.executable, "-m", "cmfsim")
+SILENT: Mapping[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 SAMPLED = 0.05  # s between two readings of the memory in use
 CASE = ["--cut", "le_fort_1", "--cut", "bsso", "--move", "maxilla", "forwards=4", "up=1"]
 
@@ -57,7 +60,7 @@ def main() -> None:
     parser.add_argument("--clinical", action="store_true")
     parser.add_argument("--markdown", type=Path)
     args = parser.parse_args()
-    data = Path(os.environ.get("CMFSIM_DATA", Path(__file__).parents[3] / "shared" / "data"))
+    data = data_folder()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         image = folder / ("ct.nrrd" if args.clinical else "ct.nii.gz")
@@ -65,25 +68,17 @@ def main() -> None:
             _write_clinical(image)
         else:
             image.write_bytes((data / "ct_phantom" / "ct.nii.gz").read_bytes())
-        _run("init", str(folder), *CASE)
+        subprocess.run([*CMFSIM, "init", str(folder), *CASE], check=True, **SILENT)  # noqa: S603
         runs = [_timed(folder) for _ in range(args.runs + 1)][1:]
         voxels = int(np.prod(cmfsim.read_image(image).values.shape))
     publish(args.markdown, NAME, _table(runs, voxels))
 
 
-def _run(*arguments: str) -> subprocess.Popen[bytes]:
-    """A command of cmfsim; all but `predict` is waited for."""
-    command = [sys.executable, "-m", "cmfsim", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603
-    if arguments[0] != "predict" and process.wait():
-        raise SystemExit(f"{' '.join(arguments)} ended with {process.returncode}")
-    return process
-
-
 def _timed(folder: Path) -> Run:
     """One prediction, and what it took."""
     started = time.perf_counter()
-    process = _run("predict", str(folder), "--model", "M+S")
+    command = [*CMFSIM, "predict", str(folder), "--model", "M+S"]
+    process = subprocess.Popen(command, **SILENT)  # noqa: S603
     most = [0.0]
     ended = threading.Event()
 

@@ -36,7 +36,7 @@ UPPER_QUADRANTS = "1256"
 
 @dataclass(frozen=True)
 class NameRole:
-    """The meaning of a name, and the word in it that says so; `is_after`: after the operation.
+    """The meaning of a name, and the word in it that shows it; `is_after`: after the operation.
 
     part: "skin", "bone" (a skull with its jaw), "cranium", one of `MOVING`, "upper teeth", "lower
         teeth", "teeth" (of an unknown jaw), "other" (no bone of a case), or empty: not said.

@@ -94,9 +94,9 @@ BEFORE_RAMUS = 5.0
 # within 2 mm in the four joints of two skulls in which it was measured.
 CONDYLE = (15.0, 0.5, -12.0)
 CONDYLES = ("condyle_L", "condyle_R")
-# Within this of its middle, along each axis, a condyle is what hangs on the mandible through bone
-# deeper than the first of these, below the first of these heights from its middle, with which
-# nothing of the skull does, mm.
+# This near its middle along each axis, a condyle is what bone deeper than a core
+# connects to the mandible below an end, a height above its middle, and to no bone of the skull.
+# Cores and ends are tried in order; all in mm.
 JOINT_BOX, CORES, CONDYLE_ENDS = 20.0, (1.5, 2.0), (3.0, 0.0, -3.0)
 # Depth in bone that counts as much as FLOOD_HU, mm.
 FLOOD_DEPTH = 3.0
@@ -305,9 +305,9 @@ def _placed(
 def _joint_seeds(seeds: NDArray[np.int32], domain: Mask, work: Working, head: FittedHead) -> None:
     """Adds a ball of the mandible in each condyle of the model, unless the mouth is open.
 
-    One that touches its fossa would be cut off at its neck, which is narrower. A condyle hangs on
-    the mandible below the joints; what lies behind it, before the ear, does not. That of an open
-    mouth has left its fossa.
+    One that touches its fossa would be cut off at its neck, which is narrower. Bone connects a
+    condyle to the mandible below the joints, unlike what lies behind it, before the ear. That of an
+    open mouth has left its fossa.
     """
     if (head.jaw != np.eye(4)).any():
         return
